@@ -1,0 +1,89 @@
+"""What a back-end is, said once: a frozen graph in, poses and a typed report out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Protocol
+
+from hybridmap.geometry import Array
+from hybridmap.graph.pose_graph import PoseGraph
+
+
+class SolveStatus(StrEnum):
+    """Why a solver stopped."""
+
+    CONVERGED = "converged"
+    MAX_ITERATIONS = "max-iterations"
+    STALLED = "stalled"
+    DIVERGED = "diverged"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class SolveReport:
+    """How a solution came about.
+
+    Attributes:
+        backend: its name.
+        status: why it stopped.
+        message: one line for people.
+        iterations: of the solver (sweeps for relaxation).
+        chi2_initial, chi2: by the one referee, `backends.objective.chi2`, over all edges; never the solver's own cost.
+        cpu_s: process time spent.
+        rejected_edge_ids: loop edges whose final weight is below 0.5.
+        weights: loop edge id -> final weight in [0, 1]; empty for back-ends without a robust kernel.
+    """
+
+    backend: str
+    status: SolveStatus
+    message: str
+    iterations: int
+    chi2_initial: float
+    chi2: float
+    cpu_s: float
+    rejected_edge_ids: tuple[int, ...] = ()
+    weights: dict[int, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Poses of every node in `map`, with the report.
+
+    Attributes:
+        poses: (N, 3) m and rad; node 0 stays where the graph's `initial` has it.
+        report: why and how.
+    """
+
+    poses: Array
+    report: SolveReport
+
+
+class SupportsPoseGraph(Protocol):
+    """Anything that can be frozen into a graph, such as the experience map."""
+
+    def pose_graph(self) -> PoseGraph:
+        """The accepted edges as arrays."""
+
+
+class Backend(Protocol):
+    """A solver. `update` follows a growing graph while driving; `solve` takes a whole one, from its `initial`."""
+
+    @property
+    def name(self) -> str:
+        """The name by which `create` knows it."""
+
+    def update(self, graph: PoseGraph) -> Solution:
+        """Follow the graph as it has grown (or lost edges) since the last call; cheap, warm-started.
+
+        Raises:
+            BackendError: the graph cannot be solved; the state before the call is kept.
+        """
+
+    def solve(self, graph: PoseGraph | SupportsPoseGraph) -> Solution:
+        """Solve a whole graph in a fresh state.
+
+        Raises:
+            GraphError: the graph is malformed (see `PoseGraph.validate`).
+            BackendError: the solver failed; the message says why.
+        """

@@ -1,0 +1,126 @@
+"""The whole configuration, and how it is read: by name or path, with `extends`, and with overrides on top."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, Self
+
+import yaml
+from pydantic import Field, ValidationError
+
+from hybridmap.config.backends import BackendsConfig
+from hybridmap.config.mapping import EdgesConfig, NodesConfig
+from hybridmap.config.neural import NeuralConfig
+from hybridmap.config.section import Section
+from hybridmap.config.sensors import SensorsConfig
+from hybridmap.config.simulation import SimulationConfig
+from hybridmap.config.vision import VisionConfig
+from hybridmap.errors import ConfigError
+
+
+class Config(Section):
+    """Everything that determines a map, one section a stage, in the order in which a sample meets them."""
+
+    seed: int = Field(default=0, ge=0)
+    """Seed of every random draw (the simulator's world and noise, RANSAC)."""
+    simulation: SimulationConfig = SimulationConfig()
+    """The simulated world and drive; ignored for recordings."""
+    sensors: SensorsConfig = SensorsConfig()
+    """Topics, mounting, synchronisation."""
+    neural: NeuralConfig = NeuralConfig()
+    """Head-direction, band, grid and place cells; the place attractor."""
+    nodes: NodesConfig = NodesConfig()
+    """When an experience is made."""
+    vision: VisionConfig = VisionConfig()
+    """Scanline profiles, loop closure, registration."""
+    edges: EdgesConfig = EdgesConfig()
+    """Noise of odometry edges; how closures enter the map."""
+    backends: BackendsConfig = BackendsConfig()
+    """Which back-ends run, and their settings."""
+
+    @classmethod
+    def load(cls, source: str | Path | None = None, overrides: Mapping[str, Any] | None = None) -> Self:
+        """Read a configuration by name (`rgbd`) or path, with `overrides` (`{"nodes.distance_m": 0.3}`) on top.
+
+        Raises:
+            ConfigError: no such file, not YAML, an unknown key (named with its path) or a value out of range.
+        """
+        tree: dict[str, Any] = {} if source is None else _read_tree(source, seen=())
+        for dotted, value in (overrides or {}).items():
+            _merge(tree, _nest(dotted, value))
+        return cls.from_tree(tree, str(source) if source is not None else "command line")
+
+    @classmethod
+    def from_tree(cls, tree: Mapping[str, Any], origin: str) -> Self:
+        """Validate a nested mapping; `origin` names it in errors.
+
+        Raises:
+            ConfigError: as `load`.
+        """
+        try:
+            return cls.model_validate(tree)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            if first["type"] == "extra_forbidden":
+                raise ConfigError(f"{origin}: unknown key {where!r}") from None
+            found = repr(first.get("input"))[:80]
+            raise ConfigError(f"{origin}: {where}: {first['msg']}, found {found}") from None
+
+    def to_yaml(self) -> str:
+        """The resolved configuration as YAML that `load` reads back to an equal one."""
+        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+
+
+def named_configs() -> dict[str, Path]:
+    """Name -> file of the configurations that come with the package (in a checkout: `configs/`)."""
+    packaged = Path(str(resources.files("hybridmap"))) / "configs"
+    folder = packaged if packaged.is_dir() else Path(str(resources.files("hybridmap"))).parent / "configs"
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def _find(source: str | Path, beside: Path | None) -> Path:
+    path = Path(source)
+    for candidate in (path, beside / path if beside else path):
+        if candidate.is_file():
+            return candidate
+    known = named_configs()
+    if str(source) in known:
+        return known[str(source)]
+    raise ConfigError(f"{source}: no such configuration file; names that come with hybridmap: {', '.join(known)}")
+
+
+def _read_tree(source: str | Path, seen: tuple[Path, ...], beside: Path | None = None) -> dict[str, Any]:
+    path = _find(source, beside)
+    if path in seen:
+        raise ConfigError(f"{path}: `extends` leads back to itself")
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not a YAML file: {' '.join(str(error).split())}") from None
+    if tree is None:
+        tree = {}
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{path}: expected a mapping of sections, found {type(tree).__name__}")
+    parent = tree.pop("extends", None)
+    if parent is None:
+        return tree
+    base = _read_tree(str(parent), (*seen, path), path.parent)
+    _merge(base, tree)
+    return base
+
+
+def _nest(dotted: str, value: Any) -> dict[str, Any]:
+    for key in reversed(dotted.split(".")):
+        value = {key: value}
+    return dict(value)
+
+
+def _merge(base: dict[str, Any], top: Mapping[str, Any]) -> None:
+    for key, value in top.items():
+        if isinstance(value, Mapping) and isinstance(base.get(key), dict):
+            _merge(base[key], value)
+        else:
+            base[key] = dict(value) if isinstance(value, Mapping) else value

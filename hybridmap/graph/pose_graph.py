@@ -1,0 +1,88 @@
+"""The frozen graph that every back-end gets: nodes and edges as arrays, in order of creation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybridmap.errors import GraphError
+from hybridmap.geometry import Array
+
+
+class EdgeKind(IntEnum):
+    """Where an edge comes from."""
+
+    ODOMETRY = 0
+    REGISTRATION = 1
+    LOOP = 2
+    MANUAL = 3
+
+
+@dataclass(frozen=True, slots=True)
+class PoseGraph:
+    """Nodes and accepted edges.
+
+    Attributes:
+        initial: (N, 3) pose of each node as the odometry chain gives it (or as the file says), m and rad.
+        sources, targets: (E,) int64 node indices.
+        deltas: (E, 3) measured pose of the target in the frame of the source.
+        information: (E, 3, 3) inverse covariance in the frame of the target (right perturbation), x, y, yaw.
+        kinds: (E,) int8, `EdgeKind`.
+        edge_ids: (E,) int64, number of the edge in the log that it comes from; strictly increasing.
+    """
+
+    initial: Array
+    sources: NDArray[np.int64]
+    targets: NDArray[np.int64]
+    deltas: Array
+    information: Array
+    kinds: NDArray[np.int8]
+    edge_ids: NDArray[np.int64]
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of nodes."""
+        return len(self.initial)
+
+    @property
+    def n_edges(self) -> int:
+        """Number of edges."""
+        return len(self.sources)
+
+    @property
+    def is_loop(self) -> NDArray[np.bool_]:
+        """(E,) which edges are loop closures, i.e. may be false."""
+        return np.asarray(self.kinds == EdgeKind.LOOP)
+
+    def validate(self) -> None:
+        """Refuse a graph that no solver could take.
+
+        Raises:
+            GraphError: NaN, unknown node, edge onto itself, information not symmetric positive definite, no node. The
+                message names the edge, what was found and what was expected.
+        """
+        if self.n_nodes == 0:
+            raise GraphError("graph: holds no node")
+        if not np.isfinite(self.initial).all():
+            node = int(np.flatnonzero(~np.isfinite(self.initial).all(axis=1))[0])
+            raise GraphError(f"graph: node {node} has a pose with NaN or Inf, expected finite numbers")
+        ends = np.stack([self.sources, self.targets], axis=1)
+        self._refuse((ends < 0).any(axis=1) | (ends >= self.n_nodes).any(axis=1), "names a node that does not exist")
+        self._refuse(self.sources == self.targets, "leads from a node to itself")
+        self._refuse(~np.isfinite(self.deltas).all(axis=1), "has a measurement with NaN or Inf")
+        self._refuse(~np.isfinite(self.information).all(axis=(1, 2)), "has an information matrix with NaN or Inf")
+        transposed = self.information.transpose(0, 2, 1)
+        scale = np.abs(self.information).max(axis=(1, 2), initial=0.0)
+        asymmetry = np.abs(self.information - transposed).max(axis=(1, 2), initial=0.0)
+        self._refuse(asymmetry > 1e-9 * scale, "has an information matrix that is not symmetric")
+        if self.n_edges:
+            smallest = np.linalg.eigvalsh(self.information)[:, 0]
+            self._refuse(smallest <= 0.0, "has an information matrix that is not positive definite")
+
+    def _refuse(self, bad: ArrayLike, what: str) -> None:
+        if np.any(bad):
+            e = int(np.flatnonzero(bad)[0])
+            raise GraphError(f"graph: edge {int(self.edge_ids[e])} ({self.sources[e]} -> {self.targets[e]}) {what}")

@@ -1,0 +1,125 @@
+"""A trajectory: planar poses at whole-nanosecond stamps, and the TUM text format that carries it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybridmap.errors import GeometryError, StreamError
+from hybridmap.geometry import Array, interpolate, quaternion_from_yaw, yaw_from_quaternion
+
+NS_PER_S = 1_000_000_000
+
+
+def stamp_ns_from_s(stamp_s: float) -> int:
+    """Nearest whole nanosecond of a stamp in seconds."""
+    return round(stamp_s * NS_PER_S)
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Poses of one frame over time, sorted by stamp.
+
+    Attributes:
+        stamps_ns: (N,) int64, nanoseconds, strictly increasing.
+        poses: (N, 3) float64, x and y in m, yaw in rad.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    poses: Array
+
+    def __post_init__(self) -> None:
+        if self.poses.shape != (len(self.stamps_ns), 3):
+            raise GeometryError(f"trajectory: found poses {self.poses.shape} for {len(self.stamps_ns)} stamps")
+        if not np.isfinite(self.poses).all():
+            raise GeometryError("trajectory: found NaN or Inf in its poses, expected finite numbers")
+        if np.any(np.diff(self.stamps_ns) <= 0):
+            raise GeometryError("trajectory: stamps must strictly increase")
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def stamps_s(self) -> Array:
+        """(N,) float64, seconds."""
+        return self.stamps_ns / NS_PER_S
+
+    def at(self, stamps_ns: ArrayLike) -> Array:
+        """Poses `(M, 3)` at given stamps by interpolation on SE(2); held constant beyond either end."""
+        wanted = np.asarray(stamps_ns, dtype=np.int64)
+        if len(self) == 1:
+            return np.repeat(self.poses, len(wanted), axis=0)
+        right = np.clip(np.searchsorted(self.stamps_ns, wanted), 1, len(self) - 1)
+        t0, t1 = self.stamps_ns[right - 1], self.stamps_ns[right]
+        fraction = np.clip((wanted - t0) / (t1 - t0), 0.0, 1.0)
+        return interpolate(self.poses[right - 1], self.poses[right], fraction)
+
+    def covers(self, stamps_ns: ArrayLike, slack_ns: int = 0) -> NDArray[np.bool_]:
+        """Which of the stamps lie within the trajectory's span, `slack_ns` wider on either side."""
+        wanted = np.asarray(stamps_ns, dtype=np.int64)
+        return np.asarray((wanted >= self.stamps_ns[0] - slack_ns) & (wanted <= self.stamps_ns[-1] + slack_ns))
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read `stamp x y z qx qy qz qw` lines (seconds, m); of equal stamps the first is kept.
+
+    Raises:
+        StreamError: the file is missing or empty, or a line is damaged, not finite or goes back in time.
+    """
+    if not path.is_file():
+        raise StreamError(f"{path}: no such trajectory file")
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        text = line.split("#", 1)[0].replace(",", " ").split()
+        if not text:
+            continue
+        try:
+            stamp_ns = int((Decimal(text[0]) * NS_PER_S).to_integral_value())
+            row = [float(field) for field in text[1:]]
+        except (InvalidOperation, ValueError, OverflowError):
+            raise StreamError(f"{path}:{number}: expected numbers, found {line.strip()[:60]!r}") from None
+        if len(row) != 7 or not np.isfinite(row).all():
+            raise StreamError(
+                f"{path}:{number}: expected 8 finite numbers `stamp x y z qx qy qz qw`, found {len(text)}"
+                if len(row) != 7
+                else f"{path}:{number}: found NaN or Inf, expected finite numbers"
+            )
+        if stamps and stamp_ns < stamps[-1]:
+            raise StreamError(f"{path}:{number}: stamp {text[0]} goes back behind the line before; expected sorted stamps")
+        if stamps and stamp_ns == stamps[-1]:
+            continue
+        stamps.append(stamp_ns)
+        rows.append(row)
+    if not stamps:
+        raise StreamError(f"{path}: holds no pose")
+    table = np.asarray(rows)
+    yaw = yaw_from_quaternion(table[:, 3], table[:, 4], table[:, 5], table[:, 6])
+    return Trajectory(np.asarray(stamps, dtype=np.int64), np.column_stack([table[:, :2], yaw]))
+
+
+def format_stamp(stamp_ns: int) -> str:
+    """Seconds with 9 decimals, exact."""
+    return f"{stamp_ns // NS_PER_S}.{stamp_ns % NS_PER_S:09d}"
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write the TUM format: stamps with 9 decimals, 17 significant digits, no half-written file on failure."""
+    quaternions = quaternion_from_yaw(trajectory.poses[:, 2])
+    lines = [
+        f"{format_stamp(int(stamp))} {pose[0]:.17g} {pose[1]:.17g} 0 0 0 {q[2]:.17g} {q[3]:.17g}\n"
+        for stamp, pose, q in zip(trajectory.stamps_ns, trajectory.poses, quaternions, strict=True)
+    ]
+    write_text_atomic(path, "".join(lines))
+
+
+def write_text_atomic(path: Path, text: str) -> None:
+    """Write a text file in one move, so that a reader or a crash never meets half of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(path)

@@ -1,0 +1,114 @@
+"""What the visual side gives to the mapper, said once: proposals of edges, each measured or refused with a reason.
+
+A front-end keeps its own templates, keyframes and submaps, addressed by node number. It never sees the graph or a
+solver: what they know reaches it as a `Belief`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.geometry import Array, RelativePose
+from hybridmap.streams.base import Observation
+
+
+class Verdict(StrEnum):
+    """State of a proposed edge."""
+
+    ACCEPTED = "accepted"
+    PENDING = "pending"
+    REJECTED = "rejected"
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """An edge that vision considered.
+
+    Attributes:
+        key: stable number within the front-end; a later proposal with the same key replaces the verdict of this one.
+        kind: `loop` or `registration` (consecutive nodes: refined self-motion).
+        source, target: nodes; for loops the source is the newer one.
+        verdict: accepted, pending or rejected.
+        reason: one line for people: why.
+        relative: measured pose of the target in the frame of the source; None if none was measured.
+        scores: every figure that the decision rested on, by name (`profile_G`, `inliers`, `fit`, ...).
+        contradicts_odometry: a registration so good that the odometry edge beside it is wrong and is to be dropped.
+    """
+
+    key: int
+    kind: str
+    source: int
+    target: int
+    verdict: Verdict
+    reason: str
+    relative: RelativePose | None = None
+    scores: Mapping[str, float] = field(default_factory=dict)
+    contradicts_odometry: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """What the map believes, for gating and re-proposal.
+
+    Attributes:
+        poses_map_node: (N, 3) current estimate of every node by the primary back-end (or the integrator's own poses where
+            the configuration says `gate: odometry`), m and rad.
+        stamps_s: (N,) creation time of each node.
+        travel_m: (N,) path length at each node.
+        covariance_from: node -> (N, 3, 3) covariance of every node's pose relative to that node, propagated along the
+            shortest graph path (accepted edges only).
+    """
+
+    poses_map_node: Array
+    stamps_s: Array
+    travel_m: Array
+    covariance_from: Callable[[int], Array]
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What one frame looks like.
+
+    Attributes:
+        stamp_ns: of the frame.
+        profile: (bands, width) float32 scanline profile(s), normalised as the configuration says.
+        template: number of the view template it matched or founded.
+        new_template: the frame founded a template (a new view, stable over several frames).
+    """
+
+    stamp_ns: int
+    profile: NDArray[np.float32]
+    template: int
+    new_template: bool
+
+
+class FrontEnd(Protocol):
+    """Scanline loop closure and refined self-motion for one kind of sensor. Calls come in this order:
+
+    `observe` for each frame; when the mapper makes a node of that frame, `add_node`, then `track`, then `close`;
+    once, at the end, `finish` (and again while it returns something new, as often as the configuration allows).
+    """
+
+    def observe(self, frame: Observation, delta_node_robot: Array) -> View:
+        """Take in one frame; `delta_node_robot` (3,) is the integrator's motion since the last node (identity at first)."""
+
+    def add_node(self, node: int, view: View) -> None:
+        """Make a node of the frame observed last. Nodes are numbered from 0 without gaps."""
+
+    def track(self, node: int, odometry: RelativePose | None) -> list[Proposal]:
+        """Register the new node to the ones before it; `odometry` is its pose seen from node - 1 (None for the first node)."""
+
+    def close(self, node: int, belief: Belief) -> list[Proposal]:
+        """Look for loop closures of the new node; may also settle proposals that were pending."""
+
+    def finish(self, belief: Belief) -> list[Proposal]:
+        """Re-propose on the optimised map; settle what is pending."""
+
+    def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
+        """What the map file keeps of a node's frame: `profile`, and `ranges_m`, or `color` and `depth_mm` (compact dtypes)."""
