@@ -1,0 +1,61 @@
+"""The command `hybridmap`: its sub-commands, and how an error reaches the user."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from importlib.metadata import version
+from typing import Annotated
+
+import typer
+
+from hybridmap.errors import HybridMapError
+
+app = typer.Typer(
+    name="hybridmap",
+    help="A factor-graph hybrid mapper: neural path integration, scanline loop closure, relaxation and GTSAM on one graph.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"hybridmap {version('hybridmap')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens, on standard error.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bars, no log below errors.")] = False,
+    _version: Annotated[
+        bool, typer.Option("--version", help="Show the version and exit.", callback=_show_version, is_eager=True)
+    ] = False,
+) -> None:
+    level = logging.INFO if verbose else logging.ERROR if quiet else logging.WARNING
+    logging.basicConfig(level=level, format="hybridmap: %(levelname)s: %(message)s", stream=sys.stderr, force=True)
+    os.environ["HYBRIDMAP_QUIET"] = "1" if quiet else ""
+
+
+def main() -> None:
+    """Run the command line: every error is one line on standard error and exit code 2."""
+    try:
+        app(prog_name="hybridmap", standalone_mode=False)
+    except HybridMapError as error:
+        _fail(" ".join(str(error).split()))
+    except Exception as error:
+        if not hasattr(error, "format_message"):  # click's usage errors, wherever typer has them from
+            raise
+        _fail(" ".join(error.format_message().split()))
+    except KeyboardInterrupt:
+        print("hybridmap: interrupted", file=sys.stderr)  # noqa: T201
+        raise SystemExit(130) from None
+
+
+def _fail(message: str) -> None:
+    print(f"hybridmap: error: {message}", file=sys.stderr)  # noqa: T201
+    raise SystemExit(2)

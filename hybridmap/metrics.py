@@ -1,0 +1,47 @@
+"""A figure with its name, unit and meaning: one list gives the table for people and the JSON for programs."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """One figure.
+
+    Attributes:
+        name: `<measure>/<backend or stage>`, e.g. `ate_rmse/gtsam-gnc`.
+        value: NaN where it could not be computed.
+        unit: `m`, `deg`, `s`, `1`, ...
+        description: one line for people.
+        bar: the limit that it is held against, if any.
+        passed: whether it keeps to the bar.
+    """
+
+    name: str
+    value: float
+    unit: str
+    description: str
+    bar: float | None = None
+    passed: bool | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; a value that is not finite becomes null, as JSON has no NaN."""
+        row: dict[str, Any] = {
+            "name": self.name,
+            "value": self.value if math.isfinite(self.value) else None,
+            "unit": self.unit,
+            "description": self.description,
+        }
+        if self.bar is not None:
+            row |= {"bar": self.bar, "passed": self.passed}
+        return row
+
+
+def to_json(head: dict[str, Any], metrics: Iterable[Metric]) -> str:
+    """One JSON object: the head's keys, then the flat list `metrics`."""
+    return json.dumps({**head, "metrics": [metric.to_json() for metric in metrics]}, indent=2)
