@@ -1,0 +1,107 @@
+"""How arrays and sensor mountings become bytes and text, and back, without loss."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.backends.base import SolveReport, SolveStatus
+from hybridmap.errors import StoreError
+from hybridmap.streams.base import Camera, Laser, Rig
+
+_PNG_LEVEL = 1
+_ZLIB_LEVEL = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Packed:
+    """An array as the map file keeps it: little-endian bytes (`zlib`) or an image (`png`)."""
+
+    dtype: str
+    shape: str
+    codec: str
+    data: bytes
+
+
+def pack(array: NDArray[Any]) -> Packed:
+    """Compress an array without loss; images of 8 or 16 bits become PNG, the rest zlib. Same array, same bytes."""
+    little = np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"), copy=False))
+    shape = json.dumps(list(array.shape))
+    if _is_image(little):
+        import cv2
+
+        pixels = little[..., ::-1] if little.ndim == 3 else little
+        _, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])
+        return Packed(little.dtype.str, shape, "png", data.tobytes())
+    return Packed(little.dtype.str, shape, "zlib", zlib.compress(little.tobytes(), _ZLIB_LEVEL))
+
+
+def unpack(packed: Packed) -> NDArray[Any]:
+    """The array that was packed."""
+    dtype, shape = np.dtype(packed.dtype), json.loads(packed.shape)
+    if packed.codec == "png":
+        import cv2
+
+        pixels = cv2.imdecode(np.frombuffer(packed.data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if pixels is None:
+            raise StoreError("map file: an image in it is damaged")
+        return np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels).reshape(shape)
+    return np.frombuffer(zlib.decompress(packed.data), dtype).reshape(shape).copy()
+
+
+def _is_image(array: NDArray[Any]) -> bool:
+    grey_or_rgb = array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)
+    return array.dtype.str in ("|u1", "<u2") and grey_or_rgb and min(array.shape) > 0
+
+
+def pack_floats(values: NDArray[np.float64]) -> bytes:
+    """Little-endian float64 bytes."""
+    return np.ascontiguousarray(values, dtype="<f8").tobytes()
+
+
+def unpack_floats(data: bytes, columns: int) -> NDArray[np.float64]:
+    """The (-1, columns) float64 array that `pack_floats` wrote."""
+    return np.frombuffer(data, "<f8").astype(np.float64).reshape(-1, columns)
+
+
+def rig_to_json(rig: Rig) -> dict[str, Any]:
+    """The sensors as plain values."""
+    return {
+        name: None if part is None else _plain(asdict(part)) for name, part in (("camera", rig.camera), ("laser", rig.laser))
+    }
+
+
+def rig_from_json(tree: dict[str, Any]) -> Rig:
+    """The sensors that `rig_to_json` gave."""
+    camera, laser = tree["camera"], tree["laser"]
+    return Rig(
+        None if camera is None else Camera(**{**camera, "T_base_camera": np.array(camera["T_base_camera"])}),
+        None if laser is None else Laser(**{**laser, **{k: np.array(laser[k]) for k in ("bearings_rad", "pose_base_laser")}}),
+    )
+
+
+def _plain(fields: dict[str, Any]) -> dict[str, Any]:
+    return {key: value.tolist() if isinstance(value, np.ndarray | np.generic) else value for key, value in fields.items()}
+
+
+def report_to_json(report: SolveReport) -> str:
+    """A solver's report as one JSON object."""
+    fields = asdict(report)
+    fields["status"] = str(report.status)
+    fields["rejected_edge_ids"] = [int(number) for number in report.rejected_edge_ids]
+    fields["weights"] = {str(number): float(weight) for number, weight in report.weights.items()}
+    return json.dumps(_plain(fields))
+
+
+def report_from_json(text: str) -> SolveReport:
+    """The report that `report_to_json` wrote."""
+    fields = json.loads(text)
+    fields["status"] = SolveStatus(fields["status"])
+    fields["rejected_edge_ids"] = tuple(fields["rejected_edge_ids"])
+    fields["weights"] = {int(number): weight for number, weight in fields["weights"].items()}
+    return SolveReport(**fields)

@@ -1,0 +1,270 @@
+"""The map file: everything a session knows, in one SQLite file, written as the run proceeds."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from hybridmap.backends.base import Solution, SolveReport
+from hybridmap.errors import StoreError
+from hybridmap.geometry import Array, RelativePose
+from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
+from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.store import codec, schema
+from hybridmap.store.track import Track
+from hybridmap.streams.base import Rig
+from hybridmap.trajectory import Trajectory
+
+_KEYFRAME, _SNAPSHOT, _CODE = "keyframe", "snapshot", "code"
+
+
+class MapStore:
+    """A map file, open either for writing (`create`) or for reading (`open`).
+
+    What was written is durable against a killed process up to the last `commit`; call it once a node. Usable as a
+    context manager; `close` leaves one file.
+    """
+
+    def __init__(self, path: Path, connection: sqlite3.Connection, *, writable: bool) -> None:
+        self._path = path
+        self._connection = connection
+        self._writable = writable
+
+    @classmethod
+    def create(cls, folder: Path, config_yaml: str, rig: Rig, source: str) -> Self:
+        """Start the map file of a session folder.
+
+        Args:
+            folder: the session folder, or the path of the file itself if it ends in `.db`.
+            config_yaml: the resolved configuration.
+            rig: the sensors of the stream.
+            source: what is mapped, for people.
+
+        Raises:
+            StoreError: there is a map already, or it cannot be written.
+        """
+        path = _file_of(folder)
+        store = cls(path, schema.create(path), writable=True)
+        for key, value in (("config_yaml", config_yaml), ("rig", codec.rig_to_json(rig)), ("source", source)):
+            store.put_info(key, value)
+        store.commit()
+        return store
+
+    @classmethod
+    def open(cls, folder_or_db: Path) -> Self:
+        """Open a map for reading; also one whose run was killed, or is still going on.
+
+        Raises:
+            StoreError: missing, not a map, or of another version.
+        """
+        path = _file_of(folder_or_db)
+        return cls(path, schema.open_read_only(path), writable=False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Commit what was written and close; closing twice does no harm."""
+        if self._writable:
+            self._writable = False
+            schema.finish(self._connection)
+        else:
+            self._connection.close()
+
+    # ------------------------------------------------------------------ writing
+
+    def add_node(
+        self,
+        number: int,
+        node: Node,
+        initial: Array,
+        keyframe: Mapping[str, NDArray[Any]],
+        snapshot: Mapping[str, NDArray[Any]],
+    ) -> None:
+        """Write a node.
+
+        Args:
+            number: of the node.
+            node: the experience.
+            initial: (3,) pose along the odometry chain, m and rad.
+            keyframe: what vision keeps of the frame, by name.
+            snapshot: state of the cells, by name, for re-anchoring.
+        """
+        row = (
+            number,
+            int(node.stamp_ns),
+            *_floats(node.pose_odom),
+            *_floats(initial),
+            int(node.template),
+            float(node.travel_m),
+        )
+        self._write(f"INSERT INTO nodes VALUES ({_marks(len(row))})", row)
+        for part, arrays in ((_CODE, {"place": node.place_code}), (_KEYFRAME, keyframe), (_SNAPSHOT, snapshot)):
+            for name, array in arrays.items():
+                packed = codec.pack(np.asarray(array))
+                fields = (number, part, name, packed.dtype, packed.shape, packed.codec, packed.data)
+                self._write("INSERT INTO arrays VALUES (?, ?, ?, ?, ?, ?, ?)", fields)
+
+    def put_edge(self, number: int, edge: Edge) -> None:
+        """Write an edge, or what has become of it since; every edge ever considered belongs here."""
+        measured: tuple[Any, ...] = (None,) * 4
+        if edge.relative is not None:
+            measured = (*_floats(edge.relative.delta), codec.pack_floats(edge.relative.covariance))
+        scores = json.dumps({name: float(score) for name, score in edge.scores.items()})
+        kind, status = EdgeKind(edge.kind).name.lower(), str(edge.status)
+        row = (number, int(edge.source), int(edge.target), kind, status, edge.reason, *measured, scores)
+        self._write(f"INSERT OR REPLACE INTO edges VALUES ({_marks(len(row))})", row)
+
+    def add_track(self, stamp_ns: int, node: int, delta_node_robot: Array, pose_odom: Array) -> None:
+        """Write where the robot was: (3,) seen from a node and (3,) in `odom`, m and rad. The last word on a stamp wins."""
+        row = (int(stamp_ns), int(node), *_floats(delta_node_robot), *_floats(pose_odom))
+        self._write(f"INSERT OR REPLACE INTO track VALUES ({_marks(len(row))})", row)
+
+    def add_online(self, backend: str, stamp_ns: int, pose_map: Array) -> None:
+        """Write where the robot believed to be at the time, (3,) in `map`, m and rad. The last word on a stamp wins."""
+        self._write("INSERT OR REPLACE INTO online VALUES (?, ?, ?, ?, ?)", (backend, int(stamp_ns), *_floats(pose_map)))
+
+    def put_solution(self, backend: str, poses: Array, report: SolveReport) -> None:
+        """Write a back-end's poses (N, 3) and report; replaces an earlier one of the same name."""
+        position = self._one("SELECT position FROM solutions WHERE backend = ?", (backend,))
+        if position is None:
+            position = self._one("SELECT COUNT(*) FROM solutions", ())
+        row = (backend, position, codec.pack_floats(poses), codec.report_to_json(report))
+        self._write("INSERT OR REPLACE INTO solutions VALUES (?, ?, ?, ?)", row)
+
+    def put_info(self, key: str, value: Any) -> None:
+        """Write a value that JSON can hold under a key; `primary_backend` names the result that is judged."""
+        self._write("INSERT OR REPLACE INTO info VALUES (?, ?)", (key, json.dumps(value)))
+
+    def commit(self) -> None:
+        """Make everything written so far survive a killed process."""
+        self._connection.commit()
+
+    # ------------------------------------------------------------------ reading
+
+    @property
+    def path(self) -> Path:
+        """The map file."""
+        return self._path
+
+    @property
+    def config_yaml(self) -> str:
+        """The resolved configuration of the run."""
+        return str(self.info("config_yaml"))
+
+    @property
+    def rig(self) -> Rig:
+        """The sensors of the run."""
+        return codec.rig_from_json(self.info("rig"))
+
+    @property
+    def source(self) -> str:
+        """What was mapped."""
+        return str(self.info("source"))
+
+    @property
+    def primary(self) -> str:
+        """The back-end that is judged: as the run recorded it, else the first of the configuration."""
+        recorded = self.info("primary_backend")
+        if recorded is not None:
+            return str(recorded)
+        names = ((yaml.safe_load(self.config_yaml) or {}).get("backends") or {}).get("names") or list(self.solutions())
+        return str(names[0]) if names else "odometry"
+
+    def info(self, key: str) -> Any:
+        """The value under a key; None if there is none."""
+        text = self._one("SELECT value FROM info WHERE key = ?", (key,))
+        return None if text is None else json.loads(text)
+
+    def map(self) -> ExperienceMap:
+        """The experience map: the same nodes and edges in the same order."""
+        experiences = ExperienceMap()
+        codes = {row[0]: codec.Packed(*row[1:]) for row in self._arrays(_CODE)}
+        for row in self._rows("SELECT * FROM nodes ORDER BY number"):
+            node = Node(row[1], np.array(row[2:5]), codec.unpack(codes[row[0]]), row[8], row[9])
+            experiences.add_node(node, np.array(row[5:8]))
+        for row in self._rows("SELECT * FROM edges ORDER BY number"):
+            relative = None
+            if row[9] is not None:
+                relative = RelativePose(np.array(row[6:9]), codec.unpack_floats(row[9], 3))
+            kind, status, scores = EdgeKind[row[3].upper()], Status(row[4]), json.loads(row[10])
+            experiences.add_edge(Edge(row[1], row[2], kind, status, row[5], relative, scores))
+        return experiences
+
+    def keyframe(self, node: int) -> dict[str, NDArray[Any]]:
+        """What vision kept of a node's frame, by name; empty for an unknown node."""
+        return self._named(node, _KEYFRAME)
+
+    def snapshot(self, node: int) -> dict[str, NDArray[Any]]:
+        """State of the cells at a node, by name; empty for an unknown node."""
+        return self._named(node, _SNAPSHOT)
+
+    def track(self) -> Track:
+        """Where the robot was at each stamp, seen from nodes."""
+        rows = self._rows("SELECT * FROM track ORDER BY stamp_ns")
+        values = np.array([row[2:] for row in rows], dtype=np.float64).reshape(-1, 6)
+        ends = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2)
+        return Track(ends[:, 0].copy(), ends[:, 1].copy(), values[:, :3].copy(), values[:, 3:].copy())
+
+    def online(self, backend: str) -> Trajectory:
+        """Where the robot believed to be at the time, by one back-end; empty if it kept none."""
+        rows = self._rows("SELECT stamp_ns, x_m, y_m, yaw_rad FROM online WHERE backend = ? ORDER BY stamp_ns", (backend,))
+        stamps = np.array([row[0] for row in rows], dtype=np.int64)
+        return Trajectory(stamps, np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 3))
+
+    def online_backends(self) -> list[str]:
+        """Back-ends with an online trajectory, by name."""
+        return [row[0] for row in self._rows("SELECT DISTINCT backend FROM online ORDER BY backend")]
+
+    def solutions(self) -> dict[str, Solution]:
+        """Name -> poses and report of every back-end, in the order in which they were written."""
+        rows = self._rows("SELECT backend, poses, report FROM solutions ORDER BY position")
+        return {name: Solution(codec.unpack_floats(poses, 3), codec.report_from_json(report)) for name, poses, report in rows}
+
+    # ------------------------------------------------------------------ plumbing
+
+    def _write(self, statement: str, row: tuple[Any, ...]) -> None:
+        try:
+            self._connection.execute(statement, row)
+        except sqlite3.Error as error:
+            raise StoreError(f"{self._path}: cannot write: {error}") from None
+
+    def _rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+        try:
+            return self._connection.execute(statement, values).fetchall()
+        except sqlite3.Error as error:
+            raise StoreError(f"{self._path}: cannot read: {error}") from None
+
+    def _one(self, statement: str, values: tuple[Any, ...]) -> Any:
+        rows = self._rows(statement, values)
+        return rows[0][0] if rows else None
+
+    def _arrays(self, part: str) -> list[tuple[Any, ...]]:
+        return self._rows("SELECT node, dtype, shape, codec, data FROM arrays WHERE part = ?", (part,))
+
+    def _named(self, node: int, part: str) -> dict[str, NDArray[Any]]:
+        statement = "SELECT name, dtype, shape, codec, data FROM arrays WHERE node = ? AND part = ? ORDER BY name"
+        return {row[0]: codec.unpack(codec.Packed(*row[1:])) for row in self._rows(statement, (int(node), part))}
+
+
+def _file_of(folder_or_db: Path) -> Path:
+    path = Path(folder_or_db)
+    return path if path.suffix == ".db" and not path.is_dir() else path / schema.MAP_NAME
+
+
+def _floats(values: Array) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)
+
+
+def _marks(count: int) -> str:
+    return ", ".join("?" * count)

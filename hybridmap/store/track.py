@@ -1,0 +1,81 @@
+"""Where the robot was between nodes, and how node poses become a trajectory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.errors import StoreError
+from hybridmap.geometry import Array, between, compose, interpolate, inverse, wrap_angle
+from hybridmap.trajectory import Trajectory
+
+_TURN_AS_TRAVEL_M = 0.3
+"""Metres of travel that a turn of one radian counts for when a residual is spread over the way."""
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Where the robot was at each distinct stamp, seen from a node.
+
+    Attributes:
+        stamps_ns: (T,) int64, strictly increasing.
+        nodes: (T,) int64, the node that the robot had last made (or been re-anchored to).
+        deltas: (T, 3) pose of the robot in the frame of that node, m and rad.
+        poses_odom: (T, 3) pose of the robot in `odom`, m and rad.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    nodes: NDArray[np.int64]
+    deltas: Array
+    poses_odom: Array
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def odometry(self) -> Trajectory:
+        """Dead reckoning over the whole recording."""
+        return Trajectory(self.stamps_ns, self.poses_odom)
+
+
+def trajectory_of(track: Track, poses: Array) -> Trajectory:
+    """Poses of the robot at every stamp of the track, given those of the nodes.
+
+    On the way from one node to the next the pose seen from the first and the pose seen from the next are blended along
+    the SE(2) geodesic by the share of the way done, so that what odometry and the solution disagree about is spread over
+    that way and the trajectory is continuous.
+
+    Args:
+        track: where the robot was, seen from nodes.
+        poses: (N, 3) pose of each node in `map`, m and rad.
+
+    Raises:
+        StoreError: the track is empty or names a node beyond `poses`.
+    """
+    if len(track) == 0:
+        raise StoreError("track: holds no pose; nothing was mapped")
+    if track.nodes.max() >= len(poses) or track.nodes.min() < 0:
+        raise StoreError(f"track: names node {int(track.nodes.max())}, expected less than {len(poses)}")
+    forward = compose(poses[track.nodes], track.deltas)
+    first = np.flatnonzero(np.diff(track.nodes, prepend=track.nodes[0] - 1))
+    run = np.searchsorted(first, np.arange(len(track)), side="right") - 1
+    inside = run < len(first) - 1
+    target = first[np.minimum(run + 1, len(first) - 1)]
+    robot_target = between(track.poses_odom, track.poses_odom[target])
+    backward = compose(compose(poses[track.nodes[target]], track.deltas[target]), inverse(robot_target))
+    share = np.where(inside, _share_of_way(track, first[run], target), 0.0)
+    return Trajectory(track.stamps_ns, interpolate(forward, backward, share))
+
+
+def _share_of_way(track: Track, start: NDArray[np.int64], end: NDArray[np.int64]) -> Array:
+    """(T,) how much of the way from `start` to `end` is done: by travel and turn, by time where the robot stood still."""
+    step = np.diff(track.poses_odom, axis=0, prepend=track.poses_odom[:1])
+    length = np.hypot(step[:, 0], step[:, 1]) + _TURN_AS_TRAVEL_M * np.abs(wrap_angle(step[:, 2]))
+    way = np.cumsum(length)
+    done, total = way - way[start], way[end] - way[start]
+    time_done, time_total = track.stamps_ns - track.stamps_ns[start], track.stamps_ns[end] - track.stamps_ns[start]
+    moved = total > 1e-6
+    by_time = time_done / np.maximum(time_total, 1)
+    return np.asarray(np.where(moved, done / np.where(moved, total, 1.0), by_time))

@@ -1,0 +1,197 @@
+from __future__ import annotations
+
+import signal
+import sqlite3
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from hybridmap.backends.base import SolveReport, SolveStatus
+from hybridmap.errors import StoreError
+from hybridmap.graph.experience_map import Edge, ExperienceMap, Status
+from hybridmap.graph.hashing import graph_hash
+from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.store import MapStore
+from hybridmap.streams.base import Rig
+from tests.store.sessions import RIG, keyframe_of, ring_map, truth_at, write_session
+
+
+def test_map_comes_back_with_every_edge_and_the_same_hash(tmp_path):
+    before = ring_map()
+    write_session(tmp_path / "s", before)
+    with MapStore.open(tmp_path / "s") as store:
+        after = store.map()
+    assert graph_hash(after) == graph_hash(before)
+    assert len(after.edges) == len(before.edges)
+    for old, new in zip(before.edges, after.edges, strict=True):
+        assert (old.source, old.target, old.kind, old.status, old.reason) == (
+            new.source,
+            new.target,
+            new.kind,
+            new.status,
+            new.reason,
+        )
+        assert dict(old.scores) == dict(new.scores)
+        assert (old.relative is None) == (new.relative is None)
+    for old, new in zip(before.nodes, after.nodes, strict=True):
+        assert (old.stamp_ns, old.template, old.travel_m) == (new.stamp_ns, new.template, new.travel_m)
+        np.testing.assert_array_equal(old.pose_odom, new.pose_odom)
+        np.testing.assert_array_equal(old.place_code, new.place_code)
+        assert new.place_code.dtype == np.float32
+
+
+def test_keyframes_snapshots_rig_and_solutions_come_back_exactly(tmp_path):
+    experiences = ring_map()
+    write_session(tmp_path / "s", experiences)
+    truth = truth_at(np.array([node.stamp_ns for node in experiences.nodes]))
+    with MapStore.open(tmp_path / "s") as store:
+        for name, array in keyframe_of(11, truth).items():
+            back = store.keyframe(11)[name]
+            assert back.dtype == array.dtype
+            np.testing.assert_array_equal(back, array)
+        np.testing.assert_array_equal(store.snapshot(3)["phases"], np.arange(4.0))
+        assert store.keyframe(10_000) == {}
+        np.testing.assert_array_equal(store.rig.camera.T_base_camera, RIG.camera.T_base_camera)
+        np.testing.assert_array_equal(store.rig.laser.bearings_rad, RIG.laser.bearings_rad)
+        assert store.rig.camera.fx_px == RIG.camera.fx_px
+        assert store.primary == "gtsam-lm"
+        assert store.source == "circle"
+        solution = store.solutions()["gtsam-lm"]
+        np.testing.assert_array_equal(solution.poses, truth)
+        assert solution.report.status is SolveStatus.CONVERGED
+
+
+def test_report_keeps_weights_and_rejected_edges(tmp_path):
+    report = SolveReport("b", SolveStatus.STALLED, "m", 3, 2.0, 1.0, 0.5, (4, 9), {4: 0.25, 9: 0.0})
+    with MapStore.create(tmp_path, "{}", Rig(), "x") as store:
+        store.put_solution("b", np.zeros((2, 3)), report)
+        store.put_solution("a", np.ones((2, 3)), report)
+        store.put_solution("b", np.ones((3, 3)), report)
+    with MapStore.open(tmp_path) as store:
+        assert list(store.solutions()) == ["b", "a"]
+        assert store.solutions()["b"].report == report
+        assert store.solutions()["b"].poses.shape == (3, 3)
+
+
+def test_edge_is_replaced_by_its_later_verdict(tmp_path):
+    experiences = ring_map(loops=False)
+    pending = Edge(5, 1, EdgeKind.LOOP, Status.PENDING, "waits", None)
+    number = experiences.add_edge(pending)
+    with MapStore.create(tmp_path, "{}", Rig(), "x") as store:
+        initial = experiences.pose_graph().initial
+        for k, node in enumerate(experiences.nodes):
+            store.add_node(k, node, initial[k], {}, {})
+        for k, edge in enumerate(experiences.edges):
+            store.put_edge(k, edge)
+        store.commit()
+        experiences.set_status(number, Status.REJECTED, "rival cluster")
+        store.put_edge(number, experiences.edge(number))
+    with MapStore.open(tmp_path) as store:
+        edges = store.map().edges
+    assert len(edges) == len(experiences.edges)
+    assert edges[number].status is Status.REJECTED
+    assert edges[number].reason == "rival cluster"
+
+
+def test_finished_session_is_one_file(tmp_path):
+    write_session(tmp_path / "s", ring_map())
+    assert sorted(path.name for path in (tmp_path / "s").glob("map.db*")) == ["map.db"]
+    MapStore.open(tmp_path / "s").close()
+    assert sorted(path.name for path in (tmp_path / "s").glob("map.db*")) == ["map.db"]
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from hybridmap.store import MapStore
+from hybridmap.streams.base import Rig
+from tests.store.sessions import ring_map
+import numpy as np
+experiences = ring_map(loops=False)
+initial = experiences.pose_graph().initial
+store = MapStore.create(Path(sys.argv[1]), "{}", Rig(), "x")
+for k, node in enumerate(experiences.nodes):
+    store.add_node(k, node, initial[k], {"noise": np.random.default_rng(k).random(20_000)}, {})
+    if k:
+        store.put_edge(k - 1, experiences.edge(k - 1))
+    if k == 30:
+        os.kill(os.getpid(), signal.SIGKILL)
+    store.commit()
+"""
+
+
+def test_killed_run_leaves_a_map_up_to_the_last_committed_node(tmp_path):
+    done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)
+    assert done.returncode == -signal.SIGKILL
+    with MapStore.open(tmp_path) as store:
+        killed = store.map()
+        assert len(store.keyframe(29)["noise"]) == 20_000
+        assert store.keyframe(30) == {}
+    assert len(killed) == 30
+    whole = ring_map(loops=False)
+    part = ExperienceMap()
+    for k in range(30):
+        part.add_node(whole.node(k), whole.pose_graph().initial[k])
+    for edge in whole.edges[:29]:
+        part.add_edge(edge)
+    assert graph_hash(killed) == graph_hash(part)
+
+
+def test_running_session_can_be_read_along(tmp_path):
+    experiences = ring_map(loops=False)
+    with MapStore.create(tmp_path, "{}", Rig(), "x") as store:
+        store.add_node(0, experiences.node(0), np.zeros(3), {}, {})
+        store.commit()
+        store.add_node(1, experiences.node(1), np.zeros(3), {}, {})
+        with MapStore.open(tmp_path) as reader:
+            assert len(reader.map()) == 1
+
+
+def test_same_session_twice_has_the_same_stored_bytes(tmp_path):
+    dumps = []
+    for name in ("a", "b"):
+        write_session(tmp_path / name, ring_map())
+        with sqlite3.connect(tmp_path / name / "map.db") as connection:
+            dumps.append("\n".join(connection.iterdump()))
+    assert dumps[0] == dumps[1]
+
+
+def test_track_keeps_the_last_word_on_a_stamp_and_is_sorted(tmp_path):
+    with MapStore.create(tmp_path, "{}", Rig(), "x") as store:
+        store.add_track(20, 0, np.array([1.0, 2, 3]), np.zeros(3))
+        store.add_track(10, 0, np.zeros(3), np.array([0, 0, 0.5]))
+        store.add_track(20, 1, np.array([4.0, 5, 3]), np.zeros(3))
+    with MapStore.open(tmp_path) as store:
+        track = store.track()
+    assert track.stamps_ns.tolist() == [10, 20]
+    assert track.nodes.tolist() == [0, 1]
+    assert track.deltas[1].tolist() == [4, 5, 3]
+    assert track.poses_odom[0].tolist() == [0, 0, 0.5]
+
+
+def test_bad_files_are_refused_with_the_reason(tmp_path):
+    with pytest.raises(StoreError, match="no such map file"):
+        MapStore.open(tmp_path)
+    (tmp_path / "map.db").write_bytes(b"this is a text of more than a hundred bytes, no database at all" * 4)
+    with pytest.raises(StoreError, match="not a map file"):
+        MapStore.open(tmp_path)
+    with pytest.raises(StoreError, match="map is here already"):
+        MapStore.create(tmp_path, "{}", Rig(), "x")
+    other = tmp_path / "other.db"
+    sqlite3.connect(other).execute("CREATE TABLE t (x)")
+    with pytest.raises(StoreError, match="not a map of hybridmap"):
+        MapStore.open(other)
+    MapStore.create(tmp_path / "v", "{}", Rig(), "x").close()
+    with sqlite3.connect(tmp_path / "v" / "map.db") as connection:
+        connection.execute("PRAGMA user_version = 99")
+    connection.close()
+    with pytest.raises(StoreError, match="version 99, expected 1"):
+        MapStore.open(tmp_path / "v")
+
+
+def test_reading_changes_nothing(tmp_path):
+    write_session(tmp_path / "s", ring_map())
+    with MapStore.open(tmp_path / "s") as store, pytest.raises(StoreError, match="cannot write"):
+        store.put_info("x", 1)

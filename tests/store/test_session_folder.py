@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+
+from hybridmap.errors import StoreError
+from hybridmap.metrics import Metric
+from hybridmap.store import MapStore, SessionFolder
+from hybridmap.streams.base import Rig
+from tests.store.sessions import ring_map, write_session
+
+
+def test_a_session_is_refused_unless_overwritten_and_strangers_stay(tmp_path):
+    session = write_session(tmp_path / "s", ring_map())
+    (tmp_path / "s" / "notes.txt").write_text("mine")
+    with pytest.raises(StoreError, match="holds a session already"):
+        session.prepare()
+    session.prepare(overwrite=True)
+    assert not session.map_db.exists()
+    MapStore.create(session.path, "{}", Rig(), "new").close()
+    session.keep()
+    assert sorted(path.name for path in (tmp_path / "s").iterdir()) == ["map.db", "notes.txt"]
+
+
+def test_a_failed_overwrite_brings_the_old_session_back(tmp_path):
+    session = write_session(tmp_path / "s", ring_map())
+    before = session.map_db.read_bytes()
+    session.prepare(overwrite=True)
+    MapStore.create(session.path, "{}", Rig(), "new").close()
+    session.discard()
+    assert session.map_db.read_bytes() == before
+    assert session.groundtruth.is_file()
+    assert not (session.path / ".previous").exists()
+
+
+def test_a_failed_run_leaves_nothing(tmp_path):
+    session = SessionFolder(tmp_path / "new")
+    session.prepare()
+    session.write_config("{}")
+    session.discard()
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_folder_of_something_else_is_refused_even_with_overwrite(tmp_path):
+    (tmp_path / "thesis.tex").write_text("x")
+    for overwrite in (False, True):
+        with pytest.raises(StoreError, match=r"no session.*thesis\.tex"):
+            SessionFolder(tmp_path).prepare(overwrite=overwrite)
+    assert (tmp_path / "thesis.tex").read_text() == "x"
+    with pytest.raises(StoreError, match="is a file"):
+        SessionFolder(tmp_path / "thesis.tex").prepare()
+
+
+def test_remains_of_a_run_that_died_early_can_be_overwritten(tmp_path):
+    session = SessionFolder(tmp_path)
+    session.write_config("{}")
+    with pytest.raises(StoreError, match="holds a session already"):
+        session.prepare()
+    session.prepare(overwrite=True)
+    session.keep()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_metrics_are_merged_by_name_and_keep_the_head(tmp_path):
+    session = SessionFolder(tmp_path)
+    session.write_metrics({"graph_hash": "abc"}, [Metric("a/x", 1.0, "m", "A"), Metric("b/x", math.nan, "1", "B", 2.0, True)])
+    session.merge_metrics([Metric("c/x", 3.0, "s", "C"), Metric("a/x", 5.0, "m", "A")])
+    read = session.read_metrics()
+    assert read.head == {"graph_hash": "abc"}
+    assert [metric.name for metric in read.metrics] == ["a/x", "b/x", "c/x"]
+    assert read.metrics[0].value == 5.0
+    assert math.isnan(read.metrics[1].value)
+    assert read.metrics[1].bar == 2.0
+    assert read.metrics[1].passed is True
+    assert json.loads(session.metrics_json.read_text())["metrics"][1]["value"] is None
+
+
+def test_damaged_metrics_are_named(tmp_path):
+    session = SessionFolder(tmp_path)
+    session.metrics_json.write_text("{")
+    with pytest.raises(StoreError, match=r"metrics\.json: damaged"):
+        session.read_metrics()
+
+
+def test_require_says_what_is_missing(tmp_path):
+    with pytest.raises(StoreError, match="no such session folder"):
+        SessionFolder(tmp_path / "gone").require()
+    with pytest.raises(StoreError, match="holds no session"):
+        SessionFolder(tmp_path).require()
