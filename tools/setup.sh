@@ -20,12 +20,18 @@ if command -v flock >/dev/null; then
   flock 9
 fi
 
+# A virtual environment that an interrupted run left without pip, or without being one, is none.
+usable_venv() {
+  "$venv/bin/python" -c 'import importlib.util as u, sys
+sys.exit(sys.prefix == sys.base_prefix or sys.version_info < (3, 11) or u.find_spec("pip") is None)' >/dev/null 2>&1
+}
+
 suits() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; }
 
 find_python() {
   local candidate
   if [[ -n "${PYTHON:-}" ]]; then
-    suits "$PYTHON" || die "PYTHON=$PYTHON is $("$PYTHON" --version 2>&1 || true); hybridmap needs Python 3.11 or newer"
+    suits "$PYTHON" || die "PYTHON=$PYTHON does not run or is too old ($("$PYTHON" --version 2>&1 || true)); Python 3.11 or newer is needed"
     printf '%s' "$PYTHON"
     return
   fi
@@ -64,7 +70,7 @@ installed() {
 }
 
 install_packages() {
-  say "installing hybridmap and its dependencies into .venv (a minute or two, about 1.5 GB)"
+  say "installing hybridmap and its dependencies into .venv (a minute or two, 2 GB on disk)"
   rm -f "$stamp"
   "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --retries 5 --editable "$root[dev]" ||
     die "pip could not install the dependencies (see above); run it again once the cause is gone"
@@ -128,7 +134,7 @@ install_libraries() {
   return 1
 }
 
-if ! "$venv/bin/python" -c '' 2>/dev/null || ! suits "$venv/bin/python"; then create_venv; fi
+usable_venv || create_venv
 fresh=0
 if ! installed; then
   install_packages
