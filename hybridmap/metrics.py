@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,3 +47,19 @@ class Metric:
 def to_json(head: dict[str, Any], metrics: Iterable[Metric]) -> str:
     """One JSON object: the head's keys, then the flat list `metrics`."""
     return json.dumps({**head, "metrics": [metric.to_json() for metric in metrics]}, indent=2)
+
+
+class StageClock:
+    """Process time by stage; kept apart from results, which never depend on it."""
+
+    def __init__(self) -> None:
+        self.cpu_s: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the process time of the block to a stage."""
+        start = time.process_time()
+        try:
+            yield
+        finally:
+            self.cpu_s[name] = self.cpu_s.get(name, 0.0) + time.process_time() - start

@@ -80,6 +80,13 @@ class Backend(Protocol):
             BackendError: the graph cannot be solved; the state before the call is kept.
         """
 
+    def finish(self, graph: PoseGraph) -> Solution:
+        """End of the drive: the best solution of this back-end, from the state that `update` has reached.
+
+        Raises:
+            BackendError: the graph cannot be solved; the state before the call is kept.
+        """
+
     def solve(self, graph: PoseGraph | SupportsPoseGraph) -> Solution:
         """Solve a whole graph in a fresh state.
 

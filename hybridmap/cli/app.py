@@ -10,6 +10,8 @@ from typing import Annotated
 
 import typer
 
+from hybridmap.cli.demo import demo
+from hybridmap.cli.map import map_source
 from hybridmap.errors import HybridMapError
 
 app = typer.Typer(
@@ -41,10 +43,15 @@ def _options(
     os.environ["HYBRIDMAP_QUIET"] = "1" if quiet else ""
 
 
+app.command("demo")(demo)
+app.command("map")(map_source)
+
+
 def main() -> None:
     """Run the command line: every error is one line on standard error and exit code 2."""
     try:
-        app(prog_name="hybridmap", standalone_mode=False)
+        code = app(prog_name="hybridmap", standalone_mode=False)
+        raise SystemExit(code if isinstance(code, int) else 0)
     except HybridMapError as error:
         _fail(" ".join(str(error).split()))
     except Exception as error:

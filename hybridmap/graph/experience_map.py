@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +62,13 @@ class ExperienceMap:
     def __init__(self) -> None:
         self._nodes: list[Node] = []
         self._edges: list[Edge] = []
-        self._initial: list[Array] = []
+        self._initial = _Rows((3,), np.float64)
+        self._ends = _Rows((2,), np.int64)
+        self._deltas = _Rows((3,), np.float64)
+        self._information = _Rows((3, 3), np.float64)
+        self._kinds = _Rows((), np.int8)
+        self._accepted = _Rows((), np.bool_)
+        self._edges_into: dict[int, list[int]] = {}
 
     @property
     def nodes(self) -> tuple[Node, ...]:
@@ -73,6 +80,11 @@ class ExperienceMap:
         """Every edge ever considered, by number."""
         return tuple(self._edges)
 
+    @property
+    def initial(self) -> Array:
+        """(N, 3) pose of each node along the chain of odometry edges."""
+        return self._initial.view().copy()
+
     def __len__(self) -> int:
         return len(self._nodes)
 
@@ -83,6 +95,10 @@ class ExperienceMap:
     def edge(self, number: int) -> Edge:
         """One edge."""
         return self._edges[number]
+
+    def edges_into(self, node: int) -> tuple[int, ...]:
+        """Numbers of the edges whose target is a node."""
+        return tuple(self._edges_into.get(node, ()))
 
     def add_node(self, node: Node, initial: Array) -> int:
         """Append a node; `initial` (3,) is its pose along the chain of odometry edges. Returns its number."""
@@ -98,44 +114,83 @@ class ExperienceMap:
         """
         if not (0 <= edge.source < len(self) and 0 <= edge.target < len(self)) or edge.source == edge.target:
             raise GraphError(f"map: edge {edge.source} -> {edge.target} needs two different nodes of 0..{len(self) - 1}")
-        if edge.status is Status.ACCEPTED and edge.relative is None:
-            raise GraphError(f"map: edge {edge.source} -> {edge.target} was accepted without a measurement")
+        _require_measurement(edge)
         self._edges.append(edge)
+        for rows in (self._ends, self._deltas, self._information, self._kinds, self._accepted):
+            rows.grow()
+        self._write(len(self._edges) - 1)
+        self._edges_into.setdefault(edge.target, []).append(len(self._edges) - 1)
         return len(self._edges) - 1
 
     def set_status(self, number: int, status: Status, reason: str) -> None:
         """Change what became of an edge, and why."""
-        self._edges[number] = replace(self._edges[number], status=status, reason=reason)
+        self.update_edge(number, replace(self._edges[number], status=status, reason=reason))
 
     def update_edge(self, number: int, edge: Edge) -> None:
-        """Replace an edge by a later measurement or verdict between the same two nodes."""
+        """Replace an edge by a later measurement or verdict between the same two nodes.
+
+        Raises:
+            GraphError: the ends differ, or an accepted edge carries no measurement.
+        """
         before = self._edges[number]
         if (before.source, before.target) != (edge.source, edge.target):
             raise GraphError(
                 f"map: edge {number} joins {before.source} -> {before.target}, found {edge.source} -> {edge.target}"
             )
+        _require_measurement(edge)
         self._edges[number] = edge
-
-    def accepted(self) -> Iterator[tuple[int, Edge]]:
-        """Numbers and edges of the graph, in order of creation."""
-        return ((i, e) for i, e in enumerate(self._edges) if e.status is Status.ACCEPTED)
+        self._write(number)
 
     def pose_graph(self) -> PoseGraph:
         """Freeze the accepted edges into arrays."""
-        kept = list(self.accepted())
-        relatives = [e.relative for _, e in kept if e.relative is not None]
-        n = len(kept)
+        kept = np.flatnonzero(self._accepted.view())
+        ends = self._ends.view()[kept]
         return PoseGraph(
-            initial=np.array(self._initial, dtype=np.float64).reshape(len(self), 3),
-            sources=np.fromiter((e.source for _, e in kept), np.int64, n),
-            targets=np.fromiter((e.target for _, e in kept), np.int64, n),
-            deltas=np.array([r.delta for r in relatives], dtype=np.float64).reshape(n, 3),
-            information=_invert(np.array([r.covariance for r in relatives], dtype=np.float64).reshape(n, 3, 3)),
-            kinds=np.fromiter((e.kind for _, e in kept), np.int8, n),
-            edge_ids=np.fromiter((i for i, _ in kept), np.int64, n),
+            initial=self.initial,
+            sources=ends[:, 0],
+            targets=ends[:, 1],
+            deltas=self._deltas.view()[kept],
+            information=self._information.view()[kept],
+            kinds=self._kinds.view()[kept],
+            edge_ids=kept,
         )
+
+    def _write(self, number: int) -> None:
+        edge = self._edges[number]
+        accepted = edge.status is Status.ACCEPTED
+        self._ends.view()[number] = edge.source, edge.target
+        self._kinds.view()[number] = edge.kind
+        self._accepted.view()[number] = accepted
+        if edge.relative is not None:
+            self._deltas.view()[number] = edge.relative.delta
+            self._information.view()[number] = _invert(edge.relative.covariance) if accepted else 0.0
+
+
+class _Rows:
+    """Rows of an array that grows at its end without a copy at each row."""
+
+    def __init__(self, shape: tuple[int, ...], dtype: type[np.generic]) -> None:
+        self._data: NDArray[Any] = np.zeros((64, *shape), dtype=dtype)
+        self._count = 0
+
+    def view(self) -> NDArray[Any]:
+        return self._data[: self._count]
+
+    def grow(self) -> None:
+        if self._count == len(self._data):
+            self._data = np.concatenate([self._data, np.zeros_like(self._data)])
+        self._count += 1
+
+    def append(self, row: NDArray[Any]) -> None:
+        self.grow()
+        self._data[self._count - 1] = row
+
+
+def _require_measurement(edge: Edge) -> None:
+    if edge.status is Status.ACCEPTED and edge.relative is None:
+        raise GraphError(f"map: edge {edge.source} -> {edge.target} was accepted without a measurement")
 
 
 def _invert(covariance: Array) -> Array:
     information = np.linalg.inv(covariance)
-    return np.asarray(0.5 * (information + information.transpose(0, 2, 1)))
+    return np.asarray(0.5 * (information + information.T))

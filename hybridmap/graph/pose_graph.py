@@ -57,6 +57,19 @@ class PoseGraph:
         """(E,) which edges are loop closures, i.e. may be false."""
         return np.asarray(self.kinds == EdgeKind.LOOP)
 
+    def only(self, *kinds: EdgeKind) -> PoseGraph:
+        """The same nodes with only the edges of some kinds."""
+        kept = np.isin(self.kinds, kinds)
+        return PoseGraph(
+            self.initial,
+            self.sources[kept],
+            self.targets[kept],
+            self.deltas[kept],
+            self.information[kept],
+            self.kinds[kept],
+            self.edge_ids[kept],
+        )
+
     def validate(self) -> None:
         """Refuse a graph that no solver could take.
 

@@ -1,0 +1,65 @@
+"""From a source and the options of a command to the stream and the resolved configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hybridmap.config import Config, named_configs
+from hybridmap.errors import ConfigError
+from hybridmap.streams import open_stream
+from hybridmap.streams.base import Stream
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """A stream and the configuration to map it with."""
+
+    stream: Stream
+    config: Config
+
+
+def parse_settings(settings: list[str] | None) -> dict[str, Any]:
+    """`["nodes.distance_m=0.3"]` -> `{"nodes.distance_m": 0.3}`; values are read as YAML.
+
+    Raises:
+        ConfigError: no `=`, or a value that is not YAML.
+    """
+    parsed: dict[str, Any] = {}
+    for setting in settings or []:
+        key, equals, value = setting.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(f"--set {setting}: expected KEY=VALUE, e.g. nodes.distance_m=0.3")
+        try:
+            parsed[key.strip()] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise ConfigError(f"--set {setting}: the value is not YAML") from None
+    return parsed
+
+
+def choose(
+    source: str,
+    config_name: str | None,
+    overrides: Mapping[str, Any],
+    *,
+    start_s: float | None = None,
+    end_s: float | None = None,
+) -> Chosen:
+    """Open a source with its configuration; without `--config` the world's name or the sensors found choose it.
+
+    Raises:
+        StreamError: the source cannot be opened.
+        ConfigError: the configuration cannot be used.
+    """
+    world = source.removeprefix("sim:")
+    if config_name is None and world in named_configs() and not Path(source).exists():
+        config_name = world
+    if config_name is None:
+        probe = open_stream(source, Config.load(None, overrides), start_s=start_s, end_s=end_s)
+        config_name = "laser" if probe.rig.laser is not None else "rgbd"
+    config = Config.load(config_name, overrides)
+    return Chosen(open_stream(source, config, start_s=start_s, end_s=end_s), config)

@@ -1,0 +1,68 @@
+"""`hybridmap map`: a recording or a simulated world into a session folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hybridmap.cli.show import emit, progress
+
+Topic = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic to use instead of the one found.")]
+
+
+def map_source(
+    source: Annotated[str, typer.Argument(help="A .bag, .mcap or .db3 file, a ROS 2 bag or TUM folder, a .csv, or a world.")],
+    out: Annotated[Path, typer.Option(help="The session folder itself.")],
+    config: Annotated[str | None, typer.Option(help="Configuration: a name or a file. Default: by the sensors found.")] = None,
+    backend: Annotated[
+        list[str] | None, typer.Option(help="Back-end; repeatable, the first one drives the pose (map -> odom).")
+    ] = None,
+    start: Annotated[float | None, typer.Option(help="Begin so many seconds after the first stamp.")] = None,
+    end: Annotated[float | None, typer.Option(help="End so many seconds after the first stamp.")] = None,
+    odometry_topic: Topic = None,
+    scan_topic: Topic = None,
+    color_topic: Topic = None,
+    depth_topic: Topic = None,
+    camera_info_topic: Topic = None,
+    odometry_file: Annotated[str | None, typer.Option(help="TUM folder: the odometry file to use.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of every random draw.", min=0)] = None,
+    setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. nodes.distance_m=0.3.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a session that is there.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+) -> None:
+    """Map a recording: nodes, edges, back-ends, trajectories and a page, in one session folder."""
+    from hybridmap.cli.choose import choose, parse_settings
+
+    overrides: dict[str, Any] = {
+        "sensors.odometry_topic": odometry_topic,
+        "sensors.scan_topic": scan_topic,
+        "sensors.color_topic": color_topic,
+        "sensors.depth_topic": depth_topic,
+        "sensors.camera_info_topic": camera_info_topic,
+        "sensors.odometry_file": odometry_file,
+        "backends.names": backend or None,
+        "seed": seed,
+    }
+    overrides = {key: value for key, value in overrides.items() if value is not None} | parse_settings(setting)
+    chosen = choose(source, config, overrides, start_s=start, end_s=end)
+    head, metrics = map_and_report(chosen.stream, chosen.config, out, overwrite=overwrite)
+    emit(head, metrics, as_json=as_json, title=f"{out}: {chosen.stream.name}")
+    if not as_json:
+        typer.echo(f"page: {out / 'report.html'}")
+
+
+def map_and_report(stream: Any, config: Any, out: Path, *, overwrite: bool) -> tuple[dict[str, Any], list[Any]]:
+    """Run a session, evaluate it where the truth is known, write the page; returns head and figures of `metrics.json`."""
+    from hybridmap import session
+    from hybridmap.evaluate import evaluate_session
+    from hybridmap.report import write_report
+
+    with progress(f"mapping {stream.name}") as advance:
+        finished = session.run(stream, config, out, overwrite=overwrite, progress=advance)
+    if stream.groundtruth is not None:
+        evaluate_session(finished.folder.path)
+    write_report(finished.folder)
+    written = finished.folder.read_metrics()
+    return written.head, written.metrics

@@ -1,0 +1,295 @@
+"""The whole algorithm on one page: self-motion drives the cells, views close loops, both make the map, back-ends correct it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybridmap.backends.ensemble import Ensemble
+from hybridmap.config import Config
+from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, inverse
+from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
+from hybridmap.graph.motion_noise import odometry_covariance
+from hybridmap.graph.novelty import Novelty
+from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.uncertainty import relative_covariances
+from hybridmap.metrics import StageClock
+from hybridmap.neural.path_integrator import PathIntegrator
+from hybridmap.streams.base import LaserScan, RgbdFrame, Rig, Sample, SelfMotion, Velocity
+from hybridmap.streams.synchronise import Ready, Synchroniser
+from hybridmap.trajectory import NS_PER_S, stamp_ns_from_s
+from hybridmap.vision import create_front_end
+from hybridmap.vision.base import Belief, Proposal, Verdict, View
+
+_KINDS = {"loop": EdgeKind.LOOP, "registration": EdgeKind.REGISTRATION}
+_STATUS = {Verdict.ACCEPTED: Status.ACCEPTED, Verdict.PENDING: Status.PENDING, Verdict.REJECTED: Status.REJECTED}
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """What one instant did to the map, and why.
+
+    Attributes:
+        stamp_ns: of the sample.
+        pose_odom_robot: (3,) decoded from the path integrator's activity; `odom` begins where the drive begins.
+        pose_map_robot: (3,) by the primary back-end.
+        poses_map_robot: the same by every back-end, by name.
+        at_node, delta_node_robot: the node that the robot is at (-1 before the first) and its pose (3,) seen from it.
+        new_node: the experience made here, None if none was.
+        edges: numbers of the edges that are new or changed their verdict.
+        reason: why a node was made, or why not.
+    """
+
+    stamp_ns: int
+    pose_odom_robot: Array
+    pose_map_robot: Array
+    poses_map_robot: Mapping[str, Array]
+    at_node: int
+    delta_node_robot: Array
+    reason: str
+    new_node: int | None = None
+    edges: tuple[int, ...] = ()
+
+
+class Mapper:
+    """Builds an experience map from self-motion and views; usable without any file.
+
+    ```python
+    mapper = Mapper(Config.load("laser"), rig)
+    mapper.add_odometry(stamp_s, pose_odom_robot)
+    update = mapper.add_scan(stamp_s, ranges_m)
+    ```
+    """
+
+    def __init__(self, config: Config, rig: Rig | None = None) -> None:
+        """Set up every stage; `rig` says which sensors there are (default: those that the configuration describes).
+
+        Raises:
+            ConfigError: the configuration asks for a sensor that the rig does not have.
+            BackendError: it names an unknown back-end.
+        """
+        self.config = config
+        self.clock = StageClock()
+        self.map = ExperienceMap()
+        self.integrator = PathIntegrator(config.neural)
+        self.vision = create_front_end(config.vision, rig if rig is not None else config.sensors.rig(), config.seed)
+        self.backends = Ensemble(config.backends, self.clock)
+        self._synchroniser = Synchroniser()
+        self._novelty = Novelty(config.nodes)
+        self._stamp_ns = 0
+        self._travel_m = 0.0
+        self._at_node = -1
+        self._pose_odom_at_node: Array = IDENTITY
+        self._pose_map_at_node: dict[str, Array] = {}
+        self._since_node = (0.0, 0.0)
+        self._edge_of_proposal: dict[int, int] = {}
+
+    def add_odometry(self, stamp_s: float, pose_odom_robot: ArrayLike) -> Update | None:
+        """Take in a pose (3,) of `base_link` in `odom`; returns the newest update, None while nothing is ready."""
+        return _newest(self.add(SelfMotion(stamp_ns_from_s(stamp_s), np.asarray(pose_odom_robot, dtype=np.float64))))
+
+    def add_velocity(self, stamp_s: float, v_m_s: float, omega_rad_s: float) -> Update | None:
+        """Take in a forward speed and a turn rate that hold until the next call."""
+        return _newest(self.add(Velocity(stamp_ns_from_s(stamp_s), float(v_m_s), float(omega_rad_s))))
+
+    def add_rgbd(self, stamp_s: float, color: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> Update | None:
+        """Take in a frame: color (H, W, 3) uint8 RGB, depth (H, W) float32 in m, 0 where invalid.
+
+        A frame waits for odometry at or after its stamp: the update may come with a later call (None until then).
+        """
+        return _newest(self.add(RgbdFrame(stamp_ns_from_s(stamp_s), color, depth_m)))
+
+    def add_scan(self, stamp_s: float, ranges_m: ArrayLike) -> Update | None:
+        """Take in a scan (B,), m, NaN or Inf where there is no return; waits for odometry as `add_rgbd` does."""
+        ranges = np.array(ranges_m, dtype=np.float32)
+        ranges[~np.isfinite(ranges)] = np.nan
+        return _newest(self.add(LaserScan(stamp_ns_from_s(stamp_s), ranges)))
+
+    def add(self, sample: Sample) -> list[Update]:
+        """Take in any sample and do every step that it makes possible, in order of stamp.
+
+        Raises:
+            StreamError: NaN in the motion, or a stamp that goes back.
+        """
+        return [self.step(ready) for ready in self._synchroniser.push(sample)]
+
+    def step(self, ready: Ready) -> Update:
+        """One instant through the paper's figure: cells, view, experience, closure, correction."""
+        pose_odom = self._path_integrate(ready)
+        moved = between(self._pose_odom_at_node, pose_odom)
+        view = self._look(ready, moved)
+        if view is None and self.vision is not None:
+            return self._update(pose_odom, "no view at this instant")
+        reason = self._novelty.reason(moved, self.integrator.place_code, view is not None and view.new_template)
+        if reason is None:
+            return self._update(pose_odom, "nothing new")
+        node = self._make_node(pose_odom, moved, view)
+        edges = self._join_to_chain(node)
+        if view is not None:
+            edges += self._refine_self_motion(node, view)
+            edges += self._close_loops(node)
+        self._since_node = (0.0, 0.0)
+        self._correct()
+        return self._update(pose_odom, reason, node, edges)
+
+    def finish(self) -> list[Update]:
+        """End of the drive: settle what waits, propose loops again on the optimised map, let every back-end finish."""
+        updates = [self.step(ready) for ready in self._synchroniser.flush()]
+        pose_odom = self.integrator.pose
+        while self.vision is not None and len(self.map):
+            with self.clock.stage("matching"):
+                proposals = self.vision.finish(self.belief())
+            edges = self._enter(proposals)
+            if not edges:
+                break
+            self._correct()
+            updates.append(self._update(pose_odom, "loops proposed again on the optimised map", None, edges))
+            if not any(proposal.verdict is Verdict.ACCEPTED for proposal in proposals):
+                break
+        if len(self.map):
+            self._correct(final=True)
+            updates.append(self._update(pose_odom, "end of the drive"))
+        return updates
+
+    @property
+    def pose_map_robot(self) -> Array:
+        """(3,) where the robot is, by the primary back-end."""
+        return self._update(self.integrator.pose, "").pose_map_robot
+
+    @property
+    def pose_map_odom(self) -> Array:
+        """(3,) the correction `map -> odom` (REP-105) for the odometry as it came in."""
+        pose_odom = compose(self._synchroniser.pose_odom_start, self.integrator.pose)
+        return compose(self.pose_map_robot, inverse(pose_odom))
+
+    def poses(self, backend: str | None = None) -> Array:
+        """(N, 3) current poses of all nodes by a back-end (default: the primary)."""
+        return self.backends.poses(self.map.pose_graph(), backend)
+
+    def belief(self) -> Belief:
+        """What the map believes, for the gating of loop closures."""
+        own = self.config.edges.gate == "odometry"
+        graph = self.map.pose_graph().only(EdgeKind.ODOMETRY) if own else self.map.pose_graph()
+        return Belief(
+            poses_map_node=graph.initial if own else self.backends.poses(graph),
+            stamps_s=np.array([node.stamp_ns for node in self.map.nodes]) / NS_PER_S,
+            travel_m=np.array([node.travel_m for node in self.map.nodes]),
+            covariance_from=lambda node: relative_covariances(graph, node),
+        )
+
+    def _correct(self, final: bool = False) -> None:
+        """Give the graph to every back-end."""
+        graph = self.map.pose_graph()
+        if final:
+            self.backends.finish(graph)
+        else:
+            self.backends.update(graph)
+        names = self.config.backends.names
+        self._pose_map_at_node = {name: self.backends.poses(graph, name)[self._at_node] for name in names}
+
+    def _path_integrate(self, ready: Ready) -> Array:
+        with self.clock.stage("neural"):
+            self.integrator.step(ready.delta_robot, ready.dt_s)
+            pose_odom = self.integrator.pose
+        self._stamp_ns = ready.stamp_ns
+        travel_m, turn_rad = float(np.hypot(ready.delta_robot[0], ready.delta_robot[1])), abs(float(ready.delta_robot[2]))
+        self._travel_m += travel_m
+        self._since_node = (self._since_node[0] + travel_m, self._since_node[1] + turn_rad)
+        return pose_odom
+
+    def _look(self, ready: Ready, moved: Array) -> View | None:
+        if self.vision is None or ready.observation is None:
+            return None
+        with self.clock.stage("profile"):
+            return self.vision.observe(ready.observation, moved if len(self.map) else IDENTITY)
+
+    def _make_node(self, pose_odom: Array, moved: Array, view: View | None) -> int:
+        code = self.integrator.place_code
+        template = view.template if view is not None else -1
+        initial = compose(self.map.initial[self._at_node], moved) if len(self.map) else pose_odom
+        node = self.map.add_node(Node(self._stamp_ns, pose_odom, code, template, self._travel_m), initial)
+        self._novelty.remember(code)
+        return node
+
+    def _join_to_chain(self, node: int) -> list[int]:
+        """Join the new node to the one that the robot was at; from now on the robot is at the new one."""
+        edges = []
+        if node > 0:
+            reason = "consecutive" if self._at_node == node - 1 else "re-hung on the matched node"
+            relative = self._odometry_from(self._pose_odom_at_node, node)
+            edge = Edge(self._at_node, node, EdgeKind.ODOMETRY, Status.ACCEPTED, reason, relative)
+            edges.append(self.map.add_edge(edge))
+        self._at_node, self._pose_odom_at_node = node, self.map.node(node).pose_odom
+        return edges
+
+    def _odometry_from(self, pose_odom_before: Array, node: int) -> RelativePose:
+        covariance = odometry_covariance(self.config.edges, *self._since_node)
+        return RelativePose(between(pose_odom_before, self.map.node(node).pose_odom), covariance)
+
+    def _refine_self_motion(self, node: int, view: View) -> list[int]:
+        assert self.vision is not None
+        with self.clock.stage("tracking"):
+            self.vision.add_node(node, view)
+            odometry = self._odometry_from(self.map.node(node - 1).pose_odom, node) if node > 0 else None
+            proposals = self.vision.track(node, odometry)
+        return self._enter(proposals) if self.config.edges.hanging == "chain" else []
+
+    def _close_loops(self, node: int) -> list[int]:
+        assert self.vision is not None
+        with self.clock.stage("matching"):
+            proposals = self.vision.close(node, self.belief())
+        edges = self._enter(proposals)
+        closed = [p for p in proposals if p.verdict is Verdict.ACCEPTED and p.source == node and p.relative is not None]
+        if closed and self.config.edges.hanging == "ratslam":
+            matched = closed[0]
+            assert matched.relative is not None
+            self._at_node = matched.target
+            self._pose_odom_at_node = compose(self._pose_odom_at_node, matched.relative.delta)
+        return edges
+
+    def _enter(self, proposals: list[Proposal]) -> list[int]:
+        """Write proposals into the map; a later one with the same key replaces the edge of the earlier."""
+        changed = []
+        for proposal in proposals:
+            edge = Edge(
+                proposal.source,
+                proposal.target,
+                _KINDS[proposal.kind],
+                _STATUS[proposal.verdict],
+                proposal.reason,
+                proposal.relative,
+                proposal.scores,
+            )
+            if proposal.key in self._edge_of_proposal:
+                number = self._edge_of_proposal[proposal.key]
+                self.map.update_edge(number, edge)
+            else:
+                number = self._edge_of_proposal[proposal.key] = self.map.add_edge(edge)
+            changed.append(number)
+            if proposal.contradicts_odometry and self.config.edges.drop_contradicted:
+                changed += self._drop_odometry(proposal)
+        return changed
+
+    def _drop_odometry(self, proposal: Proposal) -> list[int]:
+        ends = {proposal.source, proposal.target}
+        dropped = [
+            number
+            for number in self.map.edges_into(max(ends))
+            if self.map.edge(number).kind is EdgeKind.ODOMETRY and self.map.edge(number).source in ends
+        ]
+        for number in dropped:
+            self.map.set_status(number, Status.REJECTED, f"contradicted by registration: {proposal.reason}")
+        return dropped
+
+    def _update(self, pose_odom: Array, reason: str, node: int | None = None, edges: list[int] | None = None) -> Update:
+        moved = between(self._pose_odom_at_node, pose_odom)
+        on_map = {name: compose(pose, moved) for name, pose in self._pose_map_at_node.items()}
+        primary = on_map.get(self.backends.primary, pose_odom)
+        return Update(self._stamp_ns, pose_odom, primary, on_map, self._at_node, moved, reason, node, tuple(edges or ()))
+
+
+def _newest(updates: list[Update]) -> Update | None:
+    return updates[-1] if updates else None

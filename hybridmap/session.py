@@ -1,0 +1,230 @@
+"""A session: stream -> mapper -> map file, with progress, and the figures at its end."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hybridmap.backends import objective
+from hybridmap.config import Config
+from hybridmap.errors import HybridMapError, StreamError
+from hybridmap.geometry import Array, between, compose
+from hybridmap.graph.experience_map import Status
+from hybridmap.graph.hashing import graph_hash
+from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.mapper import Mapper, Update
+from hybridmap.metrics import Metric
+from hybridmap.store import MapStore
+from hybridmap.store.session_folder import SessionFolder
+from hybridmap.store.track import trajectory_of
+from hybridmap.streams.base import Observation, Stream
+from hybridmap.trajectory import NS_PER_S
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[int, int | None], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """A finished session.
+
+    Attributes:
+        folder: where it lies.
+        head: the keys of `metrics.json` beside its list.
+        metrics: the figures.
+    """
+
+    folder: SessionFolder
+    head: dict[str, Any]
+    metrics: list[Metric]
+
+
+def run(stream: Stream, config: Config, out: Path, *, overwrite: bool = False, progress: Progress | None = None) -> Session:
+    """Map a stream into a session folder.
+
+    The map file is written as the run proceeds: a run that is killed leaves a readable map up to its last node. When
+    the input turns out to be unusable, what this run wrote is removed and what an overwritten session held is put back.
+
+    Args:
+        stream: the samples.
+        config: every setting; saved resolved.
+        out: the session folder itself.
+        overwrite: replace a session that is there.
+        progress: called with (observations done, observations expected).
+
+    Raises:
+        StreamError: the stream is damaged or unordered, or gave nothing to map.
+        StoreError: the folder cannot be used.
+        ConfigError, BackendError: a sensor or back-end that there is not.
+    """
+    mapper = Mapper(config, stream.rig)
+    folder = SessionFolder(out)
+    folder.prepare(overwrite=overwrite)
+    try:
+        folder.write_config(config.to_yaml())
+        with MapStore.create(folder.path, config.to_yaml(), stream.rig, stream.name) as store:
+            recorder = _Recorder(mapper, store)
+            _drive(stream, mapper, recorder, progress)
+            session = _conclude(stream, mapper, recorder, folder)
+    except HybridMapError:
+        folder.discard()
+        raise
+    folder.keep()
+    return session
+
+
+def _drive(stream: Stream, mapper: Mapper, recorder: _Recorder, progress: Progress | None) -> None:
+    observations = 0
+    for sample in stream:
+        for update in mapper.add(sample):
+            recorder.record(update)
+        if isinstance(sample, Observation):
+            observations += 1
+            if progress is not None:
+                progress(observations, stream.expected_observations)
+    for update in mapper.finish():
+        recorder.record(update)
+    if not len(mapper.map):
+        counts = ", ".join(f"{count} {name}" for name, count in stream.report.counts.items()) or "no sample"
+        raise StreamError(f"{stream.name}: gave nothing to map (found {counts}); expected odometry and views at the same time")
+
+
+class _Recorder:
+    """Writes what each update did into the map file, one transaction a node."""
+
+    def __init__(self, mapper: Mapper, store: MapStore) -> None:
+        self.store = store
+        self.largest_correction_m = 0.0
+        self._mapper = mapper
+        self._before_first_node: list[Update] = []
+        self._last_stamp_ns = -1
+        self._poses = np.zeros((0, 3))
+
+    def record(self, update: Update) -> None:
+        """Take in one update."""
+        if update.new_node is not None:
+            self._write_node(update.new_node)
+        for number in update.edges:
+            self.store.put_edge(number, self._mapper.map.edge(number))
+        if update.at_node < 0:
+            self._before_first_node.append(update)
+            return
+        if update.new_node is not None or update.edges:
+            self._note_correction(update)
+        for early in self._before_first_node:
+            self._write_track(early, 0, between(self._mapper.map.node(0).pose_odom, early.pose_odom_robot))
+        self._before_first_node.clear()
+        self._write_track(update, update.at_node, update.delta_node_robot)
+        if update.new_node is not None:
+            self.store.commit()
+
+    def _write_node(self, number: int) -> None:
+        mapper = self._mapper
+        keyframe = mapper.vision.keyframe(number) if mapper.vision is not None else {}
+        initial = mapper.map.initial[number]
+        self.store.add_node(number, mapper.map.node(number), initial, keyframe, mapper.integrator.snapshot())
+
+    def _write_track(self, update: Update, node: int, delta: Array) -> None:
+        if update.stamp_ns <= self._last_stamp_ns:
+            return
+        self._last_stamp_ns = update.stamp_ns
+        self.store.add_track(update.stamp_ns, node, delta, update.pose_odom_robot)
+        for backend in self._mapper.config.backends.names:
+            pose = update.poses_map_robot.get(backend, update.pose_odom_robot)
+            self.store.add_online(backend, update.stamp_ns, pose)
+
+    def _note_correction(self, update: Update) -> None:
+        """Keep the map just before and after the largest shift of the robot on it."""
+        poses = self._mapper.poses()
+        known = len(self._poses)
+        if known and update.edges:
+            seen = self._mapper.map.initial
+            carried = compose(self._poses[-1], between(seen[known - 1], seen[known:])) if len(poses) > known else seen[:0]
+            before = np.concatenate([self._poses, carried])
+            shift_m = float(np.hypot(*(poses[:, :2] - before[:, :2]).T).max())
+            if shift_m > self.largest_correction_m:
+                self.largest_correction_m = shift_m
+                self.store.put_info(
+                    "largest_correction",
+                    {
+                        "stamp_ns": update.stamp_ns,
+                        "node": len(poses) - 1,
+                        "shift_m": shift_m,
+                        "before": before.tolist(),
+                        "after": poses.tolist(),
+                    },
+                )
+        self._poses = poses
+
+
+def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: SessionFolder) -> Session:
+    store = recorder.store
+    track = store.track()
+    folder.write_trajectory("odometry", track.odometry)
+    for name in mapper.config.backends.names:
+        solution = mapper.backends.solutions.get(name)
+        if solution is not None:
+            store.put_solution(name, solution.poses, solution.report)
+            folder.write_trajectory(name, trajectory_of(track, solution.poses))
+            folder.write_trajectory(f"{name}_online", store.online(name))
+    if stream.groundtruth is not None:
+        folder.write_groundtruth(stream.groundtruth)
+    head = {
+        "graph_hash": graph_hash(mapper.map),
+        "primary_backend": mapper.backends.primary,
+        "backends": list(mapper.config.backends.names),
+        "source": stream.name,
+        "failed_backends": dict(mapper.backends.failures),
+        "stream": dict(stream.report.counts),
+        "remarks": list(stream.report.remarks),
+    }
+    for key in ("graph_hash", "primary_backend"):
+        store.put_info(key, head[key])
+    metrics = _figures(mapper, recorder, float(track.stamps_ns[-1] - track.stamps_ns[0]) / NS_PER_S)
+    folder.write_metrics(head, metrics)
+    return Session(folder, head, metrics)
+
+
+def _figures(mapper: Mapper, recorder: _Recorder, duration_s: float) -> list[Metric]:
+    edges = mapper.map.edges
+    loops = [edge for edge in edges if edge.kind is EdgeKind.LOOP]
+    dropped = [edge for edge in edges if edge.kind is EdgeKind.ODOMETRY and edge.status is not Status.ACCEPTED]
+    count = {status: float(sum(edge.status is status for edge in loops)) for status in Status}
+    rows = [
+        Metric("nodes", len(mapper.map), "1", "experiences"),
+        Metric("loops_accepted", count[Status.ACCEPTED], "1", "loop closures in the graph"),
+        Metric("loops_pending", count[Status.PENDING], "1", "loop closures still waiting at the end"),
+        Metric("loops_rejected", count[Status.REJECTED], "1", "loop closures refused, each with its reason"),
+        Metric("odometry_dropped", len(dropped), "1", "odometry edges that a registration contradicted"),
+        Metric("largest_correction", recorder.largest_correction_m, "m", "largest shift of a node at one closure"),
+        Metric("travel", mapper.map.node(len(mapper.map) - 1).travel_m, "m", "path length by odometry"),
+        Metric("duration", duration_s, "s", "length of the recording"),
+    ]
+    graph = mapper.map.pose_graph()
+    chain = objective.chi2(graph, graph.initial)
+    rows += [
+        Metric("chi2_initial/odometry", chain, "1", "referee's chi2 of the odometry chain"),
+        Metric("chi2/odometry", chain, "1", "referee's chi2 of the odometry chain"),
+    ]
+    for name, solution in mapper.backends.solutions.items():
+        if name == "odometry":
+            continue
+        report = solution.report
+        rows += [
+            Metric(f"chi2_initial/{name}", report.chi2_initial, "1", "referee's chi2 before the last solve"),
+            Metric(f"chi2/{name}", objective.chi2(graph, solution.poses), "1", f"referee's chi2 at the end: {report.status}"),
+            Metric(f"loops_rejected/{name}", len(report.rejected_edge_ids), "1", "accepted loops that it gave no weight"),
+        ]
+    for stage, cpu_s in mapper.clock.cpu_s.items():
+        rows.append(Metric(f"cpu_s/{stage}", cpu_s, "s", "process time of the stage"))
+    total = sum(mapper.clock.cpu_s.values())
+    rows.append(Metric("cpu_s/mapping", total, "s", "process time of all stages"))
+    if duration_s > 0:
+        rows.append(Metric("cpu_s_per_min", 60.0 * total / duration_s, "s/min", "process time a minute of recording"))
+    return rows
