@@ -2,11 +2,50 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
 
 from hybridmap.config.laser import LaserConfig
 from hybridmap.config.rgbd import RgbdConfig
 from hybridmap.config.section import Section
+
+
+class ProfileConfig(Section):
+    """The scanline profile (eq. 11): what one frame is boiled down to."""
+
+    width: int = Field(default=64, ge=8, le=1024)
+    """b: columns of a profile."""
+    bands: int = Field(default=4, ge=1, le=32)
+    """Row bands an image is cut into for the `four-band` matching; the seed's modes always use the whole column."""
+    normalise: Literal["z", "mean"] = "z"
+    """`z`: mean 0 and standard deviation 1; `mean`: divided by its mean (the seed's reading; ranks worse)."""
+
+
+class MatchingConfig(Section):
+    """Comparison of profiles (eq. 12 and 13)."""
+
+    mu_r: float = Field(default=0.7, ge=0, le=1)
+    """mu_R, weight of the intensity profile."""
+    mu_d: float = Field(default=0.3, ge=0, le=1)
+    """mu_D, weight of the depth profile; mu_R + mu_D = 1. A laser has depth only and ignores both."""
+    max_shift: int = Field(default=16, ge=0)
+    """Largest shift |c| tried, columns; less than the profile's width."""
+    g_bar: Literal["templates", "shifts"] = "templates"
+    """What g_bar is: the mean of g_min over the stored templates, or the mean of g over the shifts of the pair."""
+    c_t: float | None = Field(default=None)
+    """Threshold: a match when G < c_t. None: no threshold where candidates are verified, else a moderate one for the mode."""
+
+
+class TemplatesConfig(Section):
+    """View templates: when a view is new."""
+
+    threshold: float = Field(default=0.5, gt=0)
+    """A view is new when its profile differs by more than this from every template (mean absolute difference)."""
+    stable_frames: int = Field(default=3, ge=1)
+    """A new view founds a template when it has been new in this many consecutive frames."""
+    max_shift: int = Field(default=4, ge=0)
+    """Largest shift tried against the templates, columns."""
 
 
 class VisionConfig(Section):
@@ -14,7 +53,22 @@ class VisionConfig(Section):
 
     sensor: Literal["auto", "laser", "rgbd", "none"] = "auto"
     """The sensor to map with; `auto` takes laser if the source has one, else RGB-D."""
+    profile: ProfileConfig = ProfileConfig()
+    """Scanline profiles."""
+    matching: MatchingConfig = MatchingConfig()
+    """Comparison of profiles."""
+    templates: TemplatesConfig = TemplatesConfig()
+    """View templates."""
     laser: LaserConfig = LaserConfig()
     """Laser front-end."""
     rgbd: RgbdConfig = RgbdConfig()
     """RGB-D front-end."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if abs(self.matching.mu_r + self.matching.mu_d - 1.0) > 1e-9:
+            raise ValueError(f"matching: mu_r + mu_d must be 1, found {self.matching.mu_r + self.matching.mu_d:g}")
+        for name, shift in (("matching", self.matching.max_shift), ("templates", self.templates.max_shift)):
+            if shift >= self.profile.width:
+                raise ValueError(f"{name}.max_shift must be less than profile.width {self.profile.width}, found {shift}")
+        return self
