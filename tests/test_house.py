@@ -1,0 +1,111 @@
+"""What holds for the package as a whole: cheap imports, a complete wheel, documented and small modules, layers."""
+
+import ast
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "hybridmap"
+MODULES = sorted(path.relative_to(ROOT) for path in PACKAGE.rglob("*.py"))
+HEAVY = ("open3d", "matplotlib", "gtsam", "cv2", "scipy", "rosbags")
+MAX_FILE_LINES = 400
+MAX_FUNCTION_LINES = 60
+
+HELP = f"""
+import sys
+sys.argv = ["hybridmap", "--help"]
+from hybridmap.cli import main
+try:
+    main()
+except SystemExit as stop:
+    assert not stop.code, stop.code
+print("HEAVY", [name for name in {HEAVY!r} if name in sys.modules])
+"""
+
+BY_NAME = """
+import sys, hybridmap
+from pathlib import Path
+from hybridmap.config import Config, named_configs
+assert Path(hybridmap.__file__).is_relative_to(sys.argv[1]), hybridmap.__file__
+for name, path in named_configs().items():
+    assert path.is_relative_to(sys.argv[1]), path
+    Config.load(name)
+print(" ".join(named_configs()))
+"""
+
+
+def run(*command: str | Path, cwd: Path, path: Path | None = None) -> str:
+    env = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    if path is not None:
+        env["PYTHONPATH"] = str(path)
+    done = subprocess.run([*map(str, command)], cwd=cwd, env=env, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_help_loads_no_heavy_library(tmp_path: Path) -> None:
+    out = run(sys.executable, "-c", HELP, cwd=tmp_path)
+    assert "Usage: hybridmap" in out
+    assert out.splitlines()[-1] == "HEAVY []"
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+def test_wheel_holds_every_file_that_the_package_reads(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    expected = {str(path) for path in MODULES}
+    expected |= {f"hybridmap/configs/{path.name}" for path in (ROOT / "configs").glob("*.yaml")}
+    expected |= {str(path.relative_to(ROOT)) for path in PACKAGE.rglob("*.j2")}
+    assert expected - names == set()
+    assert [name for name in names if name.endswith("licenses/LICENSE")]
+
+
+def test_configurations_are_found_by_name_outside_a_checkout(wheel: Path, tmp_path: Path) -> None:
+    installed, empty = tmp_path / "installed", tmp_path / "empty"
+    empty.mkdir()
+    pip = (sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", installed, wheel)
+    run(*pip, cwd=empty)
+    names = run(sys.executable, "-c", BY_NAME, installed, cwd=empty, path=installed).split()
+    assert names == sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
+    assert {"rgbd", "laser"} <= set(names)
+
+
+def public(tree: ast.Module) -> list[ast.Module | ast.ClassDef | ast.FunctionDef]:
+    """The module itself and every public class, function and method at any depth of public classes."""
+    found: list[ast.Module | ast.ClassDef | ast.FunctionDef] = [tree]
+    for node in found:
+        if not isinstance(node, ast.FunctionDef):
+            children = (child for child in node.body if isinstance(child, ast.ClassDef | ast.FunctionDef))
+            found += [child for child in children if not child.name.startswith("_")]
+    return found
+
+
+@pytest.mark.parametrize("module", MODULES, ids=str)
+def test_everything_public_is_documented(module: Path) -> None:
+    tree = ast.parse((ROOT / module).read_text())
+    assert [getattr(node, "name", "module") for node in public(tree) if not ast.get_docstring(node)] == []
+
+
+@pytest.mark.parametrize("module", MODULES, ids=str)
+def test_files_and_functions_stay_small(module: Path) -> None:
+    text = (ROOT / module).read_text()
+    assert len(text.splitlines()) <= MAX_FILE_LINES
+    functions = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)]
+    long = {f.name: f.end_lineno - f.lineno + 1 for f in functions if f.end_lineno - f.lineno >= MAX_FUNCTION_LINES}
+    assert long == {}
+
+
+def test_imports_point_only_to_earlier_stages() -> None:
+    out = run(Path(sys.executable).with_name("lint-imports"), "--no-cache", cwd=ROOT)
+    assert " 0 broken" in out
