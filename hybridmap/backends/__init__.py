@@ -1,1 +1,7 @@
-"""backends."""
+"""Solvers: one frozen graph in, poses and a typed report out. They know no sensors; `create` makes one by name."""
+
+from hybridmap.backends.base import Backend, Solution, SolveReport, SolveStatus, SupportsPoseGraph
+from hybridmap.backends.registry import create, names
+from hybridmap.backends.replay import replay
+
+__all__ = ["Backend", "Solution", "SolveReport", "SolveStatus", "SupportsPoseGraph", "create", "names", "replay"]

@@ -2,9 +2,66 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from hybridmap.config.section import Section
+
+
+class RelaxationConfig(Section):
+    """The paper's correction rule and its stable relatives."""
+
+    theta: float = Field(default=0.5, gt=0, le=1)
+    """Correction rate, the paper's vartheta."""
+    theta_decay: float = Field(default=1.0, gt=0, le=1)
+    """`relaxation-ratslam`: factor on theta after every sweep of one call; below 1 it removes the limit cycle."""
+    sweeps_per_node: int = Field(default=20, ge=1)
+    """Sweeps each time the graph has grown."""
+    solve_sweeps: int = Field(default=2000, ge=1)
+    """Most sweeps when a whole graph is solved at once."""
+    tolerance_m: float = Field(default=1e-6, ge=0)
+    """A sweep that moves no node by more (m; 1 rad counts as 1 m) ends the relaxation."""
+    on_unstable: Literal["refuse", "normalise", "run"] = "run"
+    """`relaxation-paper` where theta >= theta_max = 2/lambda_max: report `diverged` without a sweep, divide theta by each
+    node's degree, or run it and report what happened. It never returns a worse map than it got."""
+
+
+class GncConfig(Section):
+    """Graduated non-convexity (truncated least squares) on the loop edges; other edges are known inliers."""
+
+    start: Literal["auto", "batch", "grow"] = "auto"
+    """`batch` starts at the graph's initial poses, `grow` adds the nodes by chunks, `auto` takes the lower robust cost."""
+    chunk_nodes: int = Field(default=500, ge=10)
+    """`grow`: nodes a chunk."""
+    mu_factor: float = Field(default=4.0, gt=1)
+    """Growth of the control parameter mu from round to round."""
+    max_rounds: int = Field(default=60, ge=1)
+    """Most rounds of weights and one step."""
+    quantile: float = Field(default=0.99, gt=0.5, lt=1)
+    """A loop is an inlier while its squared Mahalanobis residual is below this quantile of chi2 with 3 degrees of freedom."""
+
+
+class RobustConfig(Section):
+    """Kernels on the loop edges."""
+
+    cauchy_scale: float = Field(default=1.0, gt=0)
+    """Whitened residual at which a Cauchy weight is one half."""
+    huber_scale: float = Field(default=1.345, gt=0)
+    """Whitened residual from which a Huber cost is linear."""
+    dcs_phi: float = Field(default=1.0, gt=0)
+    """Dynamic covariance scaling: squared whitened residual from which a loop is scaled down."""
+
+
+class Isam2Config(Section):
+    """Incremental smoothing."""
+
+    loop_kernel: Literal["none", "cauchy"] = "cauchy"
+    """Kernel on the loop edges."""
+    relinearize_threshold: float = Field(default=0.01, gt=0)
+    """Largest step of a variable (m, rad) before it is linearised anew."""
+    settle_updates: int = Field(default=3, ge=0)
+    """Empty updates after a loop edge was added or removed."""
 
 
 class BackendsConfig(Section):
@@ -12,3 +69,13 @@ class BackendsConfig(Section):
 
     names: tuple[str, ...] = Field(default=("gtsam-gnc", "relaxation-ratslam"), min_length=1)
     """Names; the first is the primary."""
+    max_iterations: int = Field(default=100, ge=1)
+    """Most iterations of a batch optimiser."""
+    relaxation: RelaxationConfig = RelaxationConfig()
+    """Relaxation rules."""
+    robust: RobustConfig = RobustConfig()
+    """Robust kernels."""
+    gnc: GncConfig = GncConfig()
+    """Graduated non-convexity."""
+    isam2: Isam2Config = Isam2Config()
+    """Incremental smoothing."""

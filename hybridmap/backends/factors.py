@@ -1,0 +1,80 @@
+"""Graphs and poses in GTSAM's terms, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from hybridmap.geometry import Array
+from hybridmap.graph.pose_graph import PoseGraph
+
+_PRIOR_SIGMA = 1e-3  # zero residual at the optimum: fixes the frame without touching chi2
+
+Wrap = Callable[[Any], Any]
+
+
+class NoiseModels:
+    """Noise models shared between edges of equal information; `wrap` (a kernel) is for loop edges."""
+
+    def __init__(self, wrap: Wrap | None = None) -> None:
+        self._plain: dict[bytes, Any] = {}
+        self._robust: dict[bytes, Any] = {}
+        self._wrap = wrap
+
+    def __call__(self, information: Array, *, loop: bool) -> Any:
+        """The noise model of one edge."""
+        key = information.tobytes()
+        model = self._plain.get(key)
+        if model is None:
+            model = self._plain[key] = gtsam.noiseModel.Gaussian.Information(information)
+        if not loop or self._wrap is None:
+            return model
+        robust = self._robust.get(key)
+        if robust is None:
+            robust = self._robust[key] = self._wrap(model)
+        return robust
+
+
+def factors(graph: PoseGraph, models: NoiseModels) -> list[Any]:
+    """A between factor for every edge, in the graph's order."""
+    make, pose = gtsam.BetweenFactorPose2, gtsam.Pose2
+    rows = zip(
+        graph.sources.tolist(),
+        graph.targets.tolist(),
+        graph.deltas.tolist(),
+        graph.information,
+        graph.is_loop.tolist(),
+        strict=True,
+    )
+    return [make(s, t, pose(*delta), models(info, loop=loop)) for s, t, delta, info, loop in rows]
+
+
+def anchor(initial: Array) -> Any:
+    """The prior that fixes node 0 at `initial` (3,)."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, _PRIOR_SIGMA)
+    return gtsam.PriorFactorPose2(0, gtsam.Pose2(*initial), noise)
+
+
+def factor_graph(graph: PoseGraph, models: NoiseModels) -> Any:
+    """All edges and the anchor as a `NonlinearFactorGraph`."""
+    out = gtsam.NonlinearFactorGraph()
+    for factor in factors(graph, models):
+        out.push_back(factor)
+    out.push_back(anchor(graph.initial[0]))
+    return out
+
+
+def values(poses: Array, first: int = 0) -> Any:
+    """Poses `(N, 3)` as `gtsam.Values` with keys from `first` on."""
+    out = gtsam.Values()
+    for key, pose in enumerate(poses.tolist(), start=first):
+        out.insert(key, gtsam.Pose2(*pose))
+    return out
+
+
+def poses_of(result: Any) -> Array:
+    """`gtsam.Values` with keys 0..N-1 as `(N, 3)`."""
+    return np.array(gtsam.utilities.extractPose2(result), dtype=np.float64).reshape(-1, 3)

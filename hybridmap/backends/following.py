@@ -1,0 +1,187 @@
+"""Following a growing graph: what is new, what is gone, and when a solver has to work at all."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.backends.base import Solution, SolveReport, SolveStatus, SupportsPoseGraph
+from hybridmap.backends.objective import chi2
+from hybridmap.config.backends import BackendsConfig
+from hybridmap.errors import BackendError
+from hybridmap.geometry import Array, between, compose
+from hybridmap.graph.connectivity import extend, require_connected
+from hybridmap.graph.pose_graph import PoseGraph
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a solver says: poses (N, 3), why it stopped, loop edge id -> final weight."""
+
+    poses: Array
+    status: SolveStatus
+    message: str
+    iterations: int
+    weights: dict[int, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """Difference of two states of one graph; a measurement that changed counts as removed and added.
+
+    Attributes:
+        added: (A,) indices into the new graph's edges.
+        removed: (R,) indices into the old graph's edges.
+        closes: some node that was there before got or lost an edge, so that solved poses may move.
+    """
+
+    added: NDArray[np.int64]
+    removed: NDArray[np.int64]
+    closes: bool
+
+
+def edges_subset(graph: PoseGraph, edges: NDArray[np.int64] | NDArray[np.bool_]) -> PoseGraph:
+    """The same nodes with some of the edges."""
+    return PoseGraph(
+        graph.initial,
+        graph.sources[edges],
+        graph.targets[edges],
+        graph.deltas[edges],
+        graph.information[edges],
+        graph.kinds[edges],
+        graph.edge_ids[edges],
+    )
+
+
+def prefix(graph: PoseGraph, nodes: int) -> PoseGraph:
+    """The first `nodes` nodes and the edges among them."""
+    inside = np.maximum(graph.sources, graph.targets) < nodes
+    return replace(edges_subset(graph, inside), initial=graph.initial[:nodes])
+
+
+def difference(old: PoseGraph | None, new: PoseGraph) -> Change:
+    """What happened between two states of one graph."""
+    if old is None:
+        return Change(np.arange(new.n_edges), np.arange(0), closes=True)
+    _, i_old, i_new = np.intersect1d(old.edge_ids, new.edge_ids, assume_unique=True, return_indices=True)
+    same = (
+        (old.deltas[i_old] == new.deltas[i_new]).all(axis=1)
+        & (old.information[i_old] == new.information[i_new]).all(axis=(1, 2))
+        & (old.kinds[i_old] == new.kinds[i_new])
+    )
+    kept_old, kept_new = np.zeros(old.n_edges, dtype=bool), np.zeros(new.n_edges, dtype=bool)
+    kept_old[i_old[same]], kept_new[i_new[same]] = True, True
+    added, removed = np.flatnonzero(~kept_new), np.flatnonzero(~kept_old)
+    newest = np.maximum(new.sources[added], new.targets[added])
+    per_new_node = np.bincount(newest[newest >= old.n_nodes], minlength=1)
+    closes = bool(len(removed)) or bool(np.any(newest < old.n_nodes)) or bool(np.any(per_new_node > 1))
+    return Change(added, removed, closes)
+
+
+class GraphBackend(ABC):
+    """What all back-ends share; a solver supplies `_optimise` and may refine `_finish`."""
+
+    def __init__(self, name: str, config: BackendsConfig) -> None:
+        self._name = name
+        self._config = config
+        self._graph: PoseGraph | None = None
+        self._poses: Array = np.zeros((0, 3))
+        self._weights: dict[int, float] = {}
+
+    @property
+    def name(self) -> str:
+        """The name by which `create` knows it."""
+        return self._name
+
+    def update(self, graph: PoseGraph) -> Solution:
+        """See `Backend.update`."""
+        started = time.process_time()
+        change = difference(self._graph, graph)
+        placed = self._admit(graph, change)
+        start = extend(graph, placed)
+        if self._must_work(change):
+            outcome = self._guarded(graph, start, change)
+        else:
+            outcome = Outcome(start, SolveStatus.CONVERGED, "extended by odometry", 0, self._weights)
+        self._graph, self._poses, self._weights = graph, outcome.poses, outcome.weights
+        return self._solution(graph, start, outcome, started)
+
+    def solve(self, graph: PoseGraph | SupportsPoseGraph) -> Solution:
+        """See `Backend.solve`."""
+        frozen = graph if isinstance(graph, PoseGraph) else graph.pose_graph()
+        started = time.process_time()
+        frozen.validate()
+        require_connected(frozen)
+        try:
+            outcome = self._finish(frozen)
+        except RuntimeError as error:  # gtsam raises nothing more specific
+            raise BackendError(f"{self._name}: the solver gave up: {_first_line(error)}") from error
+        return self._solution(frozen, frozen.initial, self._checked(frozen, frozen.initial, outcome), started)
+
+    @abstractmethod
+    def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
+        """Work on a whole graph from given poses, knowing nothing of earlier calls."""
+
+    def _finish(self, graph: PoseGraph) -> Outcome:
+        """What `solve` does."""
+        return self._optimise(graph, graph.initial)
+
+    def _follow(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
+        """What `update` does when the graph asks for work."""
+        del change
+        return self._optimise(graph, start)
+
+    def _must_work(self, change: Change) -> bool:
+        return change.closes
+
+    def _admit(self, graph: PoseGraph, change: Change) -> Array:
+        """Validate what is new; the poses to extend from."""
+        old = self._graph
+        if old is None:
+            graph.validate()
+            return graph.initial[:1]
+        if graph.n_nodes < old.n_nodes:
+            raise BackendError(f"{self._name}: the graph shrank from {old.n_nodes} to {graph.n_nodes} nodes between updates")
+        edges_subset(graph, change.added).validate()
+        if len(change.removed):
+            require_connected(graph)
+        return self._poses
+
+    def _guarded(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
+        try:
+            outcome = self._follow(graph, start, change)
+        except RuntimeError as error:
+            raise BackendError(f"{self._name}: the solver gave up: {_first_line(error)}") from error
+        return self._checked(graph, start, outcome)
+
+    def _checked(self, graph: PoseGraph, start: Array, outcome: Outcome) -> Outcome:
+        """Refuse what is not finite, and bring node 0 back to where it is fixed."""
+        if not np.isfinite(outcome.poses).all():
+            message = "poses were not finite; kept those before"
+            return Outcome(start, SolveStatus.DIVERGED, message, outcome.iterations, outcome.weights)
+        moved = between(outcome.poses[0], outcome.poses)
+        poses = compose(graph.initial[0], moved) if np.any(outcome.poses[0] != graph.initial[0]) else outcome.poses
+        return replace(outcome, poses=poses)
+
+    def _solution(self, graph: PoseGraph, start: Array, outcome: Outcome, started: float) -> Solution:
+        report = SolveReport(
+            backend=self._name,
+            status=outcome.status,
+            message=outcome.message,
+            iterations=outcome.iterations,
+            chi2_initial=chi2(graph, start),
+            chi2=chi2(graph, outcome.poses),
+            cpu_s=time.process_time() - started,
+            rejected_edge_ids=tuple(edge for edge, weight in outcome.weights.items() if weight < 0.5),
+            weights=outcome.weights,
+        )
+        return Solution(outcome.poses, report)
+
+
+def _first_line(error: BaseException) -> str:
+    text = str(error).strip()
+    return text.splitlines()[0] if text else type(error).__name__

@@ -1,0 +1,66 @@
+"""A start for the optimisers: headings by linear rotation averaging, then positions by linear least squares."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, diags_array
+from scipy.sparse.linalg import splu
+
+from hybridmap.backends.objective import chi2
+from hybridmap.geometry import Array
+from hybridmap.graph.pose_graph import PoseGraph
+
+
+def best_start(graph: PoseGraph) -> Array:
+    """The angular start or the graph's own `initial`, whichever has the lower chi2; (N, 3)."""
+    angular = angular_start(graph)
+    if angular is None or chi2(graph, graph.initial) <= chi2(graph, angular):
+        return graph.initial
+    return angular
+
+
+def angular_start(graph: PoseGraph) -> Array | None:
+    """Poses (N, 3) by two sparse linear solves; None where they are singular.
+
+    Headings: unit complex numbers z minimise sum of w |z_target - z_source exp(i dyaw)|^2 with z_0 fixed, then |z| = 1
+    (the chordal relaxation of rotation averaging; takes any winding). Positions: with these headings, the sum of
+    squared translation residuals weighted by the edge's isotropised information.
+    """
+    if graph.n_nodes < 2:
+        return graph.initial
+    with np.errstate(all="ignore"):
+        w_yaw = graph.information[:, 2, 2]
+        turned = np.exp(1j * graph.deltas[:, 2])
+        z = _solve(graph, w_yaw, turned, np.zeros(graph.n_edges, dtype=complex), np.exp(1j * graph.initial[0, 2]))
+        if z is None or np.any(np.abs(z) < 1e-9):
+            return None
+        z = z / np.abs(z)
+        w_xy = 0.5 * (graph.information[:, 0, 0] + graph.information[:, 1, 1])
+        steps = z[graph.sources] * (graph.deltas[:, 0] + 1j * graph.deltas[:, 1])
+        ones = np.ones(graph.n_edges, dtype=complex)
+        p = _solve(graph, w_xy, ones, steps, complex(*graph.initial[0, :2]))
+    return None if p is None else np.column_stack([p.real, p.imag, np.angle(z)])
+
+
+def _solve(
+    graph: PoseGraph, weight: Array, turned: NDArray[np.complex128], offset: NDArray[np.complex128], fixed: complex
+) -> NDArray[np.complex128] | None:
+    """Minimise sum of weight |u_target - turned u_source - offset|^2 with u_0 = fixed."""
+    n, e = graph.n_nodes, graph.n_edges
+    rows = np.arange(e)
+    entries = np.concatenate([-turned, np.ones(e, dtype=complex)])
+    ends = np.concatenate([graph.sources, graph.targets])
+    a = coo_array((entries, (np.tile(rows, 2), ends)), shape=(e, n)).tocsc()
+    free = a[:, 1:]
+    right = offset - a[:, [0]].toarray()[:, 0] * fixed
+    scaled = free.conj().T @ diags_array(weight / weight.max())
+    normal: Any = (scaled @ free).tocsc()
+    try:
+        factor: Any = splu(normal, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    except RuntimeError:
+        return None
+    solved = factor.solve(scaled @ right)
+    return np.concatenate([[fixed], solved]) if np.isfinite(solved).all() else None

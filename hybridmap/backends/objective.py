@@ -1,0 +1,32 @@
+"""The one referee of every comparison: the sum of squared Mahalanobis residuals on SE(2)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybridmap.geometry import Array, between, compose, inverse, log
+from hybridmap.graph.pose_graph import PoseGraph
+
+
+def residuals(graph: PoseGraph, poses: Array) -> Array:
+    """Residuals `(E, 3)`: log(inverse(delta) * between(source, target)) in the target's frame, m, m, rad.
+
+    Args:
+        graph: the measurements.
+        poses: (N, 3) pose of every node.
+    """
+    predicted = between(poses[graph.sources], poses[graph.targets])
+    return log(compose(inverse(graph.deltas), predicted))
+
+
+def squared_norms(graph: PoseGraph, poses: Array) -> Array:
+    """Squared Mahalanobis norm `(E,)` of each edge's residual."""
+    r = residuals(graph, poses)
+    return np.asarray(np.einsum("ei,eij,ej->e", r, graph.information, r))
+
+
+def chi2(graph: PoseGraph, poses: Array) -> float:
+    """Sum of the squared Mahalanobis residuals of all edges; infinite where a pose is not finite."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        total = float(squared_norms(graph, poses).sum())
+    return total if np.isfinite(total) else float("inf")

@@ -1,0 +1,43 @@
+"""The table of back-ends: name -> implementation, imported when it is made."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+from hybridmap.backends.base import Backend
+from hybridmap.config.backends import BackendsConfig
+from hybridmap.errors import BackendError
+
+# name -> (module, class); every class is made as Class(name, config).
+_TABLE = {
+    "odometry": ("odometry", "OdometryBackend"),
+    "relaxation-paper": ("relaxation", "PaperRelaxation"),
+    "relaxation-normalised": ("relaxation", "NormalisedRelaxation"),
+    "relaxation-ratslam": ("ratslam", "RatslamRelaxation"),
+    "gtsam-lm": ("batch", "BatchBackend"),
+    "gtsam-gn": ("batch", "BatchBackend"),
+    "gtsam-dogleg": ("batch", "BatchBackend"),
+    "gtsam-isam2": ("incremental", "Isam2Backend"),
+    "gtsam-huber": ("robust", "KernelBackend"),
+    "gtsam-cauchy": ("robust", "KernelBackend"),
+    "gtsam-dcs": ("robust", "KernelBackend"),
+    "gtsam-gnc": ("gnc", "GncBackend"),
+}
+
+
+def names() -> tuple[str, ...]:
+    """Every name that `create` takes."""
+    return tuple(_TABLE)
+
+
+def create(name: str, config: BackendsConfig | None = None) -> Backend:
+    """Make a back-end by its name, in a fresh state.
+
+    Raises:
+        BackendError: no such name; the message lists those there are.
+    """
+    if name not in _TABLE:
+        raise BackendError(f"unknown back-end {name!r}; there are {', '.join(_TABLE)}")
+    module, class_name = _TABLE[name]
+    backend: Backend = getattr(import_module(f"hybridmap.backends.{module}"), class_name)(name, config or BackendsConfig())
+    return backend

@@ -1,0 +1,62 @@
+"""What hangs together: the connected part of a graph, and poses along its chain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from hybridmap.errors import GraphError
+from hybridmap.geometry import Array, compose, inverse
+from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+
+
+def require_connected(graph: PoseGraph) -> None:
+    """Refuse a graph in which some node cannot be placed relative to node 0.
+
+    Raises:
+        GraphError: names the first such node.
+    """
+    ones = np.ones(graph.n_edges, dtype=np.int8)
+    n = graph.n_nodes
+    matrix = csr_array((ones, (graph.sources, graph.targets)), shape=(n, n))
+    _, label = connected_components(matrix, directed=False)
+    apart = np.flatnonzero(label != label[0])
+    if len(apart):
+        raise GraphError(f"graph: node {apart[0]} is not connected to node 0 ({len(apart)} of {n} nodes are not)")
+
+
+def extend(graph: PoseGraph, placed: Array) -> Array:
+    """Place the nodes beyond `placed` (M, 3) by the newest edge that joins each to a placed one; (N, 3).
+
+    Odometry and registration edges go before loops.
+
+    Raises:
+        GraphError: a node has no edge to an earlier one.
+    """
+    done, n = len(placed), graph.n_nodes
+    poses = np.concatenate([placed, np.zeros((n - done, 3))])
+    if done == n:
+        return poses
+    later = np.maximum(graph.sources, graph.targets)
+    candidates = np.flatnonzero(later >= done)
+    rank = graph.kinds[candidates] <= EdgeKind.REGISTRATION
+    best: dict[int, int] = {}
+    for edge in candidates[np.lexsort((candidates, rank))].tolist():  # the last one wins: chain edges, newest last
+        best[int(later[edge])] = edge
+    for node in range(done, n):
+        if node not in best:
+            raise GraphError(f"graph: node {node} is not connected to an earlier node")
+        edge = best[node]
+        if graph.targets[edge] == node:
+            poses[node] = compose(poses[graph.sources[edge]], graph.deltas[edge])
+        else:
+            poses[node] = compose(poses[graph.targets[edge]], inverse(graph.deltas[edge]))
+    return poses
+
+
+def chain(graph: PoseGraph) -> PoseGraph:
+    """The graph with `initial` replaced by the chain of its edges from node 0's pose on."""
+    return replace(graph, initial=extend(graph, graph.initial[:1]))

@@ -1,0 +1,132 @@
+"""Pose-graph files: g2o and TORO in, g2o out; planar only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from hybridmap.errors import GraphError
+from hybridmap.geometry import Array
+from hybridmap.graph.connectivity import chain
+from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.trajectory import write_text_atomic
+
+# Where xx, xy, xt, yy, yt, tt stand among the six numbers of a line.
+_G2O_ORDER = (0, 1, 2, 3, 4, 5)
+_TORO_ORDER = (0, 1, 4, 2, 5, 3)
+_EDGES = {"EDGE_SE2": _G2O_ORDER, "EDGE2": _TORO_ORDER}
+_VERTICES = ("VERTEX_SE2", "VERTEX2")
+_IGNORED = ("FIX",)
+_UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+
+
+@dataclass(slots=True)
+class _Lines:
+    vertices: dict[int, list[float]] = field(default_factory=dict)
+    ends: list[tuple[int, int]] = field(default_factory=list)
+    deltas: list[list[float]] = field(default_factory=list)
+    upper: list[list[float]] = field(default_factory=list)
+
+
+def read_graph(path: Path) -> PoseGraph:
+    """Read a planar g2o (`VERTEX_SE2`, `EDGE_SE2`) or TORO (`VERTEX2`, `EDGE2`) file.
+
+    Vertices are numbered anew from 0 in the order of their numbers in the file; edges keep the file's order. An edge between
+    consecutive vertices counts as odometry, every other one as a loop. A file without vertices is chained from its edges.
+
+    Raises:
+        GraphError: no such file, a damaged line (named), a 3-D file, a vertex given twice or missing, no edge.
+    """
+    if not path.is_file():
+        raise GraphError(f"{path}: no such graph file")
+    lines = _Lines()
+    text = path.read_text(encoding="utf-8", errors="replace")
+    for number, line in enumerate(text.splitlines(), start=1):
+        fields = line.split("#", 1)[0].split()
+        if fields:
+            _parse(lines, fields, f"{path}:{number}")
+    if not lines.ends:
+        raise GraphError(f"{path}: holds no edge (EDGE_SE2 or EDGE2 lines); is it a g2o or TORO file?")
+    return _assemble(lines, path)
+
+
+def _parse(lines: _Lines, fields: list[str], where: str) -> None:
+    tag = fields[0]
+    if tag in _EDGES:
+        source, target = _integers(fields, 2, where)
+        numbers = _numbers(fields, 3, 9, where)
+        lines.ends.append((source, target))
+        lines.deltas.append(numbers[:3])
+        lines.upper.append([numbers[3 + k] for k in _EDGES[tag]])
+    elif tag in _VERTICES:
+        (vertex,) = _integers(fields, 1, where)
+        if vertex in lines.vertices:
+            raise GraphError(f"{where}: vertex {vertex} is given twice")
+        lines.vertices[vertex] = _numbers(fields, 2, 3, where)
+    elif "SE3" in tag or tag in ("VERTEX3", "EDGE3"):
+        raise GraphError(f"{where}: {tag} is a 3-D record; only planar graphs (SE2) can be read")
+    elif tag not in _IGNORED:
+        known = ", ".join((*_VERTICES, *_EDGES))
+        raise GraphError(f"{where}: unknown record {tag[:40]!r}, expected one of {known}")
+
+
+def _integers(fields: list[str], count: int, where: str) -> list[int]:
+    try:
+        return [int(field) for field in fields[1 : 1 + count]]
+    except ValueError:
+        raise GraphError(
+            f"{where}: expected {count} whole number(s) after {fields[0]}, found {fields[1 : 1 + count]}"
+        ) from None
+
+
+def _numbers(fields: list[str], start: int, count: int, where: str) -> list[float]:
+    if len(fields) != start + count:
+        raise GraphError(f"{where}: expected {start + count - 1} numbers after {fields[0]}, found {len(fields) - 1}")
+    try:
+        numbers = [float(field) for field in fields[start:]]
+    except ValueError:
+        raise GraphError(f"{where}: expected numbers after {fields[0]}, found {' '.join(fields[start:])[:60]!r}") from None
+    if not np.isfinite(numbers).all():
+        raise GraphError(f"{where}: found NaN or Inf, expected finite numbers")
+    return numbers
+
+
+def _assemble(lines: _Lines, path: Path) -> PoseGraph:
+    names = sorted(lines.vertices) or sorted({end for ends in lines.ends for end in ends})
+    index = {name: i for i, name in enumerate(names)}
+    for source, target in lines.ends:
+        for end in (source, target):
+            if end not in index:
+                raise GraphError(f"{path}: edge {source} -> {target} names vertex {end}, which the file does not give")
+    sources = np.array([index[s] for s, _ in lines.ends], dtype=np.int64)
+    targets = np.array([index[t] for _, t in lines.ends], dtype=np.int64)
+    kinds = np.where(np.abs(sources - targets) == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP).astype(np.int8)
+    initial = np.array([lines.vertices[name] for name in names]) if lines.vertices else np.zeros((len(names), 3))
+    graph = PoseGraph(
+        initial=initial,
+        sources=sources,
+        targets=targets,
+        deltas=np.array(lines.deltas),
+        information=np.array(lines.upper)[:, _UPPER],
+        kinds=kinds,
+        edge_ids=np.arange(len(sources), dtype=np.int64),
+    )
+    return graph if lines.vertices else chain(graph)
+
+
+def write_g2o(path: Path, graph: PoseGraph, poses: Array) -> None:
+    """Write nodes at `poses` (N, 3) and all edges as g2o with 17 significant digits, in one move.
+
+    The format carries no kinds: read back, every edge between non-consecutive nodes is a loop.
+    """
+    rows = [f"VERTEX_SE2 {i} {_row(pose)}\n" for i, pose in enumerate(poses)]
+    upper = graph.information[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    ends = zip(graph.sources, graph.targets, graph.deltas, upper, strict=True)
+    rows += [f"EDGE_SE2 {s} {t} {_row(delta)} {_row(info)}\n" for s, t, delta, info in ends]
+    write_text_atomic(path, "".join(rows))
+
+
+def _row(numbers: Array) -> str:
+    return " ".join(f"{number:.17g}" for number in numbers)
