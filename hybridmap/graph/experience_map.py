@@ -45,7 +45,17 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """A relative pose between two nodes, in the frame of the source, with its fate."""
+    """A relative pose between two nodes, in the frame of the source, with its fate.
+
+    Attributes:
+        source, target: node numbers.
+        kind: where it comes from.
+        status, reason: what became of it, and why.
+        relative: the measurement; None where a candidate was refused before one was made.
+        scores: the figures that the decision rested on.
+        since_node: number of the newest node when the edge got its present status (-1: let the map note it), so that a
+            replay brings an edge that was committed late at the same moment.
+    """
 
     source: int
     target: int
@@ -54,6 +64,7 @@ class Edge:
     reason: str
     relative: RelativePose | None
     scores: Mapping[str, float] = field(default_factory=dict)
+    since_node: int = -1
 
 
 class ExperienceMap:
@@ -68,6 +79,7 @@ class ExperienceMap:
         self._information = _Rows((3, 3), np.float64)
         self._kinds = _Rows((), np.int8)
         self._accepted = _Rows((), np.bool_)
+        self._since = _Rows((), np.int64)
         self._edges_into: dict[int, list[int]] = {}
 
     @property
@@ -115,8 +127,8 @@ class ExperienceMap:
         if not (0 <= edge.source < len(self) and 0 <= edge.target < len(self)) or edge.source == edge.target:
             raise GraphError(f"map: edge {edge.source} -> {edge.target} needs two different nodes of 0..{len(self) - 1}")
         _require_measurement(edge)
-        self._edges.append(edge)
-        for rows in (self._ends, self._deltas, self._information, self._kinds, self._accepted):
+        self._edges.append(self._dated(edge))
+        for rows in (self._ends, self._deltas, self._information, self._kinds, self._accepted, self._since):
             rows.grow()
         self._write(len(self._edges) - 1)
         self._edges_into.setdefault(edge.target, []).append(len(self._edges) - 1)
@@ -124,7 +136,7 @@ class ExperienceMap:
 
     def set_status(self, number: int, status: Status, reason: str) -> None:
         """Change what became of an edge, and why."""
-        self.update_edge(number, replace(self._edges[number], status=status, reason=reason))
+        self.update_edge(number, replace(self._edges[number], status=status, reason=reason, since_node=-1))
 
     def update_edge(self, number: int, edge: Edge) -> None:
         """Replace an edge by a later measurement or verdict between the same two nodes.
@@ -138,7 +150,7 @@ class ExperienceMap:
                 f"map: edge {number} joins {before.source} -> {before.target}, found {edge.source} -> {edge.target}"
             )
         _require_measurement(edge)
-        self._edges[number] = edge
+        self._edges[number] = self._dated(edge)
         self._write(number)
 
     def pose_graph(self) -> PoseGraph:
@@ -153,7 +165,11 @@ class ExperienceMap:
             information=self._information.view()[kept],
             kinds=self._kinds.view()[kept],
             edge_ids=kept,
+            entered=self._since.view()[kept],
         )
+
+    def _dated(self, edge: Edge) -> Edge:
+        return edge if edge.since_node >= 0 else replace(edge, since_node=len(self) - 1)
 
     def _write(self, number: int) -> None:
         edge = self._edges[number]
@@ -161,6 +177,7 @@ class ExperienceMap:
         self._ends.view()[number] = edge.source, edge.target
         self._kinds.view()[number] = edge.kind
         self._accepted.view()[number] = accepted
+        self._since.view()[number] = edge.since_node
         if edge.relative is not None:
             self._deltas.view()[number] = edge.relative.delta
             self._information.view()[number] = _invert(edge.relative.covariance) if accepted else 0.0

@@ -12,7 +12,8 @@ def odometry_covariance(config: EdgesConfig, travel_m: float, turn_rad: float) -
     """Covariance (3, 3) of a stretch of dead reckoning, in the frame of its end (m^2, rad^2).
 
     Both standard deviations grow with the root of the way, as a random walk does; a heading that wanders along a
-    straight way of length s moves the end sideways by s / sqrt(3) times its own deviation, with correlation sqrt(3)/2.
+    straight way of length s moves the end sideways by s / sqrt(3) times its own deviation, with correlation -sqrt(3)/2
+    as seen from the end.
 
     Args:
         config: growth rates and floors.
@@ -23,5 +24,5 @@ def odometry_covariance(config: EdgesConfig, travel_m: float, turn_rad: float) -
     walk = np.deg2rad(config.rotation_deg_per_sqrt_m) ** 2 * travel_m
     heading = np.deg2rad(config.rotation_floor_deg) ** 2 + walk + config.rotation_per_turn**2 * turn_rad
     sideways = position + walk * travel_m**2 / 3.0
-    cross = walk * travel_m / 2.0
+    cross = -walk * travel_m / 2.0
     return np.array([[position, 0.0, 0.0], [0.0, sideways, cross], [0.0, cross, heading]])

@@ -48,7 +48,8 @@ class Novelty:
         """Take in the place code of a new node."""
         if self._count == len(self._codes):
             grown = np.zeros((max(64, 2 * self._count), len(place_code)), dtype=np.float32)
-            grown[: self._count] = self._codes[: self._count]
+            if self._count:
+                grown[: self._count] = self._codes
             self._codes = grown
         norm = float(np.linalg.norm(place_code))
         self._codes[self._count] = place_code / norm if norm > 0 else place_code

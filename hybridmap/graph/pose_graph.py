@@ -32,6 +32,7 @@ class PoseGraph:
         information: (E, 3, 3) inverse covariance in the frame of the target (right perturbation), x, y, yaw.
         kinds: (E,) int8, `EdgeKind`.
         edge_ids: (E,) int64, number of the edge in the log that it comes from; strictly increasing.
+        entered: (E,) int64, newest node when the edge entered the graph; None: as soon as both its ends were there.
     """
 
     initial: Array
@@ -41,6 +42,12 @@ class PoseGraph:
     information: Array
     kinds: NDArray[np.int8]
     edge_ids: NDArray[np.int64]
+    entered: NDArray[np.int64] | None = None
+
+    @property
+    def entry_nodes(self) -> NDArray[np.int64]:
+        """(E,) at which node a replay brings each edge."""
+        return np.maximum(self.sources, self.targets) if self.entered is None else self.entered
 
     @property
     def n_nodes(self) -> int:
@@ -68,6 +75,7 @@ class PoseGraph:
             self.information[kept],
             self.kinds[kept],
             self.edge_ids[kept],
+            None if self.entered is None else self.entered[kept],
         )
 
     def validate(self) -> None:

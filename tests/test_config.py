@@ -1,0 +1,66 @@
+"""Reading configurations: precedence, refusals, resolution."""
+
+from __future__ import annotations
+
+import pytest
+from pydantic import ValidationError
+
+from hybridmap.config import Config, named_configs
+from hybridmap.errors import ConfigError
+
+
+def test_overrides_win_over_the_file_which_wins_over_defaults(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("nodes: {distance_m: 0.7, angle_deg: 11}\n")
+    config = Config.load(path, {"nodes.distance_m": 0.9})
+    assert (config.nodes.distance_m, config.nodes.angle_deg) == (0.9, 11)
+    assert config.nodes.rule == Config().nodes.rule
+
+
+def test_a_file_extends_another_beside_it_or_by_name(tmp_path):
+    (tmp_path / "base.yaml").write_text("nodes: {distance_m: 0.7}\nseed: 3\n")
+    (tmp_path / "top.yaml").write_text("extends: base.yaml\nnodes: {angle_deg: 5}\n")
+    config = Config.load(tmp_path / "top.yaml")
+    assert (config.seed, config.nodes.distance_m, config.nodes.angle_deg) == (3, 0.7, 5)
+
+
+def test_extending_in_a_circle_is_refused(tmp_path):
+    (tmp_path / "a.yaml").write_text("extends: b.yaml\n")
+    (tmp_path / "b.yaml").write_text("extends: a.yaml\n")
+    with pytest.raises(ConfigError, match="leads back"):
+        Config.load(tmp_path / "a.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("nodes: {distanse_m: 1}\n", r"unknown key 'nodes.distanse_m'"),
+        ("nodes: {distance_m: -1}\n", r"nodes.distance_m: .*greater than 0, found -1"),
+        ("nodes: {distance_m: .nan}\n", r"nodes.distance_m: .*finite"),
+        ("nodes: [1]\n", r"nodes: "),
+        ("- 1\n", r"expected a mapping"),
+        ("a: [\n", r"not a YAML file"),
+    ],
+)
+def test_refusals_name_the_key(tmp_path, text, expected):
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=expected):
+        Config.load(path)
+
+
+def test_a_missing_configuration_lists_the_names():
+    with pytest.raises(ConfigError, match="rgbd"):
+        Config.load("no-such-thing")
+
+
+def test_sections_are_frozen():
+    with pytest.raises(ValidationError):
+        Config().seed = 3
+
+
+@pytest.mark.parametrize("name", sorted(named_configs()))
+def test_every_named_configuration_loads_and_its_resolved_form_is_itself(name, tmp_path):
+    config = Config.load(name)
+    (tmp_path / "resolved.yaml").write_text(config.to_yaml())
+    assert Config.load(tmp_path / "resolved.yaml") == config
