@@ -2,8 +2,94 @@
 
 from __future__ import annotations
 
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
 from hybridmap.config.section import Section
 
 
+class PlaceConfig(Section):
+    """Grid -> place learning and the place attractor."""
+
+    attractor_side: int = Field(default=32, ge=8, le=256)
+    """Cells along a side of the place attractor; the place code has side * side entries."""
+    attractor_cell_m: float = Field(default=0.25, gt=0)
+    """Metres a cell of the place attractor; the sheet wraps after side * cell metres."""
+    attractor_width_cells: float = Field(default=1.5, ge=1.0, le=6.0)
+    """Standard deviation of the attractor's bump, cells."""
+    grid_inputs_side: int = Field(default=4, ge=3)
+    """Grid cells along a side of each sheet that project to place cells; must divide the sheet's side."""
+    learning_rate: float = Field(default=0.0005, ge=0, le=1)
+    """eta of the Hebbian rule, per learning step."""
+    recruit_threshold: float = Field(default=0.6, gt=0, lt=1)
+    """A cell is recruited where no field responds above this share of its peak."""
+    inhibition: float = Field(default=0.5, ge=0, lt=1)
+    """C_inh_p, as a share of the peak drive of a field; larger means narrower fields."""
+    competition: float = Field(default=2.0, ge=1.0, le=8.0)
+    """Exponent of the competition between place cells in the place code; 1 is none."""
+    learning_period_steps: int = Field(default=4, ge=1)
+    """Moving steps between two learning steps (four at 30 Hz: the theta rhythm)."""
+    max_fields: int = Field(default=32768, ge=1)
+    """No more fields than this are recruited; the log says when it is reached."""
+
+
 class NeuralConfig(Section):
-    """The path integrator."""
+    """The path integrator: head direction -> band -> grid -> place -> place attractor."""
+
+    dtype: Literal["float32", "float64"] = "float64"
+    """Precision of every population."""
+    head_direction_cells: int = Field(default=360, ge=8)
+    """m, cells of the head-direction ring."""
+    modules: int = Field(default=8, ge=3, le=32)
+    """M, grid modules; their spacings are geometric between the two limits."""
+    sheet_side: int = Field(default=32, ge=12, le=128)
+    """Cells along a side of a grid sheet."""
+    spacing_min_m: float = Field(default=0.12, gt=0)
+    """Grid spacing of the finest module, m."""
+    spacing_max_m: float = Field(default=0.52, gt=0)
+    """Grid spacing of the coarsest module, m."""
+    orientation_deg: float = Field(default=7.0, ge=-180, le=180)
+    """Orientation of the finest module's first band, degrees."""
+    orientation_step_deg: float = Field(default=7.5, ge=-60, le=60)
+    """Rotation of each module against the one before it, degrees."""
+    rectifier: Literal["relu", "softplus"] = "relu"
+    """f of the grid sheets: `relu` is the paper's, `softplus` the accurate one."""
+    softplus_sharpness: float = Field(default=2.0, gt=0, le=20)
+    """beta of softplus, log(1 + exp(beta x)) / beta."""
+    fourier_modes: int = Field(default=4, ge=2, le=15)
+    """K, the Fourier modes along each axis of a sheet that its recurrent weights carry."""
+    kernel_gain_first: float = Field(default=1.4, gt=1)
+    """Fourier gain of the recurrent weights at the first hexagonal mode."""
+    kernel_gain_zero: float = Field(default=-1.0, le=0)
+    """Fourier gain of the recurrent weights at mode zero: net inhibition."""
+    kernel_widths: tuple[float, float] = (1.5, 0.3)
+    """Widths of the excitatory and the inhibitory Gaussian's spectrum, in squared wave numbers of the first mode."""
+    band_cells: int = Field(default=32, ge=16)
+    """Cells of a band ring (three rings a module)."""
+    band_width: float = Field(default=0.1, gt=0.02, le=0.12)
+    """Stripe width r as a share of the period; the rate is exp(-(s - l/2)^2 / (2 r^2))."""
+    band_drive: float = Field(default=0.1, ge=0, le=1)
+    """Gain of the band stripes' excitatory input to the sheets (the uniform input is 1); 0 leaves only the shift."""
+    gain: float = Field(default=1.0, gt=0, le=10)
+    """k_m, metres of path integration a metre of odometry."""
+    turn_gain: float = Field(default=1.0, gt=0, le=10)
+    """k_w, radians of path integration a radian of odometry."""
+    heading_bias_rad_m: float = Field(default=0.0, ge=-1, le=1)
+    """Radians added to the heading for each metre forward."""
+    decode_box_m: float = Field(default=1.0, gt=0, le=5)
+    """Half side of the box around the prior in which all modules together resolve the wrap, m."""
+    place: PlaceConfig = PlaceConfig()
+    """Grid -> place learning and the place attractor."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.spacing_min_m > self.spacing_max_m:
+            raise ValueError("spacing_min_m must not exceed spacing_max_m")
+        if self.sheet_side % self.place.grid_inputs_side:
+            raise ValueError("place.grid_inputs_side must divide sheet_side")
+        if 2 * self.fourier_modes >= self.sheet_side:
+            raise ValueError("fourier_modes must be less than half of sheet_side")
+        if self.kernel_widths[0] <= self.kernel_widths[1]:
+            raise ValueError("kernel_widths: the excitatory spectrum must be wider than the inhibitory")
+        return self

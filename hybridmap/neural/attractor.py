@@ -1,0 +1,74 @@
+"""The place attractor: one bump on a sheet, moved by self-motion, kept single by recurrent competition."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from hybridmap.geometry import Array
+from hybridmap.neural.torus import split_shift
+
+
+class PlaceAttractor:
+    """Sheet of N x N place-attractor cells (paper eq. 10).
+
+    A step moves the activity by whole cells (floor) and by the residual, spreads it with Gaussian weights of the bump's own
+    width, and lets the cells compete: rates are squared and normalised (Deneve, Latham and Pouget 1999). A Gaussian of that
+    width is the fixed point, the largest of several bumps wins, and since all of it is smooth the bump does not stick to cells.
+
+    Attributes:
+        activity: (N, N) rates of sum one, first index x, second y; the whole state.
+    """
+
+    def __init__(self, side: int, cell_m: float, width_cells: float, dtype: DTypeLike = np.float64) -> None:
+        self.cell_m = cell_m
+        self._side = side
+        angle = 2.0 * np.pi * np.outer(np.arange(side), np.arange(side // 2)) / side
+        self._cos, self._sin = np.cos(angle), np.sin(angle)
+        wave = 2.0 * np.pi * np.arange(side // 2) / side
+        self._wave = wave
+        gain = np.exp(-0.5 * (width_cells * wave) ** 2) / side
+        self._gain = np.where(wave == 0, gain, 2.0 * gain)
+        self._dtype = np.dtype(dtype)
+        offset = (np.arange(side) + side // 2) % side - side // 2
+        line = np.exp(-0.5 * (offset / width_cells) ** 2)
+        self.activity: NDArray[np.floating] = self._normalised(np.outer(line, line)).astype(dtype)
+
+    @property
+    def extent_m(self) -> float:
+        """The sheet repeats after this many metres."""
+        return self._side * self.cell_m
+
+    def step(self, displacement_m: NDArray[np.float64]) -> None:
+        """Move the bump by a displacement (2,) in the world, m, and let the cells compete once."""
+        whole, residual = split_shift(displacement_m / self.cell_m)
+        moved = np.roll(self.activity, (int(whole[0]), int(whole[1])), axis=(0, 1))
+        spread = self._weights(residual[0]) @ moved @ self._weights(residual[1]).T
+        np.maximum(spread, 0.0, out=spread)
+        self.activity = self._normalised(spread * spread).astype(self._dtype)
+
+    def settle(self, iterations: int = 10) -> None:
+        """Let the cells compete without self-motion, until one bump is left."""
+        for _ in range(iterations):
+            self.step(np.zeros(2))
+
+    def position_m(self) -> Array:
+        """Return the bump's position (2,) by population vector, m in [0, extent)."""
+        turn = np.exp(2j * np.pi * np.arange(self._side) / self._side)
+        z = np.array([turn @ self.activity.sum(axis=1), turn @ self.activity.sum(axis=0)])
+        return np.asarray(np.angle(z) / (2.0 * np.pi) % 1.0 * self.extent_m)
+
+    def unwrapped_m(self, near_m: Array) -> Array:
+        """Return the repetition of the bump's position (2,) that is nearest to `near_m`, m."""
+        offset = self.position_m() - near_m
+        return near_m + offset - self.extent_m * np.round(offset / self.extent_m)
+
+    def _weights(self, residual: float) -> NDArray[np.floating]:
+        """Gaussian recurrent weights (N, N) shifted by a fraction of a cell: row i receives from column j."""
+        cos, sin = self._gain * np.cos(self._wave * residual), self._gain * np.sin(self._wave * residual)
+        row_cos, row_sin = self._cos * cos + self._sin * sin, self._sin * cos - self._cos * sin
+        return np.asarray(row_cos @ self._cos.T + row_sin @ self._sin.T, dtype=self._dtype)
+
+    @staticmethod
+    def _normalised(rates: NDArray[np.floating]) -> NDArray[np.floating]:
+        return np.asarray(rates / rates.sum())

@@ -1,0 +1,74 @@
+"""Band cells: three ring attractors a grid module, whose stripes drive the grid sheets."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+ORIENTATIONS_DEG = (0.0, 60.0, 120.0)
+
+
+class BandRings:
+    """Ring attractors of band cells, three orientations a module (paper eqs. 2-4).
+
+    Cell alpha of a ring of period l fires at exp(-(s - l/2)^2 / (2 r^2)) with s = (d - alpha) mod l, so that its preferred
+    displacement is alpha + l/2. No running integral d is kept: the ring feeds its rates back through cosine weights that the
+    velocity along its orientation shifts, the net input h is normalised (divisive inhibition), and the transfer function
+    h -> exp(-(l arccos(h) / 2 pi)^2 / (2 r^2)) gives back the printed stripe, which is the attractor of the ring.
+    Periods are l = lambda sqrt(3)/2.
+
+    Attributes:
+        activity: (M, 3, n) rates 0..1 in the order of `ORIENTATIONS_DEG`; the whole state.
+        wave_vectors: (M, 3, 2) cycles per metre; the third is the second minus the first (phi60 = phi0 + phi120).
+    """
+
+    def __init__(
+        self,
+        spacings_m: NDArray[np.float64],
+        orientations_rad: NDArray[np.float64],
+        cells: int,
+        width: float,
+        dtype: DTypeLike = np.float64,
+    ) -> None:
+        angles = orientations_rad[:, None] + np.radians(ORIENTATIONS_DEG)
+        self.periods_m: NDArray[np.float64] = spacings_m * np.sqrt(3.0) / 2.0
+        self.orientations_rad: NDArray[np.float64] = angles
+        self.wave_vectors: NDArray[np.float64] = (
+            np.stack([np.cos(angles), np.sin(angles)], axis=-1) / self.periods_m[:, None, None]
+        )
+        preferred = 2.0 * np.pi * (np.arange(cells) / cells + 0.5)
+        self._weights = np.stack([np.cos(preferred), np.sin(preferred)], axis=1).astype(dtype)
+        self._sharpness = np.dtype(dtype).type(-1.0 / (2.0 * (2.0 * np.pi * width) ** 2))
+        self._complex = np.result_type(np.dtype(dtype), np.complex64)
+        self._tuning = np.ascontiguousarray(self._weights.T)
+        self.activity: NDArray[np.floating] = self.rates_at(np.zeros((len(spacings_m), 3)))
+
+    def phasors(self) -> NDArray[np.complexfloating]:
+        """Return the unit phasors exp(2 pi i phi), (M, 3), decoded from the activity."""
+        vector = self.activity @ self._weights
+        z = vector.view(self._complex)[..., 0]
+        return np.asarray(z / np.abs(z))
+
+    def phases(self) -> NDArray[np.float64]:
+        """Return the decoded phases (M, 3), cycles in [0, 1)."""
+        return np.asarray(np.angle(self.phasors().astype(np.complex128)) / (2.0 * np.pi)) % 1.0
+
+    def rates_at(self, phases: NDArray[np.float64]) -> NDArray[np.floating]:
+        """Return the stationary rates (M, 3, n) at given phases (M, 3), cycles."""
+        return self._rates(np.exp(2j * np.pi * phases).astype(self._complex))
+
+    def step(self, displacement_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Move every ring by a displacement (2,) in the world, m.
+
+        Returns:
+            (M, 3) advance of each ring's decoded phase, cycles in [-0.5, 0.5): what the ring tells the sheet.
+        """
+        before = self.phasors()
+        turn = np.exp((2j * np.pi) * (self.wave_vectors @ displacement_m))
+        self.activity = self._rates((before * turn).astype(self._complex))
+        return np.asarray(np.angle(self.phasors() * before.conj()), dtype=np.float64) / (2.0 * np.pi)
+
+    def _rates(self, phasors: NDArray[np.complexfloating]) -> NDArray[np.floating]:
+        vector = phasors[..., None].view(self._weights.dtype)
+        offset = np.arccos(np.clip(vector @ self._tuning, -1.0, 1.0))
+        return np.exp(self._sharpness * offset * offset)

@@ -1,0 +1,114 @@
+"""Grid modules: attractor sheets on a hexagonal torus, moved by the band cells."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from hybridmap.neural.torus import LowModes
+
+Rectifier = Callable[[NDArray[np.floating]], NDArray[np.floating]]
+
+
+def relu(drive: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The paper's rectifying linear f."""
+    return np.maximum(drive, 0.0)
+
+
+def softplus(sharpness: float) -> Rectifier:
+    """Return f(x) = log(1 + exp(beta x)) / beta, smooth and therefore free of pinning."""
+
+    def f(drive: NDArray[np.floating]) -> NDArray[np.floating]:
+        beta = drive.dtype.type(sharpness)
+        return np.maximum(drive, 0.0) + np.log1p(np.exp(-beta * np.abs(drive))) / beta
+
+    return f
+
+
+def kernel_spectrum(
+    squared_wave_number: NDArray[np.int64], gain_first: float, gain_zero: float, widths: tuple[float, float]
+) -> NDArray[np.float64]:
+    """Return the Fourier gains of w0(x) = a exp(-gamma |x|^2) - c exp(-beta |x|^2) at the given |k|^2.
+
+    The paper's single amplitude (a = c) has no local excitation; the two amplitudes here are fixed by the gains at the
+    first hexagonal mode and at zero, which they meet exactly.
+    """
+    wide, narrow = widths
+    system = np.array([[np.exp(-1.0 / wide), -np.exp(-1.0 / narrow)], [1.0, -1.0]])
+    excitation, inhibition = np.linalg.solve(system, np.array([gain_first, gain_zero]))
+    return np.asarray(excitation * np.exp(-squared_wave_number / wide) - inhibition * np.exp(-squared_wave_number / narrow))
+
+
+def combine_bands(cycles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sheet's two phases or shifts (M, 2) from those of the three bands (M, 3), cycles.
+
+    Least squares under phi60 = phi0 + phi120: the misfit, wrapped, is shared equally.
+    """
+    misfit = cycles[:, 1] - cycles[:, 0] - cycles[:, 2]
+    misfit = (misfit - np.round(misfit)) / 3.0
+    return np.stack([cycles[:, 0] + misfit, cycles[:, 2] + misfit], axis=1)
+
+
+class GridModules:
+    """M sheets of N x N grid cells on a twisted torus (paper eqs. 5-7).
+
+    Cell (i, j) of a sheet prefers the phases (i/N, j/N) of the module's 0 and 120 degree bands, so that the plain torus of
+    indices carries the hexagonal metric. With dt = tau the dynamics are s <- f[W(ds) s + I_BC]: the recurrent weights W,
+    shifted by the band cells' advance ds, act on the low Fourier modes; I_BC is uniform excitation plus the stripes of the
+    three bands, which hold the sheet in register with the rings. A stationary bump moves by exactly ds.
+
+    Attributes:
+        activity: (M, N, N) rates; the whole state.
+    """
+
+    def __init__(
+        self,
+        modules: int,
+        side: int,
+        fourier_modes: int,
+        gains: NDArray[np.float64],
+        rectifier: Rectifier,
+        band_drive: float,
+        dtype: DTypeLike = np.float64,
+    ) -> None:
+        self.modes = LowModes(side, fourier_modes, dtype)
+        self._gains = gains.astype(dtype)
+        self._rectifier = rectifier
+        self._centre = fourier_modes
+        self._stripe = np.dtype(dtype).type(0.5 * band_drive * side**2)
+        wave = 2.0 * np.pi * np.arange(side) / side
+        seed = np.cos(wave[:, None]) + np.cos(wave) + np.cos(wave[:, None] + wave)
+        self.activity: NDArray[np.floating] = np.repeat((1.0 + 0.3 * seed)[None], modules, axis=0).astype(dtype)
+        still, phasors = np.zeros((modules, 3)), np.ones((modules, 3), dtype=np.complex128)
+        for _ in range(300):
+            self.step(still, phasors)
+
+    def step(self, advance_cycles: NDArray[np.float64], band_phasors: NDArray[np.complexfloating]) -> None:
+        """Advance by one time constant.
+
+        Args:
+            advance_cycles: (M, 3) advance of the band rings in this step, cycles.
+            band_phasors: (M, 3) unit phasors of the band rings after it.
+        """
+        modes = self.modes.forward(self.activity) * self.modes.shift(combine_bands(advance_cycles)) * self._gains
+        stripes = self._stripe * band_phasors.conj()
+        k = self._centre
+        modes[:, k + 1, 0] += stripes[:, 0]
+        modes[:, k - 1, 0] += stripes[:, 0].conj()
+        modes[:, k + 1, 1] += stripes[:, 1]
+        modes[:, k, 1] += stripes[:, 2]
+        drive = self.modes.inverse(modes)
+        drive += 1.0
+        self.activity = self._rectifier(drive)
+
+    def band_phases(self) -> NDArray[np.float64]:
+        """Return the phases (M, 3) of the first hexagonal modes of the activity, cycles in [-0.5, 0.5]."""
+        modes, k = self.modes.forward(self.activity), self._centre
+        first = np.stack([modes[:, k + 1, 0], modes[:, k + 1, 1], modes[:, k, 1]], axis=1)
+        return np.asarray(-np.angle(first.astype(np.complex128)) / (2.0 * np.pi))
+
+    def phases(self) -> NDArray[np.float64]:
+        """Return the sheets' decoded phases (M, 2), cycles in [0, 1), of the 0 and 120 degree bands."""
+        return combine_bands(self.band_phases()) % 1.0

@@ -1,0 +1,50 @@
+"""Head-direction ring: m cells whose population vector is the only record of the heading."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+
+class HeadDirectionRing:
+    """Ring attractor of m cells with preferred directions theta_i = 2 pi i / m (paper eq. 1).
+
+    The rates are d_i = 1 + cos(theta_i - phi): never negative, and with D = [cos theta; sin theta] the read-out
+    (2/m) D d is exactly (cos phi, sin phi). A turn acts through the rank-two recurrent weights (2/m) D' R(dphi) D; the
+    length of the population vector is restored at each turn (divisive inhibition), so rounding cannot let it grow or fade.
+
+    Attributes:
+        activity: (m,) firing rates, 0..2; the whole state.
+    """
+
+    def __init__(self, cells: int, dtype: DTypeLike = np.float64) -> None:
+        preferred = 2.0 * np.pi * np.arange(cells) / cells
+        self.preferred_rad: NDArray[np.float64] = preferred
+        self._kernel = np.stack([np.cos(preferred), np.sin(preferred)]).astype(dtype)
+        self._readout = (self._kernel * (2.0 / cells)).astype(dtype)
+        self.activity: NDArray[np.floating] = 1.0 + self._kernel[0]
+
+    def direction(self) -> tuple[float, float]:
+        """Return (cos phi, sin phi) as decoded from the activity, of length one."""
+        c, s = self._readout @ self.activity
+        norm = float(np.hypot(float(c), float(s)))
+        return float(c) / norm, float(s) / norm
+
+    @property
+    def heading_rad(self) -> float:
+        """Decoded heading, rad in [-pi, pi]."""
+        c, s = self._readout @ self.activity
+        return float(np.arctan2(s, c))
+
+    def turn(self, angle_rad: float) -> None:
+        """Rotate the population vector by omega dt, rad, left positive."""
+        if angle_rad == 0.0:
+            return
+        c, s = self.direction()
+        cos, sin = float(np.cos(angle_rad)), float(np.sin(angle_rad))
+        vector = np.array([c * cos - s * sin, c * sin + s * cos], dtype=self._kernel.dtype)
+        self.activity = 1.0 + vector @ self._kernel
+
+    def rates(self, turn_rate_rad_s: float = 0.0, modulation_s: float = 0.1) -> NDArray[np.floating]:
+        """Return the rates (m,) with the turn-rate modulation of real cells: gain 1 + modulation |omega|; the state is untouched."""
+        return self.activity * (1.0 + modulation_s * abs(turn_rate_rad_s))

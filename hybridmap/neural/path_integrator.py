@@ -1,0 +1,149 @@
+"""The path integrator: self-motion in, pose and place code out, nothing but network activity between."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybridmap.config.neural import NeuralConfig
+from hybridmap.geometry import Array
+from hybridmap.neural.attractor import PlaceAttractor
+from hybridmap.neural.band import BandRings
+from hybridmap.neural.decoder import Decoded, PhaseDecoder
+from hybridmap.neural.grid import GridModules, kernel_spectrum, relu, softplus
+from hybridmap.neural.head_direction import HeadDirectionRing
+from hybridmap.neural.place import PlaceCells
+from hybridmap.neural.torus import LowModes, shift_sheets
+
+
+class PathIntegrator:
+    """Head direction -> band -> grid -> place -> place attractor.
+
+    The pose is read from the head-direction ring and from the phases of all grid sheets together. No number integrates position
+    beside the network. What the read-out needs besides is which repetition of the code is meant: the place attractor's bump says it
+    up to the attractor's own wrap (some metres), and the last decoded position says which of those. Both are used as a prior
+    only: within the box around it, other activity means another pose.
+    """
+
+    def __init__(self, config: NeuralConfig) -> None:
+        self.config = config
+        dtype = np.dtype(config.dtype)
+        self.spacings_m: NDArray[np.float64] = np.geomspace(config.spacing_min_m, config.spacing_max_m, config.modules)
+        turned = np.radians(config.orientation_deg + config.orientation_step_deg * np.arange(config.modules))
+        self.head_direction = HeadDirectionRing(config.head_direction_cells, dtype)
+        self.bands = BandRings(self.spacings_m, turned, config.band_cells, config.band_width, dtype)
+        self.grid = _grid(config)
+        place = config.place
+        self.place = PlaceCells(place, config.sheet_side, config.modules)
+        self.attractor = PlaceAttractor(place.attractor_side, place.attractor_cell_m, place.attractor_width_cells, dtype)
+        self._decoder = PhaseDecoder(self.bands.wave_vectors, config.decode_box_m)
+        self._last_decoded_m: Array = np.zeros(2)
+        self._moves = 0
+        self.place.learn(self.grid.activity)
+
+    def step(self, delta_robot: ArrayLike, dt_s: float) -> None:
+        """Integrate one displacement.
+
+        Args:
+            delta_robot: (3,) pose of the robot now in the frame of the robot at the last step, m and rad (`geometry.between` of two
+                odometry poses). Its chord is turned to the mid-point heading, so gains on the turn bend the path as they should.
+            dt_s: seconds since the last step; the sheets' time constant is one step, so it does not enter their dynamics.
+        """
+        dx, dy, dyaw = (float(value) for value in np.asarray(delta_robot, dtype=np.float64))
+        if dx == 0.0 and dy == 0.0 and dyaw == 0.0:
+            return
+        config = self.config
+        half_turn = 0.5 * (config.turn_gain * dyaw + config.heading_bias_rad_m * dx)
+        cos, sin = np.cos(0.5 * dyaw), np.sin(0.5 * dyaw)
+        self.head_direction.turn(half_turn)
+        forward, left = config.gain * (cos * dx + sin * dy), config.gain * (cos * dy - sin * dx)
+        c, s = self.head_direction.direction()
+        self.head_direction.turn(half_turn)
+        if dx != 0.0 or dy != 0.0:
+            self._translate(np.array([c * forward - s * left, s * forward + c * left]))
+
+    def step_velocity(self, v_m_s: float, omega_rad_s: float, dt_s: float) -> None:
+        """Integrate constant speed and turn rate over `dt_s`, by the mid-point heading."""
+        ds, dyaw = v_m_s * dt_s, omega_rad_s * dt_s
+        self.step((ds * np.cos(0.5 * dyaw), ds * np.sin(0.5 * dyaw), dyaw), dt_s)
+
+    @property
+    def pose(self) -> Array:
+        """Pose (3,) decoded from activity, m and rad, in the frame in which the integrator started."""
+        return np.array([*self.decode().position_m, self.head_direction.heading_rad])
+
+    @property
+    def place_code(self) -> NDArray[np.float32]:
+        """Place-cell rates (P,) after competition, of unit length; novelty is 1 - the dot product of two codes."""
+        return self.place.code(self.grid.activity)
+
+    def decode(self) -> Decoded:
+        """Decode the position from all sheets together, with how well the modules agree."""
+        priors = [self._last_decoded_m, self.attractor.unwrapped_m(self._last_decoded_m)]
+        decoded = self._decoder.decode(self.grid.band_phases(), priors)
+        self._last_decoded_m = decoded.position_m
+        return decoded
+
+    def module_phases(self) -> NDArray[np.float64]:
+        """Phases (M, 2) of the sheets' activity along the 0 and 120 degree bands, cycles in [0, 1)."""
+        return self.grid.phases()
+
+    def module_errors(self, position_m: ArrayLike) -> Array:
+        """Distance (M,) between what each module's sheet says and a true position (2,), in units of its spacing."""
+        waves = self.bands.wave_vectors[:, [0, 2], :]
+        offset = self.grid.phases() - waves @ np.asarray(position_m, dtype=np.float64)[:2]
+        offset -= np.round(offset)
+        metres = np.linalg.solve(waves, offset[..., None])[..., 0]
+        return np.asarray(np.linalg.norm(metres, axis=1) / self.spacings_m)
+
+    def shift_activity(self, displacement_m: ArrayLike) -> None:
+        """Overwrite the sheets and rings with themselves moved by a displacement (2,), m, as if the robot stood there."""
+        move = np.asarray(displacement_m, dtype=np.float64)
+        shift = self.bands.wave_vectors @ move
+        self.bands.activity = self.bands.rates_at(self.bands.phases() + shift)
+        self.grid.activity = shift_sheets(self.grid.activity, shift[:, [0, 2]])
+
+    def snapshot(self) -> dict[str, NDArray[np.generic]]:
+        """Return what a node stores so that `restore` puts the network back where it is now (about 8 kB).
+
+        Keys: `heading` (m,), `band_phases` (M, 3), `grid_phases` (M, 2), `attractor` (N, N), `place_code` (P,), `near_m` (2,): the decoded
+        position, which says which repetition of the code is meant.
+        """
+        near = self.decode().position_m
+        return {
+            "heading": self.head_direction.activity.copy(),
+            "band_phases": self.bands.phases(),
+            "grid_phases": self.grid.phases(),
+            "attractor": self.attractor.activity.astype(np.float32),
+            "place_code": self.place_code,
+            "near_m": near.copy(),
+        }
+
+    def restore(self, snapshot: dict[str, NDArray[np.generic]]) -> None:
+        """Put a stored activity back: hard re-anchoring (paper eq. 16, the visual recalibration)."""
+        dtype = self.grid.activity.dtype
+        self.head_direction.activity = np.asarray(snapshot["heading"], dtype=dtype).copy()
+        self.bands.activity = self.bands.rates_at(np.asarray(snapshot["band_phases"], dtype=np.float64))
+        target = np.asarray(snapshot["grid_phases"], dtype=np.float64)
+        self.grid.activity = shift_sheets(self.grid.activity, target - self.grid.phases())
+        self.attractor.activity = np.asarray(snapshot["attractor"], dtype=dtype).copy()
+        self._last_decoded_m = np.asarray(snapshot["near_m"], dtype=np.float64).copy()
+
+    def _translate(self, displacement_m: Array) -> None:
+        advance = self.bands.step(displacement_m)
+        self.grid.step(advance, self.bands.phasors())
+        self.attractor.step(displacement_m)
+        self._moves += 1
+        if self._moves % self.config.place.learning_period_steps == 0:
+            self.place.learn(self.grid.activity)
+
+
+def _grid(config: NeuralConfig) -> GridModules:
+    modes = LowModes(config.sheet_side, config.fourier_modes)
+    gains = kernel_spectrum(
+        modes.squared_wave_number(), config.kernel_gain_first, config.kernel_gain_zero, config.kernel_widths
+    )
+    rectifier = relu if config.rectifier == "relu" else softplus(config.softplus_sharpness)
+    return GridModules(
+        config.modules, config.sheet_side, config.fourier_modes, gains, rectifier, config.band_drive, np.dtype(config.dtype)
+    )
