@@ -122,7 +122,7 @@ class MapStore:
             measured = (*_floats(edge.relative.delta), codec.pack_floats(edge.relative.covariance))
         scores = json.dumps({name: float(score) for name, score in edge.scores.items()})
         kind, status = EdgeKind(edge.kind).name.lower(), str(edge.status)
-        row = (number, int(edge.source), int(edge.target), kind, status, edge.reason, *measured, scores)
+        row = (number, int(edge.source), int(edge.target), kind, status, edge.reason, *measured, scores, edge.since_node)
         self._write(f"INSERT OR REPLACE INTO edges VALUES ({_marks(len(row))})", row)
 
     def add_track(self, stamp_ns: int, node: int, delta_node_robot: Array, pose_odom: Array) -> None:
@@ -198,7 +198,7 @@ class MapStore:
             if row[9] is not None:
                 relative = RelativePose(np.array(row[6:9]), codec.unpack_floats(row[9], 3))
             kind, status, scores = EdgeKind[row[3].upper()], Status(row[4]), json.loads(row[10])
-            experiences.add_edge(Edge(row[1], row[2], kind, status, row[5], relative, scores))
+            experiences.add_edge(Edge(row[1], row[2], kind, status, row[5], relative, scores, row[11]))
         return experiences
 
     def keyframe(self, node: int) -> dict[str, NDArray[Any]]:

@@ -29,7 +29,8 @@ CREATE TABLE arrays (
 CREATE TABLE edges (
     number INTEGER PRIMARY KEY, source INTEGER NOT NULL, target INTEGER NOT NULL,
     kind TEXT NOT NULL, status TEXT NOT NULL, reason TEXT NOT NULL,
-    x_m REAL, y_m REAL, yaw_rad REAL, covariance BLOB, scores TEXT NOT NULL);
+    x_m REAL, y_m REAL, yaw_rad REAL, covariance BLOB, scores TEXT NOT NULL,
+    since_node INTEGER NOT NULL);
 CREATE TABLE track (
     stamp_ns INTEGER PRIMARY KEY, node INTEGER NOT NULL,
     x_m REAL NOT NULL, y_m REAL NOT NULL, yaw_rad REAL NOT NULL,
