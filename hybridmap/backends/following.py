@@ -110,6 +110,10 @@ class GraphBackend(ABC):
         self._graph, self._poses, self._weights = graph, outcome.poses, outcome.weights
         return self._solution(graph, start, outcome, started)
 
+    def finish(self, graph: PoseGraph) -> Solution:
+        """See `Backend.finish`: a fresh solve; back-ends whose state is their merit go on from it instead."""
+        return self.solve(graph)
+
     def solve(self, graph: PoseGraph | SupportsPoseGraph) -> Solution:
         """See `Backend.solve`."""
         frozen = graph if isinstance(graph, PoseGraph) else graph.pose_graph()
