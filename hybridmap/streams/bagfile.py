@@ -1,0 +1,190 @@
+"""A bag file: its topics, its messages in the order of recording, and one clear error for whatever is wrong with it.
+
+ROS 1 `.bag`, ROS 2 folders with `metadata.yaml`, bare `.mcap` and `.db3` files, read by `rosbags` without ROS.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hybridmap.errors import StreamError
+from hybridmap.trajectory import NS_PER_S
+
+_TF_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
+_TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+
+_ADVICE = {
+    "not indexed": "the bag has no index; run `rosbag reindex` on it",
+    "index looks damaged": "the bag is cut off or was not closed; run `rosbag reindex` on it or record again",
+    "file magic is invalid": "not a bag of format 2.0, or damaged; convert it with `rosbag` tools or record again",
+    "end magic": "the file is cut off or was not closed; recover it with `mcap recover`",
+    "footer": "the file is cut off or was not closed; recover it with `mcap recover`",
+    "malformed": "the database is cut off or damaged",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One topic of a bag.
+
+    Attributes:
+        name: with its leading slash.
+        msgtype: as `sensor_msgs/msg/LaserScan`, for ROS 1 too.
+        count: number of messages that the bag says it holds.
+    """
+
+    name: str
+    msgtype: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class RawMessage:
+    """One serialised message.
+
+    Attributes:
+        topic: name.
+        number: its place within the topic, from 0.
+        data: serialised bytes.
+    """
+
+    topic: str
+    number: int
+    data: bytes
+
+
+class BagFile:
+    """A bag that opens; the file is closed between readings, so any number of them may run."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the bag once and learn its topics.
+
+        Raises:
+            StreamError: missing, empty, cut off, not indexed, or no bag at all.
+        """
+        self.path = path
+        self.is_ros1 = path.suffix == ".bag"
+        if not path.exists():
+            raise StreamError(f"{path}: no such file or folder")
+        if path.is_file() and path.stat().st_size == 0:
+            raise StreamError(f"{path}: the file is empty")
+        self._stores: dict[str, Any] = {}
+        self._definitions: dict[str, Any] = {}
+        with self._reader() as reader:
+            counts: dict[tuple[str, str], int] = {}
+            for connection in reader.connections:
+                key = (connection.topic, connection.msgtype)
+                counts[key] = counts.get(key, 0) + connection.msgcount
+                self._definitions.setdefault(connection.msgtype, connection.msgdef)
+        self.topics = tuple(Topic(name, msgtype, count) for (name, msgtype), count in sorted(counts.items()))
+        self._types = {topic.name: topic.msgtype for topic in self.topics}
+
+    def raw(self, names: Collection[str]) -> Iterator[RawMessage]:
+        """Messages of the named topics in the order of recording.
+
+        Raises:
+            StreamError: the file is damaged.
+        """
+        wanted = frozenset(names)
+        numbers = dict.fromkeys(wanted, 0)
+        if not wanted:
+            return
+        with self._reader() as reader:
+            connections = [c for c in reader.connections if c.topic in wanted and c.msgcount]
+            messages = reader.messages(connections=connections) if connections else iter(())
+            while True:
+                try:
+                    connection, _, data = next(messages)
+                except StopIteration:
+                    return
+                except Exception as error:  # noqa: BLE001  a damaged file makes the parser raise anything
+                    raise self._damaged(error) from None
+                number = numbers[connection.topic]
+                numbers[connection.topic] = number + 1
+                yield RawMessage(connection.topic, number, bytes(data))
+
+    def stamp_ns(self, message: RawMessage) -> int:
+        """Header stamp of a message whose first field is a header, without decoding the rest, ns."""
+        data = message.data
+        try:
+            if self.is_ros1:
+                _, seconds, nanoseconds = struct.unpack_from("<III", data)
+            else:
+                seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
+        except (struct.error, IndexError):
+            raise self._undecodable(message) from None
+        return int(seconds) * NS_PER_S + int(nanoseconds)
+
+    def decode(self, message: RawMessage) -> Any:
+        """The message as an object with the fields of its type.
+
+        Raises:
+            StreamError: the bytes are not of that type.
+        """
+        msgtype = self._types[message.topic]
+        try:
+            store = self._store(msgtype)
+            if self.is_ros1:
+                return store.deserialize_ros1(message.data, msgtype)
+            return store.deserialize_cdr(message.data, msgtype)
+        except Exception as error:
+            raise self._undecodable(message) from error
+
+    def _reader(self) -> Any:
+        try:
+            if self.is_ros1:
+                from rosbags.rosbag1 import Reader as Reader1
+
+                reader = Reader1(self.path)
+            else:
+                from rosbags.rosbag2 import Reader as Reader2
+
+                reader = Reader2(self.path)
+            reader.open()
+        except Exception as error:  # noqa: BLE001  a damaged file makes the parser raise anything
+            raise self._damaged(error) from None
+        return closing(reader)
+
+    def _store(self, msgtype: str) -> Any:
+        if msgtype not in self._stores:
+            from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+            fallback = get_typestore(Stores.ROS1_NOETIC if self.is_ros1 else Stores.ROS2_HUMBLE)
+            for name in _TF_TYPES:
+                if name not in fallback.fielddefs:
+                    fallback.register(get_types_from_msg(_TF_DEFINITION, name))
+            self._stores[msgtype] = _embedded_store(self._definitions[msgtype], msgtype) or fallback
+        return self._stores[msgtype]
+
+    def _damaged(self, error: Exception) -> StreamError:
+        found = " ".join(str(part) for part in error.args) or type(error).__name__
+        advice = next((text for sign, text in _ADVICE.items() if sign in found.lower()), "the file is cut off or damaged")
+        return StreamError(f"{self.path}: cannot be read as a bag ({found.rstrip('.')}): {advice}")
+
+    def _undecodable(self, message: RawMessage) -> StreamError:
+        return StreamError(
+            f"{self.path}: {message.topic}: message {message.number + 1} ({len(message.data)} bytes) "
+            f"is no valid {self._types[message.topic]}; the bag is damaged"
+        )
+
+
+def _embedded_store(definition: Any, msgtype: str) -> Any | None:
+    """Type store of the definition that the bag carries; None where it carries none that can be used."""
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    if definition.format != MessageDefinitionFormat.MSG:
+        return None
+    try:
+        types = get_types_from_msg(definition.data, msgtype)
+        store = get_typestore(Stores.EMPTY)
+        store.register(types)
+        store.generate_msgdef(msgtype)
+    except Exception:  # noqa: BLE001  an incomplete definition: the standard one will do
+        return None
+    return store

@@ -1,0 +1,153 @@
+"""First pass over a bag: every header stamp, all self-motion and transforms, the first message of each sensor.
+
+It decodes no picture, so it is cheap, and it meets damage, NaN and disorder before anything is mapped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.errors import StreamError
+from hybridmap.geometry import Array, compose, yaw_from_quaternion
+from hybridmap.streams.bagfile import BagFile, RawMessage
+from hybridmap.streams.mounting import TransformTree, clean_frame, matrix, planar
+from hybridmap.streams.order import sorted_order
+from hybridmap.streams.topics import ODOMETRY, TRANSFORM, is_static
+from hybridmap.trajectory import Trajectory, format_stamp
+
+
+@dataclass(slots=True)
+class PoseTrack:
+    """Poses of one frame in another, in the order of the recording.
+
+    Attributes:
+        parent, child: frames, without leading slash.
+        stamps_ns: header stamps.
+        poses: planar poses (x m, y m, yaw rad).
+    """
+
+    parent: str
+    child: str
+    stamps_ns: list[int] = field(default_factory=list)
+    poses: list[tuple[float, float, float]] = field(default_factory=list)
+
+    def add(self, stamp_ns: int, position: Any, orientation: Any, what: str) -> None:
+        """Append one pose.
+
+        Raises:
+            StreamError: NaN or Inf, or a quaternion of length zero.
+        """
+        q = (orientation.x, orientation.y, orientation.z, orientation.w)
+        pose = (float(position.x), float(position.y), float(yaw_from_quaternion(*q)))
+        if not np.isfinite(pose).all() or not np.isfinite(q).all():
+            raise StreamError(
+                f"{what}: found NaN or Inf in the pose at stamp {format_stamp(stamp_ns)} s; expected finite numbers"
+            )
+        if not any(q):
+            raise StreamError(
+                f"{what}: found a quaternion of length 0 at stamp {format_stamp(stamp_ns)} s; expected a rotation"
+            )
+        self.stamps_ns.append(stamp_ns)
+        self.poses.append(pose)
+
+    def sorted(self, what: str, pose_child_base: Array | None = None) -> tuple[NDArray[np.int64], Array]:
+        """Stamps (N,) and poses (N, 3) in order of time, carried on to a frame fixed to the child if one is given."""
+        stamps = np.asarray(self.stamps_ns, dtype=np.int64)
+        order = sorted_order(stamps, what)
+        poses = np.asarray(self.poses, dtype=np.float64).reshape(-1, 3)[order]
+        return stamps[order], poses if pose_child_base is None else compose(poses, pose_child_base)
+
+    def trajectory(self, what: str) -> Trajectory:
+        """As a trajectory; of equal stamps the first is kept."""
+        stamps, poses = self.sorted(what)
+        first = np.concatenate([[True], np.diff(stamps) > 0])
+        return Trajectory(stamps[first], poses[first])
+
+
+@dataclass(slots=True)
+class BagIndex:
+    """What the first pass learnt.
+
+    Attributes:
+        stamps_ns: topic -> header stamps in the order of the recording.
+        first: topic -> its first message, decoded.
+        odometry: topic -> its poses.
+        transforms: the transform tree; `tf_tracks` the moving transforms in it, by (parent, child).
+    """
+
+    stamps_ns: dict[str, list[int]] = field(default_factory=dict)
+    first: dict[str, Any] = field(default_factory=dict)
+    odometry: dict[str, PoseTrack] = field(default_factory=dict)
+    transforms: TransformTree = field(default_factory=TransformTree)
+    tf_tracks: dict[tuple[str, str], PoseTrack] = field(default_factory=dict)
+
+    def frame_of(self, topic: str) -> str:
+        """Frame of a topic's first header."""
+        return clean_frame(self.first[topic].header.frame_id) if topic in self.first else ""
+
+
+def build_index(bag: BagFile, names: Iterable[str], odom_frame: str) -> BagIndex:
+    """Read the named topics once.
+
+    Args:
+        bag: the bag.
+        names: topics of types with a header, or with transforms.
+        odom_frame: transforms that start here are kept as tracks, for they may be the odometry.
+
+    Raises:
+        StreamError: damage, or a pose that is no number.
+    """
+    index = BagIndex()
+    types = {topic.name: topic.msgtype for topic in bag.topics}
+    wanted = sorted(set(names))
+    for message in bag.raw(wanted):
+        if types[message.topic] in TRANSFORM:
+            _take_transforms(index, bag, message, clean_frame(odom_frame))
+            continue
+        stamp_ns = bag.stamp_ns(message)
+        index.stamps_ns.setdefault(message.topic, []).append(stamp_ns)
+        is_odometry = types[message.topic] in ODOMETRY
+        if is_odometry or message.topic not in index.first:
+            decoded = bag.decode(message)
+            index.first.setdefault(message.topic, decoded)
+            if is_odometry:
+                _take_odometry(index, bag, message.topic, decoded, stamp_ns)
+    return index
+
+
+def _take_odometry(index: BagIndex, bag: BagFile, topic: str, message: Any, stamp_ns: int) -> None:
+    if topic not in index.odometry:
+        index.odometry[topic] = PoseTrack(clean_frame(message.header.frame_id), clean_frame(message.child_frame_id))
+    pose = message.pose.pose
+    index.odometry[topic].add(stamp_ns, pose.position, pose.orientation, f"{bag.path}: {topic}")
+
+
+def _take_transforms(index: BagIndex, bag: BagFile, message: RawMessage, odom_frame: str) -> None:
+    for transform in bag.decode(message).transforms:
+        parent, child = clean_frame(transform.header.frame_id), clean_frame(transform.child_frame_id)
+        p, q = transform.transform.translation, transform.transform.rotation
+        what = f"{bag.path}: {message.topic}: {parent} -> {child}"
+        stamp = transform.header.stamp
+        stamp_ns = int(getattr(stamp, "sec", 0)) * 1_000_000_000 + int(getattr(stamp, "nanosec", 0))
+        if parent == odom_frame and not is_static(message.topic):
+            track = index.tf_tracks.setdefault((parent, child), PoseTrack(parent, child))
+            if not track.stamps_ns or track.stamps_ns[-1] != stamp_ns:  # tf is published again and again
+                track.add(stamp_ns, p, q, what)
+        values = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+        if not np.isfinite(values).all() or not any(values[3:]):
+            raise StreamError(f"{what}: found {values}, expected a finite translation and a rotation")
+        T = matrix((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+        index.transforms.add(parent, child, T, static=is_static(message.topic))
+
+
+def fixed_pose(tree: TransformTree, from_frame: str, to_frame: str) -> Array | None:
+    """(3,) planar pose of one frame in another that it is fixed to; None where they are not joined or are the same."""
+    if from_frame == to_frame:
+        return None
+    T = tree.between(from_frame, to_frame)
+    return None if T is None else planar(T)

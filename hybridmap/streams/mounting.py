@@ -1,0 +1,126 @@
+"""Where the sensors sit on the robot: the constant part of the transform tree."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridmap.errors import StreamError
+from hybridmap.geometry import Array, rotation_from_quaternion
+
+_CONSTANT_TOLERANCE = 1e-4  # m, or of a rotation matrix' entries
+_MOST_TILT_COS = 0.9  # a planar laser may lean by 25 deg at most
+
+
+def clean_frame(frame: str) -> str:
+    """A frame's name without the leading slash of old tf."""
+    return frame.strip().lstrip("/")
+
+
+def matrix(translation: tuple[float, float, float], quaternion_xyzw: tuple[float, float, float, float]) -> Array:
+    """(4, 4) pose of the child frame in the parent frame, m."""
+    T = np.eye(4)
+    T[:3, :3] = rotation_from_quaternion(quaternion_xyzw)
+    T[:3, 3] = translation
+    return T
+
+
+def invert(T_a_b: Array) -> Array:
+    """Inverse (4, 4) of a rigid transform."""
+    T = np.eye(4)
+    T[:3, :3] = T_a_b[:3, :3].T
+    T[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
+    return T
+
+
+def planar(T_a_b: Array) -> Array:
+    """(3,) x, y and heading of the x axis of a (4, 4) pose, m and rad."""
+    return np.array([T_a_b[0, 3], T_a_b[1, 3], np.arctan2(T_a_b[1, 0], T_a_b[0, 0])])
+
+
+@dataclass(slots=True)
+class _Edge:
+    T_parent_child: Array
+    is_static: bool
+    moves: bool = False
+
+
+class TransformTree:
+    """Frames joined by transforms; those that never change, static or not, carry the mounting."""
+
+    def __init__(self) -> None:
+        self._edges: dict[tuple[str, str], _Edge] = {}
+
+    def add(self, parent: str, child: str, T_parent_child: Array, *, static: bool) -> None:
+        """Take in one transform; a static one wins over a moving one, the newest static one over the older."""
+        key = (clean_frame(parent), clean_frame(child))
+        edge = self._edges.get(key)
+        if edge is None or (static and not edge.is_static) or (static and edge.is_static):
+            self._edges[key] = _Edge(T_parent_child, static)
+        elif not edge.is_static:
+            edge.moves |= bool(np.abs(edge.T_parent_child - T_parent_child).max() > _CONSTANT_TOLERANCE)
+
+    @property
+    def frames(self) -> list[str]:
+        """All frames, sorted."""
+        return sorted({frame for key in self._edges for frame in key})
+
+    def between(self, base: str, sensor: str) -> Array | None:
+        """(4, 4) pose of the sensor's frame in the base, along constant transforms; None where there is no such way."""
+        return self._search(clean_frame(base), clean_frame(sensor), allow_moving=False)
+
+    def moves_between(self, base: str, sensor: str) -> bool:
+        """Whether the two frames are joined, but only by transforms that change."""
+        return self.between(base, sensor) is None and (
+            self._search(clean_frame(base), clean_frame(sensor), allow_moving=True) is not None
+        )
+
+    def _search(self, base: str, sensor: str, *, allow_moving: bool) -> Array | None:
+        reached = {base: np.eye(4)}
+        queue = deque([base])
+        while queue:
+            frame = queue.popleft()
+            if frame == sensor:
+                return reached[frame]
+            for (parent, child), edge in sorted(self._edges.items(), key=lambda item: item[0]):
+                if edge.moves and not allow_moving:
+                    continue
+                if parent == frame and child not in reached:
+                    reached[child] = reached[frame] @ edge.T_parent_child
+                    queue.append(child)
+                elif child == frame and parent not in reached:
+                    reached[parent] = reached[frame] @ invert(edge.T_parent_child)
+                    queue.append(parent)
+        return None
+
+    def require(self, base: str, sensor: str, what: str, setting: str) -> Array:
+        """As `between`, but an error where there is no way.
+
+        Raises:
+            StreamError: naming both frames and the setting that helps.
+        """
+        found = self.between(base, sensor)
+        if found is not None:
+            return found
+        if self.moves_between(base, sensor):
+            raise StreamError(f"{what}: the transform {base!r} -> {sensor!r} moves on /tf; give {setting} in the configuration")
+        known = ", ".join(self.frames) or "none"
+        raise StreamError(
+            f"{what}: no transform {base!r} -> {sensor!r} in /tf_static or /tf (frames found: {known}); "
+            f"give {setting} in the configuration"
+        )
+
+
+def laser_pose(T_base_laser: Array, what: str) -> tuple[Array, bool]:
+    """Planar mounting (3,) of a laser, and whether it hangs upside down.
+
+    Raises:
+        StreamError: the laser does not scan level.
+    """
+    up = T_base_laser[2, 2]
+    if abs(up) < _MOST_TILT_COS:
+        tilt = np.degrees(np.arccos(np.clip(abs(up), 0.0, 1.0)))
+        raise StreamError(f"{what}: the laser leans by {tilt:.0f} deg; expected a level one; check sensors.laser_mounting")
+    return planar(T_base_laser), bool(up < 0)

@@ -1,0 +1,159 @@
+"""One name for every source: world, bag, folder or table -> stream."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from hybridmap.config.root import Config
+from hybridmap.errors import StreamError
+from hybridmap.streams.base import Rig, Sample, Stream, StreamReport
+from hybridmap.streams.order import Window
+from hybridmap.trajectory import Trajectory
+
+_Opener = Callable[[Path, Config, Window], Stream]
+
+EXPECTED = (
+    "a simulated world, a ROS 1 bag (.bag), a ROS 2 bag (folder with metadata.yaml, .mcap, .db3), "
+    "a TUM RGB-D folder or a velocity table (.csv)"
+)
+
+
+def _open_bag(path: Path, config: Config, window: Window) -> Stream:
+    from hybridmap.streams.rosbag import BagStream
+
+    return BagStream(path, config, window)
+
+
+def _open_tum(path: Path, config: Config, window: Window) -> Stream:
+    from hybridmap.streams.tum import TumStream
+
+    return TumStream(path, config, window)
+
+
+def _open_velocity(path: Path, config: Config, window: Window) -> Stream:
+    from hybridmap.streams.velocity import VelocityStream
+
+    return VelocityStream(path, config, window)
+
+
+_OPENERS: dict[str, _Opener] = {
+    "ROS 1 bag": _open_bag,
+    "ROS 2 bag": _open_bag,
+    "TUM RGB-D folder": _open_tum,
+    "velocity table": _open_velocity,
+}
+_KIND_OF_SUFFIX = {".bag": "ROS 1 bag", ".mcap": "ROS 2 bag", ".db3": "ROS 2 bag", ".csv": "velocity table"}
+_SIGNS_OF_TUM = ("rgb.txt", "depth.txt", "associations.txt", "rgb", "depth")
+
+
+def world_of(source: str | Path) -> str | None:
+    """Name of the simulated world that a source means (`office` or `sim:office`); None if it means none.
+
+    A world's name wins over a file of that name; write `./office` for the file.
+
+    Raises:
+        StreamError: `sim:` with the name of no world.
+    """
+    text = str(source)
+    explicit = text.startswith("sim:")
+    name = text.removeprefix("sim:")
+    if not explicit and (isinstance(source, Path) or "/" in name or "." in name):
+        return None
+    from hybridmap.streams.simulated import world_names
+
+    known = tuple(world_names())
+    if name in known:
+        return name
+    if explicit:
+        raise StreamError(f"{text}: no such simulated world; worlds: {', '.join(known)}")
+    return None
+
+
+def kind_of(path: Path) -> str:
+    """What a file or folder holds, by its name and look.
+
+    Raises:
+        StreamError: it does not exist, is empty, or is nothing that can be read.
+    """
+    if path.is_dir():
+        if (path / "metadata.yaml").is_file():
+            return "ROS 2 bag"
+        if any((path / sign).exists() for sign in _SIGNS_OF_TUM):
+            return "TUM RGB-D folder"
+        bags = sorted(p.name for p in path.iterdir() if p.suffix in _KIND_OF_SUFFIX)
+        hint = f"; it holds {', '.join(bags[:5])}: give one of these" if bags else ""
+        raise StreamError(f"{path}: a folder that is neither a ROS 2 bag nor a TUM RGB-D folder{hint}")
+    if not path.exists():
+        raise StreamError(f"{path}: no such file, folder or simulated world; expected {EXPECTED}")
+    if path.stat().st_size == 0:
+        raise StreamError(f"{path}: the file is empty")
+    kind = _KIND_OF_SUFFIX.get(path.suffix.lower())
+    if kind is None:
+        raise StreamError(f"{path}: unknown kind of file {path.suffix!r}; expected {EXPECTED}")
+    return kind
+
+
+def open_stream(source: str | Path, config: Config, *, start_s: float | None = None, end_s: float | None = None) -> Stream:
+    """Open a recording, or a simulated world by name.
+
+    Args:
+        source: path, or `office` / `sim:office`.
+        config: topics, mounting, synchronisation; the simulated drive.
+        start_s, end_s: only this part, seconds from the first stamp, inclusive.
+
+    Raises:
+        StreamError: it cannot be opened, or holds no stream that can be mapped; the message says why.
+    """
+    window = Window(start_s, end_s)
+    world = world_of(source)
+    if world is not None:
+        from hybridmap.streams.simulated import SimulatedStream
+
+        simulation = config.simulation.model_copy(update={"world": world})
+        stream: Stream = SimulatedStream(simulation, config.seed)
+        return stream if window == Window() else WindowedStream(stream, window)
+    path = Path(source)
+    return _OPENERS[kind_of(path)](path, config, window)
+
+
+class WindowedStream:
+    """Part of another stream."""
+
+    def __init__(self, stream: Stream, window: Window) -> None:
+        self._stream, self._window = stream, window
+
+    @property
+    def name(self) -> str:
+        """The whole stream's name."""
+        return self._stream.name
+
+    @property
+    def rig(self) -> Rig:
+        """The whole stream's sensors."""
+        return self._stream.rig
+
+    @property
+    def groundtruth(self) -> Trajectory | None:
+        """The whole stream's truth."""
+        return self._stream.groundtruth
+
+    @property
+    def expected_observations(self) -> int | None:
+        """Not known before it has been read."""
+        return None
+
+    @property
+    def report(self) -> StreamReport:
+        """What the whole stream met."""
+        return self._stream.report
+
+    def __iter__(self) -> Iterator[Sample]:
+        """Yield the samples within the window."""
+        limits: tuple[int, int] | None = None
+        for sample in self._stream:
+            low, high = limits = limits or self._window.limits_ns(sample.stamp_ns)
+            if sample.stamp_ns > high:
+                return
+            if sample.stamp_ns >= low:
+                yield sample

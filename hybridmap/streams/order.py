@@ -1,0 +1,106 @@
+"""Order in time: stamps within a topic, pairs across topics, one sorted stream out of several."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.errors import StreamError
+from hybridmap.streams.base import LaserScan, RgbdFrame, Sample, SelfMotion, Velocity
+from hybridmap.trajectory import NS_PER_S, format_stamp
+
+_RANK: dict[type, int] = {SelfMotion: 0, Velocity: 0, LaserScan: 1, RgbdFrame: 2}
+
+Stamps = NDArray[np.int64]
+
+
+def sorted_order(stamps_ns: Stamps, what: str) -> NDArray[np.intp]:
+    """Order that sorts the stamps `(N,)`; a message may have slipped behind its direct successor, no further.
+
+    Args:
+        stamps_ns: (N,) header stamps in the order of the recording, ns.
+        what: file and topic, for the error.
+
+    Raises:
+        StreamError: a stamp goes back behind more than the one message before it.
+    """
+    if len(stamps_ns) > 2:
+        newest = np.maximum.accumulate(stamps_ns)[:-2]
+        late = np.flatnonzero(stamps_ns[2:] < newest)
+        if len(late):
+            at = int(late[0])
+            raise StreamError(
+                f"{what}: stamp {format_stamp(int(stamps_ns[at + 2]))} s (message {at + 3}) goes back behind "
+                f"{format_stamp(int(newest[at]))} s; expected stamps in order, at most one message out of place"
+            )
+    return np.argsort(stamps_ns, kind="stable")
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """Which colour picture goes with which depth picture.
+
+    Attributes:
+        color, depth: (P,) indices into either list, one to one.
+        unmatched_color, unmatched_depth: how many pictures found no partner.
+    """
+
+    color: NDArray[np.intp]
+    depth: NDArray[np.intp]
+    unmatched_color: int
+    unmatched_depth: int
+
+
+def pair_nearest(color_ns: Stamps, depth_ns: Stamps, tolerance_s: float) -> Pairs:
+    """Pair pictures by stamp, nearest first, each used once, none further apart than the tolerance.
+
+    Args:
+        color_ns: (C,) sorted stamps, ns.
+        depth_ns: (D,) sorted stamps, ns.
+        tolerance_s: largest difference, s.
+    """
+    tolerance_ns = round(tolerance_s * NS_PER_S)
+    candidates: list[tuple[int, int, int]] = []
+    first = np.searchsorted(depth_ns, color_ns - tolerance_ns, side="left")
+    last = np.searchsorted(depth_ns, color_ns + tolerance_ns, side="right")
+    for i, (low, high) in enumerate(zip(first, last, strict=True)):
+        candidates += [(abs(int(color_ns[i]) - int(depth_ns[j])), i, j) for j in range(int(low), int(high))]
+    free_color, free_depth = np.ones(len(color_ns), dtype=bool), np.ones(len(depth_ns), dtype=bool)
+    pairs: list[tuple[int, int]] = []
+    for _, i, j in sorted(candidates):
+        if free_color[i] and free_depth[j]:
+            free_color[i] = free_depth[j] = False
+            pairs.append((i, j))
+    table = np.array(sorted(pairs), dtype=np.intp).reshape(-1, 2)
+    return Pairs(table[:, 0], table[:, 1], int(free_color.sum()), int(free_depth.sum()))
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """The part of a recording that is wanted.
+
+    Attributes:
+        start_s, end_s: seconds from the first stamp, both inclusive; None: open.
+    """
+
+    start_s: float | None = None
+    end_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.start_s is not None and self.end_s is not None and self.end_s < self.start_s:
+            raise StreamError(f"--end {self.end_s} s lies before --start {self.start_s} s")
+
+    def limits_ns(self, first_ns: int) -> tuple[int, int]:
+        """First and last stamp wanted, ns, for a recording whose first stamp is given."""
+        low = -(2**62) if self.start_s is None else first_ns + round(self.start_s * NS_PER_S)
+        high = 2**62 if self.end_s is None else first_ns + round(self.end_s * NS_PER_S)
+        return low, high
+
+
+def merge(*sources: Iterable[Sample]) -> Iterator[Sample]:
+    """One stream out of several sorted ones, by stamp; at equal stamps motion, then scans, then frames."""
+    return heapq.merge(*sources, key=lambda sample: (sample.stamp_ns, _RANK[type(sample)]))

@@ -1,0 +1,163 @@
+"""Self-motion and observations on one clock: the steps that a mapper takes, one after the other.
+
+It stands inside the mapper, so that a live robot and a recording give the same steps.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridmap.errors import StreamError
+from hybridmap.geometry import IDENTITY, Array, between, compose, exp, interpolate
+from hybridmap.streams.base import Motion, Observation, Sample, SelfMotion, StreamReport, Velocity
+from hybridmap.trajectory import NS_PER_S, format_stamp
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """One step of the mapper.
+
+    Attributes:
+        stamp_ns: ns.
+        delta_robot: (3,) displacement since the step before, in the robot's frame at that step, m and rad.
+        dt_s: time since the step before, s.
+        pose_odom_robot: (3,) pose in `odom` at the stamp (velocities: integrated from the identity), m and rad.
+        observation: what was seen at the stamp; None for a step of self-motion alone.
+    """
+
+    stamp_ns: int
+    delta_robot: Array
+    dt_s: float
+    pose_odom_robot: Array
+    observation: Observation | None = None
+
+
+class Synchroniser:
+    """Turns sorted samples into steps, strictly in order of stamp; at one stamp motion comes before observations.
+
+    Every distinct stamp of self-motion gives one step without observation; every observation gives one step with it, at
+    the odometry interpolated to its own stamp, as soon as odometry at or after it has come. Of odometry messages with one
+    stamp the first counts; of velocities with one stamp the last, since each holds until the next.
+    """
+
+    def __init__(self, max_hold_s: float = 1.0) -> None:
+        """Start without any sample.
+
+        Args:
+            max_hold_s: observations further behind the last odometry than this are dropped at the end, not held, s.
+        """
+        self.report = StreamReport()
+        self._max_hold_ns = round(max_hold_s * NS_PER_S)
+        self._last: tuple[int, Array] | None = None  # newest self-motion: stamp, pose
+        self._velocity: Velocity | None = None
+        self._kind: type | None = None
+        self._step: tuple[int, Array] | None = None  # newest step given out: stamp, pose
+        self._waiting: deque[Observation] = deque()
+
+    def push(self, sample: Sample) -> list[Ready]:
+        """Take in a sample; return the steps that have become ready.
+
+        Raises:
+            StreamError: stamps go back, self-motion is not finite, or odometry and velocities are mixed.
+        """
+        if isinstance(sample, SelfMotion | Velocity):
+            return self._push_motion(sample)
+        return self._push_observation(sample)
+
+    def flush(self) -> list[Ready]:
+        """End of the stream: the observations still waiting, at the last pose."""
+        if self._last is None:
+            self._drop("observations before odometry", len(self._waiting))
+            self._waiting.clear()
+            return []
+        stamp_ns, pose = self._last
+        held = [sample for sample in self._waiting if sample.stamp_ns - stamp_ns <= self._max_hold_ns]
+        self._drop("observations after odometry", len(self._waiting) - len(held))
+        self._waiting.clear()
+        return [self._make(sample.stamp_ns, pose, sample) for sample in held]
+
+    def _push_motion(self, sample: Motion) -> list[Ready]:
+        self._check_motion(sample)
+        if self._last is None:
+            pose = sample.pose_odom_robot if isinstance(sample, SelfMotion) else IDENTITY
+            before = [waiting for waiting in self._waiting if waiting.stamp_ns < sample.stamp_ns]
+            self._drop("observations before odometry", len(before))
+            self._waiting = deque(waiting for waiting in self._waiting if waiting.stamp_ns >= sample.stamp_ns)
+            steps = [self._make(sample.stamp_ns, pose, None)]
+        elif sample.stamp_ns == self._last[0]:
+            self.report.count("equal odometry stamps")
+            self._velocity = sample if isinstance(sample, Velocity) else None
+            return []
+        else:
+            pose = sample.pose_odom_robot if isinstance(sample, SelfMotion) else self._held(sample.stamp_ns)
+            steps = self._release(sample.stamp_ns, pose)
+            steps.append(self._make(sample.stamp_ns, pose, None))
+        self._last = (sample.stamp_ns, pose)
+        self._velocity = sample if isinstance(sample, Velocity) else None
+        while self._waiting and self._waiting[0].stamp_ns == sample.stamp_ns:
+            steps.append(self._make(sample.stamp_ns, pose, self._waiting.popleft()))
+        return steps
+
+    def _push_observation(self, sample: Observation) -> list[Ready]:
+        if self._waiting and sample.stamp_ns < self._waiting[-1].stamp_ns:
+            raise StreamError(
+                f"observation at stamp {format_stamp(sample.stamp_ns)} s goes back behind "
+                f"{format_stamp(self._waiting[-1].stamp_ns)} s; expected observations in order of stamp"
+            )
+        if self._last is None or sample.stamp_ns > self._last[0]:
+            self._waiting.append(sample)
+            return []
+        if self._step is not None and sample.stamp_ns < self._step[0]:
+            self._drop("observations behind odometry", 1)
+            return []
+        return [self._make(sample.stamp_ns, self._last[1], sample)]
+
+    def _release(self, stamp_ns: int, pose: Array) -> list[Ready]:
+        """Steps of the observations between the newest self-motion and the one that has just come."""
+        assert self._last is not None
+        steps = []
+        before_ns, before = self._last
+        while self._waiting and self._waiting[0].stamp_ns < stamp_ns:
+            sample = self._waiting.popleft()
+            if self._velocity is not None:
+                there = self._held(sample.stamp_ns)
+            else:
+                there = interpolate(before, pose, (sample.stamp_ns - before_ns) / (stamp_ns - before_ns))
+            steps.append(self._make(sample.stamp_ns, there, sample))
+        return steps
+
+    def _held(self, stamp_ns: int) -> Array:
+        """Pose at a stamp with the last velocity held: an exact arc."""
+        assert self._last is not None
+        assert self._velocity is not None
+        dt_s = (stamp_ns - self._last[0]) / NS_PER_S
+        twist = np.array([self._velocity.v_m_s * dt_s, 0.0, self._velocity.omega_rad_s * dt_s])
+        return compose(self._last[1], exp(twist))
+
+    def _make(self, stamp_ns: int, pose: Array, observation: Observation | None) -> Ready:
+        if self._step is None:
+            delta, dt_s = IDENTITY, 0.0
+        else:
+            delta, dt_s = between(self._step[1], pose), (stamp_ns - self._step[0]) / NS_PER_S
+        self._step = (stamp_ns, pose)
+        return Ready(stamp_ns, delta, dt_s, pose, observation)
+
+    def _check_motion(self, sample: Motion) -> None:
+        stamp = format_stamp(sample.stamp_ns)
+        if self._kind not in (None, type(sample)):
+            raise StreamError(f"stamp {stamp} s: odometry and velocities are mixed; expected one kind of self-motion")
+        self._kind = type(sample)
+        values = sample.pose_odom_robot if isinstance(sample, SelfMotion) else (sample.v_m_s, sample.omega_rad_s)
+        if not np.isfinite(values).all():
+            raise StreamError(f"odometry at stamp {stamp} s: found NaN or Inf, expected finite numbers")
+        if self._last is not None and sample.stamp_ns < self._last[0]:
+            raise StreamError(
+                f"odometry at stamp {stamp} s goes back behind {format_stamp(self._last[0])} s; expected stamps in order"
+            )
+
+    def _drop(self, name: str, number: int) -> None:
+        if number:
+            self.report.count(name, number)

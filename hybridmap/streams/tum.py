@@ -1,0 +1,272 @@
+"""A folder in the TUM RGB-D format, with wheel odometry and calibration beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from hybridmap.config.root import Config
+from hybridmap.config.sensors import CameraIntrinsics, CameraMounting, SensorsConfig
+from hybridmap.errors import StreamError
+from hybridmap.geometry import Array
+from hybridmap.streams.base import RgbdFrame, Rig, Sample, SelfMotion, StreamReport
+from hybridmap.streams.cameras import (
+    Calibration,
+    check_size,
+    clean_depth,
+    depth_from_units,
+    from_intrinsics,
+    mounted,
+    pinhole,
+)
+from hybridmap.streams.mounting import invert, matrix, planar
+from hybridmap.streams.order import Window, merge, pair_nearest, sorted_order
+from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
+
+
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    stamp_ns: int
+    color: Path
+    depth: Path
+
+
+class TumStream:
+    """`rgb/`, `depth/` with their lists or `associations.txt`, `odometry.txt` of base_link, `camera.yaml`."""
+
+    def __init__(self, folder: Path, config: Config, window: Window | None = None) -> None:
+        """Read the lists, the odometry and the calibration, and see that every picture is there.
+
+        Raises:
+            StreamError: a file is missing, damaged or contradicts another; the message says which.
+        """
+        self.name = folder.name or str(folder)
+        self._folder, self._sensors = folder, config.sensors
+        self._remarks: list[str] = []
+        self._odometry = self._read_odometry()
+        self._calibration, self._T_base_camera, self._units_per_m = _read_calibration(folder, config.sensors)
+        self._pairs, self._losses = _read_pairs(folder, config.sensors.sync_tolerance_s)
+        if config.vision.sensor == "laser":
+            raise StreamError(f"{folder}: no laser: a TUM folder holds colour and depth; set vision.sensor to rgbd")
+        if config.vision.sensor == "none":
+            self._pairs = []
+        for path in (path for pair in self._pairs for path in (pair.color, pair.depth)):
+            if not path.is_file():
+                raise StreamError(f"{path}: no such picture, though the folder's lists name it")
+        self.rig = Rig(camera=pinhole(self._calibration, self._T_base_camera) if self._pairs else None)
+        self.groundtruth = self._read_groundtruth()
+        self._apply(window or Window())
+        self.report = StreamReport()
+
+    @property
+    def expected_observations(self) -> int | None:
+        """Number of frames within the window."""
+        return len(self._pairs)
+
+    def __iter__(self) -> Iterator[Sample]:
+        """Yield odometry and frames in order of stamp.
+
+        Raises:
+            StreamError: a picture is damaged or of another size or kind than expected.
+        """
+        self.report = StreamReport(dict(self._losses), list(self._remarks))
+        for sample in merge(self._motions(), self._frames()):
+            self.report.count("odometry" if isinstance(sample, SelfMotion) else "observations")
+            yield sample
+
+    def _motions(self) -> Iterator[Sample]:
+        for stamp, pose in zip(self._odometry.stamps_ns, self._odometry.poses, strict=True):
+            yield SelfMotion(int(stamp), pose)
+
+    def _frames(self) -> Iterator[Sample]:
+        for pair in self._pairs:
+            color, depth = _read_color(pair.color), _read_depth(pair.depth)
+            if color.shape[:2] != depth.shape:
+                raise StreamError(
+                    f"{pair.depth}: depth is {depth.shape[1]}x{depth.shape[0]}, colour {color.shape[1]}x{color.shape[0]}; "
+                    "expected depth registered to colour"
+                )
+            check_size(color, self._calibration, str(pair.color))
+            depth_m = clean_depth(depth_from_units(depth, self._units_per_m), self._sensors)
+            yield RgbdFrame(pair.stamp_ns, self._calibration.undistort_color(color), self._calibration.undistort_depth(depth_m))
+
+    def _read_odometry(self) -> Trajectory:
+        named = self._sensors.odometry_file
+        path = self._folder / (named or "odometry.txt")
+        if path.is_file():
+            return read_tum(path)
+        others = sorted(p.name for p in self._folder.glob("*odom*.txt"))
+        hint = f"; found {', '.join(others)}: name one as sensors.odometry_file" if others else ""
+        raise StreamError(
+            f"{path}: no odometry: expected `stamp x y z qx qy qz qw` lines with the wheel odometry of base_link{hint}"
+        )
+
+    def _read_groundtruth(self) -> Trajectory | None:
+        """`groundtruth_base.txt`, else `groundtruth.txt` (camera) carried to the base by `base_to_camera`."""
+        base, camera = self._folder / "groundtruth_base.txt", self._folder / "groundtruth.txt"
+        if base.is_file():
+            return read_tum(base)
+        if not camera.is_file():
+            return None
+        stamps, rows = _read_poses(camera)
+        T_camera_base = invert(self._T_base_camera)
+        poses = [planar(matrix(tuple(row[:3]), tuple(row[3:])) @ T_camera_base) for row in rows]
+        return Trajectory(stamps, np.array(poses))
+
+    def _apply(self, window: Window) -> None:
+        first = min([int(self._odometry.stamps_ns[0])] + [pair.stamp_ns for pair in self._pairs[:1]])
+        low, high = window.limits_ns(first)
+        inside = (self._odometry.stamps_ns >= low) & (self._odometry.stamps_ns <= high)
+        if not inside.any():
+            raise StreamError(f"{self._folder}: no odometry between --start and --end")
+        self._odometry = Trajectory(self._odometry.stamps_ns[inside], self._odometry.poses[inside])
+        self._pairs = [pair for pair in self._pairs if low <= pair.stamp_ns <= high]
+
+
+def _stamp_ns(text: str, path: Path, number: int) -> int:
+    try:
+        return int((Decimal(text) * NS_PER_S).to_integral_value())
+    except (InvalidOperation, ValueError, OverflowError):
+        raise StreamError(f"{path}:{number}: expected a stamp in seconds, found {text[:40]!r}") from None
+
+
+def _read_lines(path: Path, fields: int) -> list[tuple[int, list[str]]]:
+    """(line number, fields) of a list file without comments."""
+    if not path.is_file():
+        raise StreamError(f"{path}: no such file; a TUM folder needs associations.txt, or rgb.txt and depth.txt")
+    lines = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        words = line.split("#", 1)[0].split()
+        if words and len(words) < fields:
+            raise StreamError(f"{path}:{number}: expected {fields} fields, found {len(words)}")
+        if words:
+            lines.append((number, words))
+    if not lines:
+        raise StreamError(f"{path}: names no picture")
+    return lines
+
+
+def _read_list(path: Path) -> tuple[NDArray[np.int64], list[Path]]:
+    """Stamps (N,) and pictures of `rgb.txt` or `depth.txt`, sorted."""
+    lines = _read_lines(path, 2)
+    stamps = np.array([_stamp_ns(words[0], path, number) for number, words in lines], dtype=np.int64)
+    order = sorted_order(stamps, str(path))
+    return stamps[order], [path.parent / lines[i][1][1] for i in order]
+
+
+def _read_pairs(folder: Path, tolerance_s: float) -> tuple[list[_Pair], dict[str, int]]:
+    """Colour and depth that belong together, and how many pictures found no partner."""
+    listed = folder / "associations.txt"
+    if listed.is_file():
+        return _read_associations(listed), {}
+    color_ns, colors = _read_list(folder / "rgb.txt")
+    depth_ns, depths = _read_list(folder / "depth.txt")
+    pairs = pair_nearest(color_ns, depth_ns, tolerance_s)
+    losses = {"unmatched color": pairs.unmatched_color, "unmatched depth": pairs.unmatched_depth}
+    if not len(pairs.color):
+        raise StreamError(f"{folder}: no colour picture has a depth picture within sensors.sync_tolerance_s = {tolerance_s} s")
+    matched = [_Pair(int(color_ns[i]), colors[i], depths[j]) for i, j in zip(pairs.color, pairs.depth, strict=True)]
+    return matched, losses
+
+
+def _read_associations(path: Path) -> list[_Pair]:
+    """`stamp rgb stamp depth`; where the first picture is the depth one, the other way round."""
+    lines = _read_lines(path, 4)
+    swapped = "depth" in lines[0][1][1] and "depth" not in lines[0][1][3]
+    color, depth = (2, 0) if swapped else (0, 2)
+    stamps = np.array([_stamp_ns(words[color], path, number) for number, words in lines], dtype=np.int64)
+    folder = path.parent
+    return [
+        _Pair(int(stamps[i]), folder / lines[i][1][color + 1], folder / lines[i][1][depth + 1])
+        for i in sorted_order(stamps, str(path))
+    ]
+
+
+def _read_poses(path: Path) -> tuple[NDArray[np.int64], Array]:
+    """Stamps (N,) and rows (N, 7) `x y z qx qy qz qw` of a TUM file; of equal stamps the first is kept."""
+    stamps = read_tum(path).stamps_ns  # says what is wrong with the file, if anything is
+    rows: dict[int, list[float]] = {}
+    for number, words in _read_lines(path, 8):
+        rows.setdefault(_stamp_ns(words[0].rstrip(","), path, number), [float(word.rstrip(",")) for word in words[1:8]])
+    return stamps, np.array([rows[int(stamp)] for stamp in stamps])
+
+
+def _read_calibration(folder: Path, sensors: SensorsConfig) -> tuple[Calibration, Array, float]:
+    """Intrinsics, (4, 4) pose of the optical frame in the base, and depth units per metre."""
+    path = folder / "camera.yaml"
+    tree = _read_camera_yaml(path) if path.is_file() else {}
+    camera, mounting = tree.get("camera") or {}, tree.get("base_to_camera") or {}
+    if sensors.camera_intrinsics is None and not camera:
+        raise StreamError(
+            f"{path}: no calibration: expected a section `camera`, or sensors.camera_intrinsics in the configuration"
+        )
+    if sensors.camera_mounting is None and not mounting:
+        raise StreamError(
+            f"{path}: no mounting: expected a section `base_to_camera`, or sensors.camera_mounting in the configuration"
+        )
+    try:
+        calibration = from_intrinsics(sensors.camera_intrinsics or _intrinsics_of(camera))
+        given = sensors.camera_mounting or CameraMounting(
+            translation_m=tuple(mounting["translation"]), quaternion_xyzw=tuple(mounting["quaternion_xyzw"])
+        )
+        units_per_m = float(sensors.depth_scale or camera["depth_scale"])
+    except (KeyError, TypeError, ValueError) as error:
+        found = str(error).replace("\n", " ")[:160]
+        raise StreamError(f"{path}: missing or unusable entry: {found}") from None
+    if not units_per_m > 0:
+        raise StreamError(f"{path}: camera.depth_scale: found {units_per_m}, expected units per metre > 0")
+    return calibration, mounted(given), units_per_m
+
+
+def _read_camera_yaml(path: Path) -> dict[str, Any]:
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise StreamError(f"{path}: not a YAML file: {' '.join(str(error).split())}") from None
+    if not isinstance(tree, dict):
+        raise StreamError(f"{path}: expected sections `camera` and `base_to_camera`, found {type(tree).__name__}")
+    return tree
+
+
+def _intrinsics_of(camera: dict[str, Any]) -> CameraIntrinsics:
+    return CameraIntrinsics(
+        width_px=camera["width"],
+        height_px=camera["height"],
+        fx_px=camera["fx"],
+        fy_px=camera["fy"],
+        cx_px=camera["cx"],
+        cy_px=camera["cy"],
+        distortion=tuple(camera.get("distortion") or ()),
+    )
+
+
+def _load(path: Path, flags: int) -> NDArray[Any]:
+    import cv2
+
+    data = np.fromfile(path, dtype=np.uint8)
+    picture = cv2.imdecode(data, flags) if len(data) else None
+    if picture is None:
+        raise StreamError(f"{path}: not a picture, or damaged")
+    return np.asarray(picture)
+
+
+def _read_color(path: Path) -> NDArray[np.uint8]:
+    import cv2
+
+    return np.ascontiguousarray(_load(path, cv2.IMREAD_COLOR)[..., ::-1], dtype=np.uint8)
+
+
+def _read_depth(path: Path) -> NDArray[np.uint16]:
+    import cv2
+
+    depth = _load(path, cv2.IMREAD_UNCHANGED)
+    if depth.ndim != 2 or depth.dtype != np.uint16:
+        raise StreamError(f"{path}: found a picture {depth.shape} of {depth.dtype}, expected one channel of 16 bit")
+    return depth

@@ -1,0 +1,72 @@
+"""A velocity table `stamp_s,v_m_s,omega_rad_s`: self-motion alone, for the neural part and dead reckoning."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from hybridmap.config.root import Config
+from hybridmap.errors import StreamError
+from hybridmap.streams.base import Rig, Sample, StreamReport, Velocity
+from hybridmap.streams.order import Window, sorted_order
+from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
+
+COLUMNS = ("stamp_s", "v_m_s", "omega_rad_s")
+
+
+class VelocityStream:
+    """Forward speed and turn rate; each holds until the next. A `<name>_groundtruth.tum` beside the table is its truth."""
+
+    def __init__(self, path: Path, config: Config, window: Window | None = None) -> None:
+        """Read the table.
+
+        Raises:
+            StreamError: missing, empty, wrong columns, a value that is no finite number, or stamps that go back.
+        """
+        self.name = path.name
+        self.rig = Rig()
+        samples = _read_table(path)
+        low, high = (window or Window()).limits_ns(samples[0].stamp_ns)
+        self._samples = [sample for sample in samples if low <= sample.stamp_ns <= high]
+        if not self._samples:
+            raise StreamError(f"{path}: no velocity between --start and --end")
+        truth = path.with_name(f"{path.stem}_groundtruth.tum")
+        self.groundtruth: Trajectory | None = read_tum(truth) if truth.is_file() else None
+        self.expected_observations: int | None = 0
+        self.report = StreamReport()
+
+    def __iter__(self) -> Iterator[Sample]:
+        """Yield the velocities in order of stamp."""
+        self.report = StreamReport({"velocities": len(self._samples)})
+        yield from self._samples
+
+
+def _read_table(path: Path) -> list[Velocity]:
+    with path.open(encoding="utf-8", errors="replace", newline="") as file:
+        rows = csv.reader(file)
+        header = tuple(name.strip() for name in next(rows, []))
+        if header != COLUMNS:
+            found = ",".join(header)[:80] or "nothing"
+            raise StreamError(f"{path}: expected the header {','.join(COLUMNS)}, found {found}")
+        samples = [_read_row(path, number, row) for number, row in enumerate(rows, start=2) if row]
+    if not samples:
+        raise StreamError(f"{path}: holds no velocity")
+    order = sorted_order(np.array([sample.stamp_ns for sample in samples], dtype=np.int64), str(path))
+    return [samples[i] for i in order]
+
+
+def _read_row(path: Path, number: int, row: list[str]) -> Velocity:
+    try:
+        stamp_ns = int((Decimal(row[0].strip()) * NS_PER_S).to_integral_value())
+        values = [float(field) for field in row[1:]]
+    except (InvalidOperation, ValueError, OverflowError):
+        raise StreamError(f"{path}:{number}: expected numbers, found {','.join(row)[:60]!r}") from None
+    if len(values) != 2:
+        raise StreamError(f"{path}:{number}: expected 3 fields, found {len(row)}")
+    if not np.isfinite(values).all():
+        raise StreamError(f"{path}:{number}: found NaN or Inf, expected finite numbers")
+    return Velocity(stamp_ns, values[0], values[1])
