@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from hybridmap.cli.demo import demo
+from hybridmap.cli.evaluate import evaluate
 from hybridmap.cli.map import map_source
 from hybridmap.errors import HybridMapError
 
@@ -45,6 +46,7 @@ def _options(
 
 app.command("demo")(demo)
 app.command("map")(map_source)
+app.command("evaluate")(evaluate)
 
 
 def main() -> None:

@@ -1,1 +1,22 @@
-"""evaluate."""
+"""Estimates against the truth: trajectories, verified relations, loop closures, whole sessions."""
+
+from hybridmap.evaluate.closures import ClosureErrors, ClosureLimits, closure_errors
+from hybridmap.evaluate.relations import RelationErrors, Relations, read_relations, relation_errors
+from hybridmap.evaluate.session import evaluate_session, session_trajectories
+from hybridmap.evaluate.trajectory import AbsoluteError, RelativeError, absolute_error, relative_error
+
+__all__ = [
+    "AbsoluteError",
+    "ClosureErrors",
+    "ClosureLimits",
+    "RelationErrors",
+    "Relations",
+    "RelativeError",
+    "absolute_error",
+    "closure_errors",
+    "evaluate_session",
+    "read_relations",
+    "relation_errors",
+    "relative_error",
+    "session_trajectories",
+]

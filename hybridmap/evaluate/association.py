@@ -1,0 +1,83 @@
+"""Which poses of an estimate can be compared with a reference, and how far along the way they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.errors import EvaluationError
+from hybridmap.geometry import Array
+from hybridmap.trajectory import NS_PER_S, Trajectory
+
+MAX_GAP_S = 1.0
+"""A reference is interpolated between two of its poses only if they are no further apart than this."""
+
+_DEAD_BAND_M = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """Poses of an estimate and of the reference at the same stamps.
+
+    Attributes:
+        stamps_ns: (P,) int64.
+        estimate: (P, 3) m and rad, in the estimate's map frame.
+        reference: (P, 3) m and rad, in the reference's frame.
+        total: number of poses of the estimate, used or not.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    estimate: Array
+    reference: Array
+    total: int
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+def known_at(trajectory: Trajectory, stamps_ns: NDArray[np.int64], max_gap_s: float = MAX_GAP_S) -> NDArray[np.bool_]:
+    """At which stamps a trajectory can be interpolated: within its span and not in a gap longer than `max_gap_s`."""
+    if len(trajectory) == 0:
+        return np.zeros(len(stamps_ns), dtype=np.bool_)
+    times = trajectory.stamps_ns
+    right = np.searchsorted(times, stamps_ns, side="left")
+    exact = times[np.minimum(right, len(times) - 1)] == stamps_ns
+    inside = (right > 0) & (right < len(times))
+    after, before = times[np.minimum(right, len(times) - 1)], times[np.maximum(right - 1, 0)]
+    return np.asarray(exact | (inside & (after - before <= max_gap_s * NS_PER_S)))
+
+
+def associate(estimate: Trajectory, reference: Trajectory, max_gap_s: float = MAX_GAP_S) -> Pairs:
+    """Interpolate the reference at the stamps of the estimate.
+
+    Raises:
+        EvaluationError: fewer than three stamps in common.
+    """
+    known = known_at(reference, estimate.stamps_ns, max_gap_s)
+    if np.count_nonzero(known) < 3:
+        raise EvaluationError(
+            f"estimate ({_span(estimate)}) and reference ({_span(reference)}) have {np.count_nonzero(known)} stamps in "
+            f"common, expected at least 3; are they of the same recording and on the same clock?"
+        )
+    stamps = estimate.stamps_ns[known]
+    return Pairs(stamps, estimate.poses[known], reference.at(stamps), len(estimate))
+
+
+def travel(poses: Array) -> Array:
+    """Path length (P,) at each pose, m. Steps enter once they exceed 5 cm together, so that jitter is no travel."""
+    total = np.zeros(len(poses))
+    anchor, length = poses[0, :2], 0.0
+    for k in range(1, len(poses)):
+        step = float(np.hypot(*(poses[k, :2] - anchor)))
+        if step >= _DEAD_BAND_M:
+            anchor, length = poses[k, :2], length + step
+        total[k] = length
+    return total
+
+
+def _span(trajectory: Trajectory) -> str:
+    if len(trajectory) == 0:
+        return "empty"
+    return f"{trajectory.stamps_s[0]:.3f} to {trajectory.stamps_s[-1]:.3f} s"

@@ -1,0 +1,121 @@
+"""Relation errors: how far a trajectory is from relative poses that people have verified.
+
+R. Kuemmerle et al., "On measuring the accuracy of SLAM algorithms", Autonomous Robots 27, 2009, its equations 1 and 2:
+the mean over relations of the translational and of the rotational part of `delta_estimated (-) delta_true`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.errors import EvaluationError
+from hybridmap.evaluate.association import MAX_GAP_S, known_at
+from hybridmap.geometry import Array, between
+from hybridmap.trajectory import NS_PER_S, Trajectory
+
+LOOP_GAP_S = 60.0
+"""Relations over more than this time count as loops."""
+
+
+@dataclass(frozen=True, slots=True)
+class Relations:
+    """Verified relative poses.
+
+    Attributes:
+        stamps_ns: (R, 2) int64, the two times.
+        deltas: (R, 3) pose of `base_link` at the second time seen from the first, m and rad.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    deltas: Array
+
+    @property
+    def is_loop(self) -> NDArray[np.bool_]:
+        """(R,) which relations span more than 60 s."""
+        return np.asarray(np.abs(np.diff(self.stamps_ns, axis=1)[:, 0]) > LOOP_GAP_S * NS_PER_S)
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorStatistics:
+    """Mean and (population) standard deviation of the errors; NaN where no relation could be used.
+
+    Attributes:
+        trans_mean_m, trans_std_m, rot_mean_deg, rot_std_deg: of the used relations.
+        used, total: relations whose two times the trajectory covers, and all.
+    """
+
+    trans_mean_m: float
+    trans_std_m: float
+    rot_mean_deg: float
+    rot_std_deg: float
+    used: int
+    total: int
+
+
+@dataclass(frozen=True, slots=True)
+class RelationErrors:
+    """Relation errors over all relations and over those that close a loop of more than 60 s."""
+
+    all: ErrorStatistics
+    loops: ErrorStatistics
+
+
+def read_relations(path: Path) -> Relations:
+    """Read lines `t1 t2 dx dy dyaw` (s, m, rad); `#` starts a comment.
+
+    Raises:
+        EvaluationError: the file is missing or empty, or a line is damaged.
+    """
+    if not path.is_file():
+        raise EvaluationError(f"{path}: no such relations file")
+    stamps: list[tuple[int, int]] = []
+    deltas: list[list[float]] = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        fields = line.split("#", 1)[0].split()
+        if not fields:
+            continue
+        try:
+            first, second = (int((Decimal(field) * NS_PER_S).to_integral_value()) for field in fields[:2])
+            delta = [float(field) for field in fields[2:]]
+        except (InvalidOperation, ValueError, OverflowError):
+            raise EvaluationError(f"{path}:{number}: expected numbers, found {line.strip()[:60]!r}") from None
+        if len(delta) != 3 or not np.isfinite(delta).all():
+            raise EvaluationError(f"{path}:{number}: expected 5 finite numbers `t1 t2 dx dy dyaw`, found {line.strip()[:60]!r}")
+        stamps.append((first, second))
+        deltas.append(delta)
+    if not stamps:
+        raise EvaluationError(f"{path}: holds no relation")
+    return Relations(np.array(stamps, dtype=np.int64), np.array(deltas))
+
+
+def relation_errors(trajectory: Trajectory, relations: Relations, max_gap_s: float = MAX_GAP_S) -> RelationErrors:
+    """Compare a trajectory with verified relations at the times that it covers."""
+    first, second = relations.stamps_ns[:, 0], relations.stamps_ns[:, 1]
+    known = known_at(trajectory, first, max_gap_s) & known_at(trajectory, second, max_gap_s)
+    loop = relations.is_loop
+    error = np.zeros((0, 3))
+    if known.any():
+        error = between(relations.deltas[known], between(trajectory.at(first[known]), trajectory.at(second[known])))
+    return RelationErrors(
+        all=_statistics(error, len(known)),
+        loops=_statistics(error[loop[known]], int(np.count_nonzero(loop))),
+    )
+
+
+def _statistics(error: Array, total: int) -> ErrorStatistics:
+    if len(error) == 0:
+        return ErrorStatistics(np.nan, np.nan, np.nan, np.nan, 0, total)
+    translation, rotation = np.hypot(error[:, 0], error[:, 1]), np.degrees(np.abs(error[:, 2]))
+    return ErrorStatistics(
+        trans_mean_m=float(translation.mean()),
+        trans_std_m=float(translation.std()),
+        rot_mean_deg=float(rotation.mean()),
+        rot_std_deg=float(rotation.std()),
+        used=len(error),
+        total=total,
+    )

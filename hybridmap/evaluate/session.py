@@ -1,0 +1,157 @@
+"""Every figure of a session against a reference trajectory and against verified relations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hybridmap.errors import EvaluationError
+from hybridmap.evaluate.association import associate
+from hybridmap.evaluate.closures import ClosureErrors, closure_errors
+from hybridmap.evaluate.relations import ErrorStatistics, Relations, read_relations, relation_errors
+from hybridmap.evaluate.trajectory import absolute_error_of, drift_percent, relative_error_of
+from hybridmap.metrics import Metric
+from hybridmap.store import MapStore, SessionFolder, trajectory_of
+from hybridmap.trajectory import Trajectory, read_tum
+
+ODOMETRY = "odometry"
+_ONLINE = "_online"
+
+
+def evaluate_session(folder: Path, reference: Path | None = None, relations: Path | None = None) -> list[Metric]:
+    """Evaluate odometry and every back-end of a session, final and online.
+
+    Args:
+        folder: the session folder.
+        reference: true trajectory in the TUM format; without it the session's own, if there is one.
+        relations: verified relative poses, `t1 t2 dx dy dyaw` a line.
+
+    Returns:
+        Figures named `<measure>/<back-end>`; NaN where the data do not give one.
+
+    Raises:
+        StoreError: no session there.
+        StreamError: the reference is damaged.
+        EvaluationError: nothing to compare with, or nothing in common.
+    """
+    session = SessionFolder(folder)
+    session.require()
+    truth_file = reference or (session.groundtruth if session.groundtruth.is_file() else None)
+    if truth_file is None and relations is None:
+        raise EvaluationError(f"{folder}: nothing to compare with; give --reference GT.tum or --relations FILE")
+    truth = None if truth_file is None else read_tum(truth_file)
+    verified = None if relations is None else read_relations(relations)
+    with MapStore.open(folder) as store:
+        estimates = session_trajectories(session, store)
+        closures = {} if truth is None else _judge_closures(store, truth)
+    metrics: list[Metric] = []
+    for name, trajectory in estimates.items():
+        if truth is not None:
+            metrics += _against_truth(name, trajectory, truth)
+        if verified is not None:
+            metrics += _against_relations(name, trajectory, verified)
+    for name, errors in closures.items():
+        metrics += _closure_metrics(name, errors)
+    return metrics
+
+
+def session_trajectories(session: SessionFolder, store: MapStore) -> dict[str, Trajectory]:
+    """Name -> estimate of a session: `odometry`, then each back-end's final and `_online`.
+
+    Taken from `trajectory/`; what a killed run could not write there comes from the map file.
+    """
+    written = session.trajectories()
+    estimates = {ODOMETRY: written[ODOMETRY] if ODOMETRY in written else store.track().odometry}
+    solutions = store.solutions()
+    followed = store.online_backends()
+    for name in (*solutions, *(name for name in followed if name not in solutions)):
+        if name == ODOMETRY:
+            continue
+        if name in written:
+            estimates[name] = written[name]
+        elif name in solutions:
+            estimates[name] = trajectory_of(store.track(), solutions[name].poses)
+        if name + _ONLINE in written:
+            estimates[name + _ONLINE] = written[name + _ONLINE]
+        elif name in followed:
+            estimates[name + _ONLINE] = store.online(name)
+    return estimates
+
+
+def _judge_closures(store: MapStore, truth: Trajectory) -> dict[str, ClosureErrors]:
+    experiences = store.map()
+    judged = {"graph": closure_errors(experiences, truth)}
+    for name, solution in store.solutions().items():
+        if name != ODOMETRY:
+            judged[name] = closure_errors(experiences, truth, rejected=frozenset(solution.report.rejected_edge_ids))
+    return judged
+
+
+def _names(estimate: str) -> tuple[str, str, str]:
+    """Suffix of the measure, back-end, and words for people."""
+    if estimate.endswith(_ONLINE):
+        return "_online", estimate.removesuffix(_ONLINE), "as the robot believed it at the time"
+    return "", estimate, "over the whole recording"
+
+
+def _against_truth(estimate: str, trajectory: Trajectory, truth: Trajectory) -> list[Metric]:
+    suffix, backend, when = _names(estimate)
+    try:
+        pairs = associate(trajectory, truth)
+    except EvaluationError as error:
+        raise EvaluationError(f"{estimate}: {error}") from None
+    ate = absolute_error_of(pairs)
+    metre, second = relative_error_of(pairs, 1.0, "m"), relative_error_of(pairs, 1.0, "s")
+    rows = [
+        ("ate_rmse", ate.rmse_m, "m", "absolute trajectory error after SE(2) alignment, RMSE"),
+        ("ate_median", ate.median_m, "m", "absolute trajectory error, median"),
+        ("ate_max", ate.max_m, "m", "absolute trajectory error, largest"),
+        ("ate_poses", float(ate.used), "1", f"poses compared, of {ate.total}"),
+        ("rpe_trans", metre.trans_rmse_m, "m", "relative pose error over 1 m, translation, RMSE"),
+        ("rpe_rot", metre.rot_rmse_deg, "deg", "relative pose error over 1 m, rotation, RMSE"),
+        ("rpe_trans_1s", second.trans_rmse_m, "m", "relative pose error over 1 s, translation, RMSE"),
+        ("rpe_rot_1s", second.rot_rmse_deg, "deg", "relative pose error over 1 s, rotation, RMSE"),
+        ("drift", drift_percent(pairs), "%", "mean translational error over pieces of 5 to 160 m, of travel"),
+    ]
+    return [Metric(f"{name}{suffix}/{backend}", value, unit, f"{text}; {when}") for name, value, unit, text in rows]
+
+
+def _against_relations(estimate: str, trajectory: Trajectory, relations: Relations) -> list[Metric]:
+    suffix, backend, when = _names(estimate)
+    errors = relation_errors(trajectory, relations)
+    rows = [
+        *_relation_rows("relation", errors.all, "all relations"),
+        *_relation_rows("relation_loop", errors.loops, "relations over more than 60 s"),
+    ]
+    return [Metric(f"{name}{suffix}/{backend}", value, unit, f"{text}; {when}") for name, value, unit, text in rows]
+
+
+def _relation_rows(prefix: str, errors: ErrorStatistics, which: str) -> list[tuple[str, float, str, str]]:
+    return [
+        (f"{prefix}_trans_mean", errors.trans_mean_m, "m", f"translational relation error, mean, {which}"),
+        (f"{prefix}_trans_std", errors.trans_std_m, "m", f"translational relation error, standard deviation, {which}"),
+        (f"{prefix}_rot_mean", errors.rot_mean_deg, "deg", f"rotational relation error, mean, {which}"),
+        (f"{prefix}_rot_std", errors.rot_std_deg, "deg", f"rotational relation error, standard deviation, {which}"),
+        (f"{prefix}_used", float(errors.used), "1", f"relations used of {errors.total}, {which}"),
+    ]
+
+
+def _closure_metrics(name: str, errors: ClosureErrors) -> list[Metric]:
+    kept = "accepted by the front-end" if name == "graph" else "that the back-end kept"
+    rows = [
+        (
+            "loop_precision",
+            errors.precision,
+            "1",
+            f"share of the {errors.judged} loop edges {kept} within 1 m and 15 deg of truth",
+        ),
+        ("loop_recall", errors.recall, "1", f"share of the {errors.revisits} revisits with a right loop edge {kept}"),
+        ("loops_right", float(errors.right), "1", f"right loop edges {kept}, of {errors.judged}"),
+    ]
+    if name == "graph":
+        rows += [
+            ("loop_trans_median", errors.trans_median_m, "m", "translational error of right loop edges, median"),
+            ("loop_trans_p95", errors.trans_p95_m, "m", "translational error of right loop edges, 95 %"),
+            ("loop_rot_median", errors.rot_median_deg, "deg", "rotational error of right loop edges, median"),
+            ("loop_rot_p95", errors.rot_p95_deg, "deg", "rotational error of right loop edges, 95 %"),
+        ]
+    return [Metric(f"{measure}/{name}", value, unit, text) for measure, value, unit, text in rows]

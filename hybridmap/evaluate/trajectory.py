@@ -1,0 +1,144 @@
+"""Errors of a trajectory against a reference: absolute (ATE), relative (RPE) and drift.
+
+ATE and RPE as defined by Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, in the plane;
+drift as the mean translational error over sub-trajectories (Geiger et al., "Are we ready for autonomous driving?", CVPR
+2012), with lengths that suit a building.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.evaluate.association import MAX_GAP_S, Pairs, associate, travel
+from hybridmap.geometry import Array, align, between, compose
+from hybridmap.trajectory import NS_PER_S, Trajectory
+
+_DRIFT_LENGTHS_M = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0)
+
+
+@dataclass(frozen=True, slots=True)
+class AbsoluteError:
+    """Distances between an estimate and the reference after the best SE(2) alignment.
+
+    Attributes:
+        rmse_m, mean_m, median_m, max_m: of the distances.
+        pose_reference_estimate: (3,) the alignment: the estimate's map frame seen from the reference's.
+        used, total: poses of the estimate that were compared, and all of them.
+    """
+
+    rmse_m: float
+    mean_m: float
+    median_m: float
+    max_m: float
+    pose_reference_estimate: Array
+    used: int
+    total: int
+
+
+@dataclass(frozen=True, slots=True)
+class RelativeError:
+    """Errors of the motion over a fixed distance or time.
+
+    Attributes:
+        trans_rmse_m, trans_mean_m: of the translation.
+        rot_rmse_deg, rot_mean_deg: of the rotation.
+        pairs: number of pieces compared; the figures are NaN if there is none.
+    """
+
+    trans_rmse_m: float
+    trans_mean_m: float
+    rot_rmse_deg: float
+    rot_mean_deg: float
+    pairs: int
+
+
+def absolute_error(estimate: Trajectory, reference: Trajectory, max_gap_s: float = MAX_GAP_S) -> AbsoluteError:
+    """ATE: align the estimate to the reference by one SE(2) transform and measure what is left.
+
+    Raises:
+        EvaluationError: too few stamps in common.
+    """
+    return absolute_error_of(associate(estimate, reference, max_gap_s))
+
+
+def absolute_error_of(pairs: Pairs) -> AbsoluteError:
+    """ATE of associated poses."""
+    pose = align(pairs.reference, pairs.estimate)
+    offset = compose(pose, pairs.estimate)[:, :2] - pairs.reference[:, :2]
+    distance = np.hypot(offset[:, 0], offset[:, 1])
+    return AbsoluteError(
+        rmse_m=float(np.sqrt(np.mean(distance**2))),
+        mean_m=float(distance.mean()),
+        median_m=float(np.median(distance)),
+        max_m=float(distance.max()),
+        pose_reference_estimate=pose,
+        used=len(pairs),
+        total=pairs.total,
+    )
+
+
+def relative_error(
+    estimate: Trajectory, reference: Trajectory, delta: float, unit: Literal["m", "s"], max_gap_s: float = MAX_GAP_S
+) -> RelativeError:
+    """RPE: compare the motion over every piece of `delta` metres of the reference's way, or of `delta` seconds.
+
+    Raises:
+        EvaluationError: too few stamps in common.
+    """
+    return relative_error_of(associate(estimate, reference, max_gap_s), delta, unit)
+
+
+def relative_error_of(pairs: Pairs, delta: float, unit: Literal["m", "s"]) -> RelativeError:
+    """RPE of associated poses."""
+    along = travel(pairs.reference) if unit == "m" else (pairs.stamps_ns - pairs.stamps_ns[0]) / NS_PER_S
+    first, last = _pieces(along, delta)
+    if len(first) == 0:
+        return RelativeError(np.nan, np.nan, np.nan, np.nan, 0)
+    translation, rotation = motion_errors(pairs, first, last)
+    return RelativeError(
+        trans_rmse_m=float(np.sqrt(np.mean(translation**2))),
+        trans_mean_m=float(translation.mean()),
+        rot_rmse_deg=float(np.sqrt(np.mean(rotation**2))),
+        rot_mean_deg=float(rotation.mean()),
+        pairs=len(first),
+    )
+
+
+def drift_percent(pairs: Pairs) -> float:
+    """Mean translational error in % of travel over pieces of 5, 10, 20, ... 160 m (the whole way where that is shorter).
+
+    Returns:
+        NaN where the reference does not move.
+    """
+    along = travel(pairs.reference)
+    lengths = [length for length in _DRIFT_LENGTHS_M if length <= along[-1]] or [float(along[-1])]
+    if lengths[0] <= 0.0:
+        return float("nan")
+    shares = []
+    for length in lengths:
+        first, last = _pieces(along, length)
+        translation, _ = motion_errors(pairs, first, last)
+        shares.append(translation / (along[last] - along[first]))
+    return 100.0 * float(np.concatenate(shares).mean())
+
+
+def motion_errors(pairs: Pairs, first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Translation (m) and rotation (deg) between the estimate's and the reference's motion from `first` to `last`."""
+    moved = between(pairs.estimate[first], pairs.estimate[last])
+    truly = between(pairs.reference[first], pairs.reference[last])
+    error = between(truly, moved)
+    return np.hypot(error[:, 0], error[:, 1]), np.degrees(np.abs(error[:, 2]))
+
+
+def _pieces(along: Array, delta: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """For each pose at which `along` grew: itself and the first pose at least `delta` further, no more than half too far."""
+    starts = np.flatnonzero(np.diff(along, prepend=-1.0) > 0)
+    ends = np.searchsorted(along, along[starts] + delta - 1e-9)
+    reached = ends < len(along)
+    starts, ends = starts[reached], ends[reached]
+    near = along[ends] - along[starts] <= 1.5 * delta
+    return starts[near], ends[near]

@@ -1,0 +1,35 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+from hybridmap.store import SessionFolder
+from tests.store.sessions import ring_map, write_session
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "from hybridmap.cli import main; main()", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_json_is_one_object_and_metrics_json_is_extended(tmp_path):
+    session = write_session(tmp_path / "s", ring_map(), keyframes=False)
+    done = run("evaluate", tmp_path / "s", "--json")
+    assert done.returncode == 0, done.stderr
+    tree = json.loads(done.stdout)
+    assert tree["primary_backend"] == "gtsam-lm"
+    values = {row["name"]: row["value"] for row in tree["metrics"]}
+    assert values["ate_rmse/gtsam-lm"] < values["ate_rmse/odometry"]
+    stored = SessionFolder(session.path).read_metrics()
+    assert {metric.name for metric in stored.metrics} == set(values)
+    assert stored.head["graph_hash"] == "0"
+
+
+def test_bad_input_is_one_line_and_code_two(tmp_path):
+    for arguments in ((tmp_path / "gone",), (tmp_path,)):
+        done = run("evaluate", *arguments)
+        assert done.returncode == 2
+        assert done.stdout == ""
+        assert done.stderr.startswith("hybridmap: error: ")
+        assert done.stderr.count("\n") == 1
