@@ -19,6 +19,7 @@ from hybridmap.graph.uncertainty import relative_covariances
 from hybridmap.metrics import StageClock
 from hybridmap.neural.path_integrator import PathIntegrator
 from hybridmap.streams.base import LaserScan, RgbdFrame, Rig, Sample, SelfMotion, Velocity
+from hybridmap.streams.rig import rig_of
 from hybridmap.streams.synchronise import Ready, Synchroniser
 from hybridmap.trajectory import NS_PER_S, stamp_ns_from_s
 from hybridmap.vision import create_front_end
@@ -75,11 +76,12 @@ class Mapper:
         self.clock = StageClock()
         self.map = ExperienceMap()
         self.integrator = PathIntegrator(config.neural)
-        self.vision = create_front_end(config.vision, rig if rig is not None else config.sensors.rig(), config.seed)
+        self.vision = create_front_end(config.vision, rig if rig is not None else rig_of(config.sensors), config.seed)
         self.backends = Ensemble(config.backends, self.clock)
         self._synchroniser = Synchroniser()
         self._novelty = Novelty(config.nodes)
         self._stamp_ns = 0
+        self._pose_odom_given: Array = IDENTITY
         self._travel_m = 0.0
         self._at_node = -1
         self._pose_odom_at_node: Array = IDENTITY
@@ -162,8 +164,7 @@ class Mapper:
     @property
     def pose_map_odom(self) -> Array:
         """(3,) the correction `map -> odom` (REP-105) for the odometry as it came in."""
-        pose_odom = compose(self._synchroniser.pose_odom_start, self.integrator.pose)
-        return compose(self.pose_map_robot, inverse(pose_odom))
+        return compose(self.pose_map_robot, inverse(self._pose_odom_given))
 
     def poses(self, backend: str | None = None) -> Array:
         """(N, 3) current poses of all nodes by a back-end (default: the primary)."""
@@ -194,7 +195,7 @@ class Mapper:
         with self.clock.stage("neural"):
             self.integrator.step(ready.delta_robot, ready.dt_s)
             pose_odom = self.integrator.pose
-        self._stamp_ns = ready.stamp_ns
+        self._stamp_ns, self._pose_odom_given = ready.stamp_ns, ready.pose_odom_robot
         travel_m, turn_rad = float(np.hypot(ready.delta_robot[0], ready.delta_robot[1])), abs(float(ready.delta_robot[2]))
         self._travel_m += travel_m
         self._since_node = (self._since_node[0] + travel_m, self._since_node[1] + turn_rad)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 
-import numpy as np
-
-from hybridmap.backends import create
 from hybridmap.backends.base import Backend, Solution
+from hybridmap.backends.registry import create
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
-from hybridmap.geometry import Array, compose
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.geometry import Array
+from hybridmap.graph.connectivity import extend
+from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.metrics import StageClock
 
 log = logging.getLogger(__name__)
@@ -35,7 +34,7 @@ class Ensemble:
     def poses(self, graph: PoseGraph, name: str | None = None) -> Array:
         """(N, 3) latest poses of a back-end (default: the primary), carried on to newer nodes by their consecutive edges."""
         solution = self.solutions.get(name or self.primary)
-        return extend(solution.poses, graph) if solution is not None else extend(graph.initial[:1], graph)
+        return extend(graph, solution.poses if solution is not None else graph.initial[:1])
 
     def update(self, graph: PoseGraph) -> None:
         """Let every back-end follow the graph."""
@@ -56,21 +55,3 @@ class Ensemble:
             if name not in self.failures:
                 log.warning("%s failed at node %d and keeps its last poses: %s", name, graph.n_nodes - 1, error)
             self.failures[name] = str(error)
-
-
-def extend(poses: Array, graph: PoseGraph) -> Array:
-    """Carry poses (K, 3) of the first K nodes on to all N by the best consecutive edge of each newer node.
-
-    A registration is preferred to odometry; a node without either keeps its place relative to the odometry chain.
-    """
-    known = len(poses)
-    out = np.empty((graph.n_nodes, 3))
-    out[:known] = poses
-    for node in range(known, graph.n_nodes):
-        into = np.flatnonzero((graph.targets == node) & (graph.sources < node) & (graph.kinds != EdgeKind.LOOP))
-        if len(into):
-            edge = max(into, key=lambda e: (graph.kinds[e] == EdgeKind.REGISTRATION, graph.sources[e]))
-            out[node] = compose(out[graph.sources[edge]], graph.deltas[edge])
-        else:
-            out[node] = out[node - 1]
-    return out
