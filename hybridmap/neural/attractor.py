@@ -30,6 +30,7 @@ class PlaceAttractor:
         gain = np.exp(-0.5 * (width_cells * wave) ** 2) / side
         self._gain = np.where(wave == 0, gain, 2.0 * gain)
         self._dtype = np.dtype(dtype)
+        self._remappings: dict[tuple[int, int], NDArray[np.int64]] = {}
         offset = (np.arange(side) + side // 2) % side - side // 2
         line = np.exp(-0.5 * (offset / width_cells) ** 2)
         self.activity: NDArray[np.floating] = self._normalised(np.outer(line, line)).astype(dtype)
@@ -62,6 +63,32 @@ class PlaceAttractor:
         """Return the repetition of the bump's position (2,) that is nearest to `near_m`, m."""
         offset = self.position_m() - near_m
         return near_m + offset - self.extent_m * np.round(offset / self.extent_m)
+
+    def code(self, near_m: Array) -> NDArray[np.float32]:
+        """Return the rates (N * N,) of unit length, with cells drawn anew (remapped) in each repetition of the sheet.
+
+        Around the origin the code is the sheet itself. A place one wrap away is carried by other cells, as real place cells
+        remap; `near_m` (2,) says which repetition the bump is in.
+        """
+        size = self._side**2
+        rates = self.activity.reshape(-1)
+        index = np.arange(self._side)
+        tile = np.round((np.asarray(near_m) / self.cell_m - index[:, None]) / self._side).astype(np.int64)
+        code = np.zeros(size)
+        for tx in np.unique(tile[:, 0]).tolist():
+            for ty in np.unique(tile[:, 1]).tolist():
+                cells = np.flatnonzero(np.outer(tile[:, 0] == tx, tile[:, 1] == ty))
+                code[self._remapping(tx, ty)[cells]] += rates[cells]
+        return np.asarray(code / np.linalg.norm(code), dtype=np.float32)
+
+    def _remapping(self, tx: int, ty: int) -> NDArray[np.int64]:
+        """Which cell (N * N,) stands for each cell of the sheet in its repetition (tx, ty); the same in every run."""
+        if (tx, ty) not in self._remappings:
+            size = self._side**2
+            seed = [abs(tx), abs(ty), int(tx < 0), int(ty < 0)]
+            drawn = np.arange(size) if tx == ty == 0 else np.random.default_rng(seed).permutation(size)
+            self._remappings[tx, ty] = drawn
+        return self._remappings[tx, ty]
 
     def _weights(self, residual: float) -> NDArray[np.floating]:
         """Gaussian recurrent weights (N, N) shifted by a fraction of a cell: row i receives from column j."""

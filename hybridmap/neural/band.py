@@ -38,7 +38,7 @@ class BandRings:
         )
         preferred = 2.0 * np.pi * (np.arange(cells) / cells + 0.5)
         self._weights = np.stack([np.cos(preferred), np.sin(preferred)], axis=1).astype(dtype)
-        self._sharpness = np.dtype(dtype).type(-1.0 / (2.0 * (2.0 * np.pi * width) ** 2))
+        self._sharpness = -1.0 / (2.0 * (2.0 * np.pi * width) ** 2)
         self._complex = np.result_type(np.dtype(dtype), np.complex64)
         self._tuning = np.ascontiguousarray(self._weights.T)
         self.activity: NDArray[np.floating] = self.rates_at(np.zeros((len(spacings_m), 3)))
@@ -71,4 +71,4 @@ class BandRings:
     def _rates(self, phasors: NDArray[np.complexfloating]) -> NDArray[np.floating]:
         vector = phasors[..., None].view(self._weights.dtype)
         offset = np.arccos(np.clip(vector @ self._tuning, -1.0, 1.0))
-        return np.exp(self._sharpness * offset * offset)
+        return np.asarray(np.exp(self._sharpness * offset * offset))

@@ -45,8 +45,8 @@ class PhaseDecoder:
 
         Args:
             phases_cycles: (M, 3) phases of the sheets' first modes.
-            priors_m: positions (2,); the first from which the modules agree is taken. Where none is close enough, the box around the
-                last one is scanned for the position on which all modules agree best.
+            priors_m: positions (2,); the first from which the modules agree is taken. Where none is close enough, the box
+                around the last one is scanned for the position on which all modules agree best.
         """
         phases = phases_cycles.reshape(-1)
         for prior in priors_m:
@@ -71,4 +71,4 @@ class PhaseDecoder:
         target = np.exp(-2j * np.pi * (phases - self._waves @ centre_m))
         score = ((along_x * target) @ along_y.T).real
         ix, iy = np.unravel_index(int(np.argmax(score)), score.shape)
-        return centre_m + np.array([self._ticks[ix], self._ticks[iy]])
+        return np.asarray(centre_m + np.array([self._ticks[ix], self._ticks[iy]]))

@@ -14,7 +14,7 @@ Rectifier = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 
 def relu(drive: NDArray[np.floating]) -> NDArray[np.floating]:
     """The paper's rectifying linear f."""
-    return np.maximum(drive, 0.0)
+    return np.asarray(np.maximum(drive, 0.0))
 
 
 def softplus(sharpness: float) -> Rectifier:
@@ -22,7 +22,7 @@ def softplus(sharpness: float) -> Rectifier:
 
     def f(drive: NDArray[np.floating]) -> NDArray[np.floating]:
         beta = drive.dtype.type(sharpness)
-        return np.maximum(drive, 0.0) + np.log1p(np.exp(-beta * np.abs(drive))) / beta
+        return np.asarray(np.maximum(drive, 0.0) + np.log1p(np.exp(-beta * np.abs(drive))) / beta)
 
     return f
 
@@ -77,7 +77,7 @@ class GridModules:
         self._gains = gains.astype(dtype)
         self._rectifier = rectifier
         self._centre = fourier_modes
-        self._stripe = np.dtype(dtype).type(0.5 * band_drive * side**2)
+        self._stripe = 0.5 * band_drive * side**2
         wave = 2.0 * np.pi * np.arange(side) / side
         seed = np.cos(wave[:, None]) + np.cos(wave) + np.cos(wave[:, None] + wave)
         self.activity: NDArray[np.floating] = np.repeat((1.0 + 0.3 * seed)[None], modules, axis=0).astype(dtype)

@@ -46,5 +46,5 @@ class HeadDirectionRing:
         self.activity = 1.0 + vector @ self._kernel
 
     def rates(self, turn_rate_rad_s: float = 0.0, modulation_s: float = 0.1) -> NDArray[np.floating]:
-        """Return the rates (m,) with the turn-rate modulation of real cells: gain 1 + modulation |omega|; the state is untouched."""
+        """Return the rates (m,) with the turn-rate modulation of real cells, gain 1 + modulation |omega|; no state changes."""
         return self.activity * (1.0 + modulation_s * abs(turn_rate_rad_s))

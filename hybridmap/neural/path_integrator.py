@@ -19,10 +19,10 @@ from hybridmap.neural.torus import LowModes, shift_sheets
 class PathIntegrator:
     """Head direction -> band -> grid -> place -> place attractor.
 
-    The pose is read from the head-direction ring and from the phases of all grid sheets together. No number integrates position
-    beside the network. What the read-out needs besides is which repetition of the code is meant: the place attractor's bump says it
-    up to the attractor's own wrap (some metres), and the last decoded position says which of those. Both are used as a prior
-    only: within the box around it, other activity means another pose.
+    The pose is read from the head-direction ring and from the phases of all grid sheets together. No number integrates
+    position beside the network. What the read-out needs besides is which repetition of the code is meant: the place
+    attractor's bump says it up to the attractor's own wrap (some metres), and the last decoded position says which of those.
+    Both are a prior only: within the box around it, other activity means another pose.
     """
 
     def __init__(self, config: NeuralConfig) -> None:
@@ -34,7 +34,7 @@ class PathIntegrator:
         self.bands = BandRings(self.spacings_m, turned, config.band_cells, config.band_width, dtype)
         self.grid = _grid(config)
         place = config.place
-        self.place = PlaceCells(place, config.sheet_side, config.modules)
+        self.place = PlaceCells(place, config.sheet_side, self.spacings_m)
         self.attractor = PlaceAttractor(place.attractor_side, place.attractor_cell_m, place.attractor_width_cells, dtype)
         self._decoder = PhaseDecoder(self.bands.wave_vectors, config.decode_box_m)
         self._last_decoded_m: Array = np.zeros(2)
@@ -45,9 +45,9 @@ class PathIntegrator:
         """Integrate one displacement.
 
         Args:
-            delta_robot: (3,) pose of the robot now in the frame of the robot at the last step, m and rad (`geometry.between` of two
-                odometry poses). Its chord is turned to the mid-point heading, so gains on the turn bend the path as they should.
-            dt_s: seconds since the last step; the sheets' time constant is one step, so it does not enter their dynamics.
+            delta_robot: (3,) pose of the robot now in the frame of the robot at the last step, m and rad (`geometry.between`
+                of two odometry poses). Its chord is turned to the mid-point heading, so a gain on the turn bends the path.
+            dt_s: seconds since the last step; the sheets' time constant is one step, so their dynamics do not need it.
         """
         dx, dy, dyaw = (float(value) for value in np.asarray(delta_robot, dtype=np.float64))
         if dx == 0.0 and dy == 0.0 and dyaw == 0.0:
@@ -74,8 +74,11 @@ class PathIntegrator:
 
     @property
     def place_code(self) -> NDArray[np.float32]:
-        """Place-cell rates (P,) after competition, of unit length; novelty is 1 - the dot product of two codes."""
-        return self.place.code(self.grid.activity)
+        """Rates (P,) of the place attractor, of unit length and unique beyond its wrap; novelty is 1 - the dot product.
+
+        It is a function of the present activity alone: the same place gives the same code whenever it is visited.
+        """
+        return self.attractor.code(self.decode().position_m)
 
     def decode(self) -> Decoded:
         """Decode the position from all sheets together, with how well the modules agree."""
@@ -106,8 +109,8 @@ class PathIntegrator:
     def snapshot(self) -> dict[str, NDArray[np.generic]]:
         """Return what a node stores so that `restore` puts the network back where it is now (about 8 kB).
 
-        Keys: `heading` (m,), `band_phases` (M, 3), `grid_phases` (M, 2), `attractor` (N, N), `place_code` (P,), `near_m` (2,): the decoded
-        position, which says which repetition of the code is meant.
+        Keys: `heading` (m,), `band_phases` (M, 3), `grid_phases` (M, 2), `attractor` (N, N), `place_code` (P,), and
+        `near_m` (2,): the decoded position, which says which repetition of the code is meant.
         """
         near = self.decode().position_m
         return {

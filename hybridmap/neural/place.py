@@ -13,42 +13,32 @@ log = logging.getLogger(__name__)
 
 
 class PlaceCells:
-    """P place cells that learn single fields from the grid sheets (paper eqs. 8-9).
+    """Place cells that learn single fields from the grid sheets (paper eqs. 8-9).
 
     The printed rule bounds no weight and leaves most cells with several fields. Here weights are non-negative with rows of
-    unit length, and where no field responds above the threshold a new one is recruited in one step: its weights are the
-    grid cells' present rates above their mean (C_inh_g). Fields are handed to cells in turn; once every cell has one, cells get a second, far
-    away from the first, as in real large environments. Everything is deterministic.
+    unit length, and where no cell responds above the threshold a new one is recruited in one step: its weights are the grid
+    cells' present rates above their mean (C_inh_g). Coarse modules weigh more, in proportion to their spacing, which is what
+    keeps side peaks down. Everything is deterministic.
     """
 
-    def __init__(self, config: PlaceConfig, sheet_side: int, modules: int) -> None:
+    def __init__(self, config: PlaceConfig, sheet_side: int, spacings_m: NDArray[np.float64]) -> None:
         self.config = config
-        self.size = config.attractor_side**2
         self._stride = sheet_side // config.grid_inputs_side
-        self._inputs = modules * config.grid_inputs_side**2
-        self._weights = np.zeros((256, self._inputs), dtype=np.float32)
-        self.fields = 0
+        self._module_weight = (spacings_m / spacings_m.max()).astype(np.float32)[:, None]
+        self._weights = np.zeros((256, len(spacings_m) * config.grid_inputs_side**2), dtype=np.float32)
+        self._recruited = 0
 
     @property
     def weights(self) -> NDArray[np.float32]:
-        """Weights of the recruited fields, (fields, inputs), rows of unit length; field n belongs to cell n mod P."""
-        return self._weights[: self.fields]
+        """Weights of the recruited cells, (cells, inputs), rows of unit length."""
+        return self._weights[: self._recruited]
 
-    def field_rates(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return p = A f[W (s - C_inh_g) - C_inh_p] of every field, (fields,), 1 at a field's peak."""
+    def rates(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return p = A f[W (s - C_inh_g) - C_inh_p] of every recruited cell, (cells,), 1 at the peak of a field."""
         return self._respond(self._drive(sheets))
 
-    def code(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return the place code (P,): rates after competition, of unit length (all zero before the first field)."""
-        rates = self.field_rates(sheets) ** np.float32(self.config.competition)
-        padded = np.zeros(-(-max(self.fields, 1) // self.size) * self.size, dtype=np.float32)
-        padded[: self.fields] = rates
-        code = padded.reshape(-1, self.size).max(axis=0)
-        norm = np.float32(np.linalg.norm(code))
-        return code / norm if norm > 0 else code
-
     def learn(self, sheets: NDArray[np.floating]) -> None:
-        """One learning step: recruit where nothing responds, else move the responding fields' weights (eq. 8)."""
+        """One learning step: recruit where nothing responds, else move the responding cells' weights (eq. 8)."""
         drive = self._drive(sheets)
         rates = self._respond(drive)
         if rates.size == 0 or float(rates.max()) < self.config.recruit_threshold:
@@ -61,20 +51,21 @@ class PlaceCells:
 
     def _respond(self, drive: NDArray[np.float32]) -> NDArray[np.float32]:
         inhibition = np.float32(self.config.inhibition)
-        return np.maximum(self.weights @ drive - inhibition, 0.0) / (np.float32(1.0) - inhibition)
+        above = np.maximum(self.weights @ drive - inhibition, np.float32(0.0))
+        return np.asarray(above / (np.float32(1.0) - inhibition))
 
     def _recruit(self, drive: NDArray[np.float32]) -> None:
-        if self.fields == self.config.max_fields:
+        if self._recruited == self.config.max_cells:
             return
-        if self.fields == len(self._weights):
+        if self._recruited == len(self._weights):
             self._weights = np.concatenate([self._weights, np.zeros_like(self._weights)])
-        self._weights[self.fields] = drive
-        self.fields += 1
-        if self.fields == self.config.max_fields:
-            log.warning("all %d place fields are in use; new places get no field of their own", self.fields)
+        self._weights[self._recruited] = drive
+        self._recruited += 1
+        if self._recruited == self.config.max_cells:
+            log.warning("all %d place cells are recruited; new places get no cell of their own", self._recruited)
 
     def _drive(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Rates above the mean of the grid cells that project to place cells, (inputs,), of unit length."""
+        """Rates above the module's mean of the grid cells that project to place cells, (inputs,), of unit length."""
         sampled = sheets[:, :: self._stride, :: self._stride].reshape(len(sheets), -1).astype(np.float32)
-        above = np.maximum(sampled - sampled.mean(axis=1, keepdims=True), 0.0).reshape(-1)
-        return above / np.float32(np.linalg.norm(above))
+        above = np.maximum(sampled - sampled.mean(axis=1, keepdims=True), np.float32(0.0)) * self._module_weight
+        return np.asarray(above.reshape(-1) / np.linalg.norm(above))

@@ -7,7 +7,7 @@ from numpy.typing import DTypeLike, NDArray
 
 
 class LowModes:
-    """Transforms between sheets (M, N, N) and their modes (M, 2K+1, K+1): p = -K..K along the first axis, q = 0..K along the second.
+    """Transforms between sheets (M, N, N) and their modes (M, 2K+1, K+1): p = -K..K on the first axis, q = 0..K on the second.
 
     Two small matrix products each way; the half plane q >= 0 suffices because sheets are real.
     """
@@ -45,7 +45,7 @@ class LowModes:
         return np.asarray(turn[:, 0, :, None] * turn[:, 1, None, len(self.second) - 1 :], dtype=self._complex)
 
     def squared_wave_number(self) -> NDArray[np.int64]:
-        """Return |k|^2 (2K+1, K+1) in the hexagonal metric: axes at 0 and 120 degrees, so the first shell is (1,0), (0,1), (1,1)."""
+        """Return |k|^2 (2K+1, K+1) in the hexagonal metric: axes 120 degrees apart, first shell (1,0), (0,1), (1,1)."""
         p, q = self.first[:, None], self.second
         return np.asarray(p * p + q * q - p * q)
 
