@@ -2,8 +2,175 @@
 
 from __future__ import annotations
 
+from pydantic import Field
+
 from hybridmap.config.section import Section
+
+
+class ScanConfig(Section):
+    """What is taken from one scan."""
+
+    range_max_m: float = Field(default=20.0, gt=0)
+    """Returns farther away are left out, m."""
+    cell_m: float = Field(default=0.05, gt=0)
+    """Points of one cell are merged into one, m."""
+    profile_width: int = Field(default=64, ge=8)
+    """Bearing columns of the scanline profile."""
+
+
+class RegistrationConfig(Section):
+    """Likelihood field and point-to-line registration."""
+
+    reach_m: float = Field(default=0.3, gt=0)
+    """A point farther than this from every target point has no partner, m."""
+    field_sigma_m: float = Field(default=0.12, gt=0)
+    """Width of the likelihood field on which starts are scored, m."""
+    cauchy_scale_m: float = Field(default=0.05, gt=0)
+    """Residual at which a partner's weight is halved, m."""
+    iterations: int = Field(default=20, ge=1)
+    """Most iterations of point-to-line registration."""
+    inlier_m: float = Field(default=0.1, gt=0)
+    """Largest point-to-line residual of an inlier, m."""
+    sigma_m: float = Field(default=0.03, gt=0)
+    """Standard deviation of a point's residual at least, m."""
+    correlation: float = Field(default=6.0, ge=1)
+    """Points that share one independent piece of information: neighbours on a wall err together."""
+
+
+class TrackingConfig(Section):
+    """Refined self-motion: each new node is registered to the submap of the last ones."""
+
+    submap_nodes: int = Field(default=25, ge=1)
+    """Nodes in the submap."""
+    narrow_m: float = Field(default=0.2, gt=0)
+    """First search: half-width of the grid of starts about the odometry, m."""
+    narrow_deg: float = Field(default=8.0, gt=0)
+    """First search: half-width of the grid of starts about the odometry, degrees."""
+    wide_m: float = Field(default=0.45, gt=0)
+    """Second search, when the first fails or contradicts the odometry: half-width, m."""
+    wide_deg: float = Field(default=40.0, gt=0, le=180)
+    """Second search: half-width, degrees (drop-outs of wheel odometry are mostly of heading)."""
+    prior_m: float = Field(default=0.1, gt=0)
+    """Standard deviation of the odometry's translation as prior of the registration, m."""
+    prior_deg: float = Field(default=5.0, gt=0)
+    """Standard deviation of the odometry's heading as prior of the first search, degrees."""
+    wide_prior_deg: float = Field(default=40.0, gt=0)
+    """The same for the second search, where the heading is nearly free, degrees."""
+    inliers_min: float = Field(default=0.6, gt=0, le=1)
+    """Least share of inliers of a good registration."""
+    inliers_weak: float = Field(default=0.45, gt=0, le=1)
+    """Least share of inliers at which a registration still becomes an edge."""
+    translation_max_m: float = Field(default=0.4, gt=0)
+    """A registration whose translation is farther from the odometry's is refused, m."""
+    contradiction_m: float = Field(default=0.15, gt=0)
+    """A good registration this far from the odometry drops the odometry edge, m."""
+    contradiction_deg: float = Field(default=3.0, gt=0)
+    """The same, degrees."""
+    floor_m: float = Field(default=0.008, gt=0)
+    """Standard deviation of a registration edge at least, m."""
+    floor_deg: float = Field(default=0.2, gt=0)
+    """The same, degrees."""
+
+
+class ProbeConfig(Section):
+    """Hypotheses of loop closure: submaps of the last metres against old submaps inside the gate."""
+
+    every_m: float = Field(default=2.0, gt=0)
+    """Travel between two probes, m."""
+    length_m: float = Field(default=10.0, gt=0)
+    """Travel that a probe covers, m."""
+    target_every_m: float = Field(default=4.0, gt=0)
+    """Travel between the anchors of old submaps, m."""
+    target_half_m: float = Field(default=6.0, gt=0)
+    """Travel that an old submap covers to either side of its anchor, m."""
+    points: int = Field(default=120, ge=20)
+    """Points of a probe that score the starts."""
+    gate_sigmas: float = Field(default=2.5, gt=0)
+    """Width of the gate in standard deviations of the propagated covariance. It has no cap."""
+    gate_m: float = Field(default=2.5, ge=0)
+    """Width of the gate beside that, m."""
+    gate_deg: float = Field(default=4.0, ge=0)
+    """Width of the gate's heading beside that, degrees."""
+    window_m: float = Field(default=3.5, gt=0)
+    """A target is searched this far about its anchor; the next anchors take over beyond it, m."""
+    modes_per_target: int = Field(default=2, ge=1)
+    """Separated modes that a target may keep."""
+    modes: int = Field(default=6, ge=1)
+    """Modes that a probe may keep in all."""
+    near_min: float = Field(default=0.5, gt=0, le=1)
+    """Least share of the probe's points that lie near the target."""
+    fit_min: float = Field(default=0.7, gt=0, le=1)
+    """Least share of inliers among them."""
+    violation_max: float = Field(default=0.08, ge=0, le=1)
+    """Largest share of points of one submap in the free space of the other, either way."""
+    loosest_max_m: float = Field(default=0.3, gt=0)
+    """Largest standard deviation of the registration in any direction: a bare corridor is refused, m."""
+    floor_m: float = Field(default=0.03, gt=0)
+    """Standard deviation of a loop edge at least, m."""
+    floor_deg: float = Field(default=0.4, gt=0)
+    """The same, degrees."""
+
+
+class CommitmentConfig(Section):
+    """Late commitment: hypotheses wait until a cluster of them beats its best rival."""
+
+    wait_m: float = Field(default=32.0, gt=0)
+    """Travel after which a hypothesis that found no cluster is given up, m."""
+    probes: int = Field(default=4, ge=1)
+    """Distinct probes that a cluster needs."""
+    span_m: float = Field(default=9.0, ge=0)
+    """Travel that they must cover, m."""
+    sure_sigma_m: float = Field(default=0.8, ge=0)
+    """Below this standard deviation of the gate fewer are enough, m."""
+    sure_probes: int = Field(default=2, ge=1)
+    """Distinct probes that are enough then."""
+    sure_span_m: float = Field(default=3.0, ge=0)
+    """Travel that they must cover then, m."""
+    rival: float = Field(default=0.75, gt=0, le=1)
+    """The best rival cluster must score less than this share of the cluster."""
+    heading_deg_per_sqrt_m: float = Field(default=0.45, gt=0)
+    """Growth of the chain's heading error, degrees per sqrt(m), for the consistency of two hypotheses."""
+
+
+class RevisitConfig(Section):
+    """Re-proposal on the optimised map, at the end."""
+
+    rounds: int = Field(default=2, ge=0)
+    """Most rounds."""
+    radius_m: float = Field(default=2.5, gt=0)
+    """Nodes nearer than this are registered again, m."""
+    every_m: float = Field(default=1.0, gt=0)
+    """Travel between two nodes that take part, m."""
+    apart_m: float = Field(default=12.0, gt=0)
+    """Travel between two passes, m."""
+    partners: int = Field(default=3, ge=1)
+    """Most earlier passes that a node is registered to."""
+    probe_half_m: float = Field(default=1.5, gt=0)
+    """Travel about the node whose scans are registered, m."""
+    target_half_m: float = Field(default=4.0, gt=0)
+    """Travel about the partner whose scans are registered to, m."""
+    search_m: float = Field(default=0.45, gt=0)
+    """Half-width of the grid of starts, m."""
+    search_deg: float = Field(default=4.5, gt=0)
+    """Half-width of the grid of starts, degrees."""
+    floor_m: float = Field(default=0.02, gt=0)
+    """Standard deviation of such an edge at least, m."""
+    floor_deg: float = Field(default=0.3, gt=0)
+    """The same, degrees."""
 
 
 class LaserConfig(Section):
     """Submap registration and commitment by cluster."""
+
+    scan: ScanConfig = ScanConfig()
+    """Points and profile of one scan."""
+    registration: RegistrationConfig = RegistrationConfig()
+    """Likelihood field and point-to-line registration."""
+    tracking: TrackingConfig = TrackingConfig()
+    """Refined self-motion."""
+    probes: ProbeConfig = ProbeConfig()
+    """Hypotheses of loop closure."""
+    commitment: CommitmentConfig = CommitmentConfig()
+    """When hypotheses become edges."""
+    revisits: RevisitConfig = RevisitConfig()
+    """Re-proposal at the end."""

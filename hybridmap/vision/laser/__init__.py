@@ -1,0 +1,1 @@
+"""Laser front-end: scans to submaps, submaps to relative poses, hypotheses to committed clusters."""

@@ -1,0 +1,182 @@
+"""Late commitment: hypotheses wait until several of them, pairwise consistent through the chain, beat their best rivals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.config.laser import CommitmentConfig
+from hybridmap.geometry import Array, between, compose, inverse
+from hybridmap.vision.base import Belief
+from hybridmap.vision.laser.hypotheses import Hypothesis
+
+MEASURED_M = 0.12
+MEASURED_RAD = np.deg2rad(1.2)
+
+
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """A hypothesis that waits, under its key."""
+
+    key: int
+    hypothesis: Hypothesis
+
+
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """A hypothesis that waits no longer, and why."""
+
+    key: int
+    hypothesis: Hypothesis
+    accepted: bool
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Cluster:
+    """Consistent hypotheses, one a probe.
+
+    Attributes:
+        members: their positions in the queue.
+        score: sum of their quality.
+        probes: distinct probes.
+        span_m: travel between the outermost of them.
+        sigma_m: median standard deviation of their gates.
+    """
+
+    members: tuple[int, ...]
+    score: float
+    probes: int
+    span_m: float
+    sigma_m: float
+
+
+class Commitment:
+    """The queue of waiting hypotheses."""
+
+    def __init__(self, config: CommitmentConfig, travel_of: Callable[[int], float], chain_of: Callable[[int], Array]) -> None:
+        self._config = config
+        self._travel = travel_of
+        self._chain = chain_of
+        self._queue: list[Waiting] = []
+        self._consistent: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
+
+    def add(self, key: int, hypothesis: Hypothesis) -> None:
+        """Let a hypothesis wait."""
+        self._queue.append(Waiting(key, hypothesis))
+
+    def settle(self, travel_m: float, belief: Belief) -> list[Settled]:
+        """Commit the best cluster if it is good enough, with all that agrees with it; give up what waited too long."""
+        out: list[Settled] = []
+        while (cluster := self._ripe(belief)) is not None:
+            out += self._commit(cluster)
+        old = [w for w in self._queue if travel_m - self._travel(w.hypothesis.probe) > self._config.wait_m]
+        out += [Settled(w.key, w.hypothesis, False, f"no cluster within {self._config.wait_m:g} m of travel") for w in old]
+        self._keep([i for i, w in enumerate(self._queue) if w not in old])
+        return out
+
+    def flush(self) -> list[Settled]:
+        """Give up everything that waits."""
+        out = [Settled(w.key, w.hypothesis, False, "no cluster by the end") for w in self._queue]
+        self._keep([])
+        return out
+
+    def _keep(self, positions: list[int]) -> None:
+        known = [p for p in positions if p < len(self._consistent)]
+        self._consistent = self._consistent[np.ix_(known, known)]
+        self._queue = [self._queue[p] for p in positions]
+
+    def _ripe(self, belief: Belief) -> Cluster | None:
+        self._extend(belief)
+        clusters = self._clusters()
+        if not clusters:
+            return None
+        best = clusters[0]
+        if not self._enough(best):
+            return None
+        rival = max((c.score for c in clusters[1:] if self._rivals(best, c)), default=0.0)
+        return best if rival < self._config.rival * best.score else None
+
+    def _enough(self, cluster: Cluster) -> bool:
+        c = self._config
+        if cluster.probes >= c.probes and cluster.span_m >= c.span_m:
+            return True
+        return cluster.sigma_m < c.sure_sigma_m and cluster.probes >= c.sure_probes and cluster.span_m >= c.sure_span_m
+
+    def _commit(self, cluster: Cluster) -> list[Settled]:
+        """Accept everything that agrees with all members; refuse what contradicts most of them."""
+        members = list(cluster.members)
+        agrees = self._consistent[:, members].mean(axis=1)
+        out, left = [], []
+        reason = f"cluster of {cluster.probes} probes over {cluster.span_m:.1f} m, score {cluster.score:.2f}"
+        for i, w in enumerate(self._queue):
+            if i in cluster.members or agrees[i] == 1.0:
+                out.append(Settled(w.key, w.hypothesis, True, reason))
+            elif agrees[i] < 0.5:
+                out.append(Settled(w.key, w.hypothesis, False, f"contradicts the {reason}"))
+            else:
+                left.append(i)
+        self._keep(left)
+        return out
+
+    def _rivals(self, best: Cluster, other: Cluster) -> bool:
+        return bool(self._consistent[np.ix_(list(best.members), list(other.members))].mean() < 0.5)
+
+    def _clusters(self) -> list[Cluster]:
+        """Greedy cliques from every seed, the best first; those that repeat an earlier one are left out."""
+        n = len(self._queue)
+        quality = np.array([w.hypothesis.quality for w in self._queue])
+        probes = np.array([w.hypothesis.probe for w in self._queue])
+        order = sorted(range(n), key=lambda i: -quality[i])
+        found: dict[tuple[int, ...], Cluster] = {}
+        for seed in order:
+            members, open_ = [seed], self._consistent[seed] & (probes != probes[seed])
+            while open_.any():
+                support = np.where(open_, (self._consistent & open_[None]) @ quality + quality, -1.0)
+                best = int(np.argmax(support))
+                members.append(best)
+                open_ &= self._consistent[best] & (probes != probes[best])
+            key = tuple(sorted(members))
+            if key not in found:
+                found[key] = self._describe(key)
+        return sorted(found.values(), key=lambda c: (-c.score, c.members))
+
+    def _describe(self, members: tuple[int, ...]) -> Cluster:
+        chosen = [self._queue[i].hypothesis for i in members]
+        travels = [self._travel(h.probe) for h in chosen]
+        return Cluster(
+            members,
+            float(sum(h.quality for h in chosen)),
+            len({h.probe for h in chosen}),
+            max(travels) - min(travels),
+            float(np.median([h.sigma_m for h in chosen])),
+        )
+
+    def _extend(self, belief: Belief) -> None:
+        """Fill the consistency of hypotheses that came since the last time."""
+        n, known = len(self._queue), len(self._consistent)
+        if n == known:
+            return
+        grown = np.eye(n, dtype=bool)
+        grown[:known, :known] = self._consistent
+        for i in range(known, n):
+            for j in range(i):
+                grown[i, j] = grown[j, i] = self._agree(self._queue[i].hypothesis, self._queue[j].hypothesis, belief)
+        self._consistent = grown
+
+    def _agree(self, a: Hypothesis, b: Hypothesis, belief: Belief) -> bool:
+        """Close the ring probe a, anchor a, anchor b, probe b and hold what is left against its uncertainty."""
+        probes = between(self._chain(a.probe), self._chain(b.probe))
+        old = between(belief.poses_map_node[a.anchor], belief.poses_map_node[b.anchor])
+        via = compose(compose(inverse(a.relative.delta), probes), b.relative.delta)
+        error = between(old, via)
+        new_m = abs(self._travel(a.probe) - self._travel(b.probe))
+        old_m = abs(self._travel(a.anchor) - self._travel(b.anchor))
+        rate = np.deg2rad(self._config.heading_deg_per_sqrt_m)
+        sigma_rad = np.sqrt(rate**2 * (new_m + min(old_m, 4.0 * self._config.wait_m)) + 2.0 * MEASURED_RAD**2)
+        lever = float(np.hypot(old[0], old[1]) + np.hypot(probes[0], probes[1])) / np.sqrt(3.0)
+        sigma_m = np.sqrt(2.0 * MEASURED_M**2 + (lever * sigma_rad) ** 2)
+        return bool(np.hypot(error[0], error[1]) < 2.5 * sigma_m and abs(error[2]) < 2.5 * sigma_rad)

@@ -1,0 +1,154 @@
+"""The laser front-end: scans in; refined self-motion and committed loop closures out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.config.vision import VisionConfig
+from hybridmap.errors import StreamError
+from hybridmap.geometry import IDENTITY, Array, RelativePose, compose
+from hybridmap.streams.base import Laser, LaserScan, Observation
+from hybridmap.vision.base import Belief, Proposal, Verdict, View
+from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan
+from hybridmap.vision.laser.clusters import Commitment, Settled
+from hybridmap.vision.laser.hypotheses import Hypothesis, Prober
+from hybridmap.vision.laser.revisits import Reviser
+from hybridmap.vision.laser.submap import Atlas
+from hybridmap.vision.laser.tracking import Step, Tracker
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """A scan with the integrator's motion from the last node."""
+
+    scan: LaserScan
+    motion: Array
+
+
+class LaserFrontEnd:
+    """Submap registration and commitment by cluster, as a `vision.base.FrontEnd`."""
+
+    def __init__(self, config: VisionConfig, laser: Laser, seed: int) -> None:
+        """Start without a node; nothing here is random, `seed` is taken for the sake of the interface."""
+        del seed
+        self._config = config.laser
+        self._laser = laser
+        self._atlas = Atlas(self._config)
+        self._tracker = Tracker(self._config, self._atlas)
+        self._prober = Prober(self._config, self._atlas, laser)
+        self._reviser = Reviser(self._config, self._atlas, laser)
+        self._commitment = Commitment(self._config.commitment, self._atlas.travel_m.__getitem__, self._atlas.chain.__getitem__)
+        self._profiles: list[NDArray[np.float32]] = []
+        self._seen: list[_Seen] = []
+        self._node: tuple[int, Cloud, LaserScan] | None = None
+        self._between: list[_Seen] = []
+        self._last_probe_m = 0.0
+        self._keys = 0
+
+    def observe(self, frame: Observation, delta_node_robot: Array) -> View:
+        """Take in one scan; see `FrontEnd.observe`.
+
+        Raises:
+            StreamError: the frame is no scan, or has another number of beams than the laser.
+        """
+        if not isinstance(frame, LaserScan):
+            raise StreamError(f"laser: expected a LaserScan, found {type(frame).__name__}")
+        if frame.ranges_m.shape != self._laser.bearings_rad.shape:
+            raise StreamError(f"laser: expected {len(self._laser.bearings_rad)} ranges, found {frame.ranges_m.shape}")
+        self._seen.append(_Seen(frame, np.array(delta_node_robot, dtype=np.float64)))
+        return View(frame.stamp_ns, _profile(frame.ranges_m, self._config.scan.profile_width), -1, False)
+
+    def add_node(self, node: int, view: View) -> None:
+        """Make a node of the scan observed last."""
+        seen = self._seen.pop()
+        self._between, self._seen = self._seen, []
+        self._profiles.append(view.profile)
+        self._node = (node, self._cloud(seen.scan), seen.scan)
+
+    def track(self, node: int, odometry: RelativePose | None) -> list[Proposal]:
+        """Register the new node to the submap of the last ones."""
+        assert self._node is not None
+        number, cloud, scan = self._node
+        assert number == node
+        if odometry is None:
+            self._atlas.add(cloud, scan.ranges_m, IDENTITY.copy())
+            return []
+        step = self._tracker.step(cloud, odometry, self._clouds_between)
+        self._atlas.add(cloud, scan.ranges_m, compose(self._atlas.chain[-1], step.relative.delta))
+        return [self._registration(node, step)]
+
+    def close(self, node: int, belief: Belief) -> list[Proposal]:
+        """Probe the old submaps every few metres; settle what has waited."""
+        travel_m = self._atlas.travel_m[node]
+        if travel_m - self._last_probe_m < self._config.probes.every_m:
+            return []
+        self._last_probe_m = travel_m
+        out = []
+        for hypothesis in self._prober.probe(node, belief):
+            key = self._next_key()
+            if hypothesis.refusal:
+                out.append(_loop(key, hypothesis, Verdict.REJECTED, hypothesis.refusal))
+            else:
+                self._commitment.add(key, hypothesis)
+                out.append(_loop(key, hypothesis, Verdict.PENDING, "waits for a cluster"))
+        return out + [_settled(s) for s in self._commitment.settle(travel_m, belief)]
+
+    def finish(self, belief: Belief) -> list[Proposal]:
+        """Give up what still waits; register nodes that came near each other on the optimised map."""
+        out = [_settled(s) for s in self._commitment.flush()]
+        for hypothesis in self._reviser.round(belief):
+            verdict = Verdict.REJECTED if hypothesis.refusal else Verdict.ACCEPTED
+            out.append(_loop(self._next_key(), hypothesis, verdict, hypothesis.refusal or "near on the optimised map"))
+        return out
+
+    def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
+        """Profile and ranges of a node's scan."""
+        return {"profile": self._profiles[node], "ranges_m": self._atlas.ranges[node]}
+
+    def _next_key(self) -> int:
+        self._keys += 1
+        return self._keys - 1
+
+    def _cloud(self, scan: LaserScan) -> Cloud:
+        return cloud_of_scan(scan.ranges_m, self._laser, self._config.scan)
+
+    def _clouds_between(self) -> Iterator[tuple[Array, Cloud]]:
+        return ((seen.motion, self._cloud(seen.scan)) for seen in self._between)
+
+    def _registration(self, node: int, step: Step) -> Proposal:
+        return Proposal(
+            key=self._next_key(),
+            kind="registration",
+            source=node - 1,
+            target=node,
+            verdict=Verdict.ACCEPTED if step.measured else Verdict.REJECTED,
+            reason=step.reason,
+            relative=step.relative if step.measured else None,
+            scores={"inliers": step.inliers, "fit": step.fit},
+            contradicts_odometry=step.contradicts_odometry,
+        )
+
+
+def _loop(key: int, hypothesis: Hypothesis, verdict: Verdict, reason: str) -> Proposal:
+    return Proposal(key, "loop", hypothesis.probe, hypothesis.anchor, verdict, reason, hypothesis.relative, hypothesis.scores)
+
+
+def _settled(settled: Settled) -> Proposal:
+    verdict = Verdict.ACCEPTED if settled.accepted else Verdict.REJECTED
+    return _loop(settled.key, settled.hypothesis, verdict, settled.reason)
+
+
+def _profile(ranges_m: NDArray[np.float32], width: int) -> NDArray[np.float32]:
+    """Ranges resampled to bearing columns, z-normalised; (1, width) float32."""
+    edges = np.linspace(0, len(ranges_m), width + 1).round().astype(np.int64)
+    valid = np.isfinite(ranges_m)
+    total = np.concatenate([[0.0], np.cumsum(np.where(valid, ranges_m, 0.0))])
+    count = np.concatenate([[0], np.cumsum(valid)])
+    columns = np.diff(count[edges])
+    mean = np.diff(total[edges]) / np.maximum(columns, 1)
+    mean = np.where(columns > 0, mean, mean[columns > 0].mean() if (columns > 0).any() else 0.0)
+    return np.asarray(((mean - mean.mean()) / max(float(mean.std()), 1e-6))[None], dtype=np.float32)

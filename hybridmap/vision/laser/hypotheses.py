@@ -1,0 +1,208 @@
+"""Hypotheses of loop closure: the submap of the last metres against the old submaps inside the gate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridmap.config.laser import LaserConfig
+from hybridmap.geometry import Array, RelativePose, between, inverse, invert_relative, wrap_angle
+from hybridmap.streams.base import Laser
+from hybridmap.vision.base import Belief
+from hybridmap.vision.laser.likelihood import score_starts
+from hybridmap.vision.laser.registration import Alignment, align
+from hybridmap.vision.laser.submap import Atlas, Submap, Target
+from hybridmap.vision.laser.tracking import spaced
+from hybridmap.vision.laser.visibility import violation
+
+START_STEP_M = 0.3
+START_STEP_DEG = 2.0
+REGISTERED_POINTS = 400
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """A place where the robot may have been before, measured.
+
+    Attributes:
+        probe: node in whose frame the recent submap is given; the newer one.
+        anchor: node in whose frame the old submap is given.
+        relative: pose of the anchor in the frame of the probe.
+        quality: near x fit.
+        sigma_m: standard deviation of the gate's position there.
+        scores: every figure of the verification.
+        refusal: why it is no hypothesis; empty if it is one.
+    """
+
+    probe: int
+    anchor: int
+    relative: RelativePose
+    quality: float
+    sigma_m: float
+    scores: dict[str, float]
+    refusal: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Gate:
+    """Where the anchor of a target may be: expected pose (3,) of the probe in its frame, radius m, heading rad, sigma m."""
+
+    anchor: int
+    expected: Array
+    radius_m: float
+    heading_rad: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Mode:
+    """A promising start: pose (3,) of the probe in the target's frame and its score."""
+
+    gate: _Gate
+    target: Target
+    pose: Array
+    score: float
+
+
+class Prober:
+    """Proposes and measures hypotheses."""
+
+    def __init__(self, config: LaserConfig, atlas: Atlas, laser: Laser) -> None:
+        self._config = config
+        self._atlas = atlas
+        self._laser = laser
+        self._anchors: list[int] = []
+
+    def probe(self, node: int, belief: Belief) -> list[Hypothesis]:
+        """Search the old submaps for the last metres before a node; those refused carry the reason."""
+        c, atlas = self._config.probes, self._atlas
+        recent = atlas.along(atlas.travel_m[node] - c.length_m, atlas.travel_m[node])
+        recent = recent[recent <= node]
+        center = int(recent[len(recent) // 2])
+        probe = atlas.submap(center, recent)
+        modes = [m for gate in self._gates(center, int(recent[0]), belief) for m in self._modes(gate, probe)]
+        modes.sort(key=lambda m: -m.score)
+        found = [self._verify(mode, probe) for mode in modes[: c.modes]]
+        return _distinct(found)
+
+    def _extend_anchors(self) -> None:
+        travel = self._atlas.travel_m
+        while True:
+            wanted = travel[self._anchors[-1]] + self._config.probes.target_every_m if self._anchors else 0.0
+            after = int(np.searchsorted(travel, wanted))
+            if after >= len(travel):
+                return
+            self._anchors.append(after)
+
+    def _gates(self, center: int, oldest: int, belief: Belief) -> list[_Gate]:
+        """Targets that lie wholly before the probe and inside the gate; the gate follows the covariance and has no cap."""
+        c, atlas = self._config.probes, self._atlas
+        self._extend_anchors()
+        limit = atlas.travel_m[oldest] - c.target_half_m
+        anchors = [a for a in self._anchors if atlas.travel_m[a] < limit]
+        if not anchors:
+            return []
+        covariance = belief.covariance_from(center)[anchors]
+        sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:, :2, :2])[:, 1])
+        radius = c.gate_sigmas * sigma_m + c.gate_m
+        heading = c.gate_sigmas * np.sqrt(covariance[:, 2, 2]) + np.deg2rad(c.gate_deg)
+        expected = between(belief.poses_map_node[anchors], belief.poses_map_node[center])
+        inside = np.hypot(expected[:, 0], expected[:, 1]) <= radius + c.window_m
+        return [
+            _Gate(anchors[i], expected[i], float(radius[i]), float(min(heading[i], np.pi)), float(sigma_m[i]))
+            for i in np.flatnonzero(inside)
+        ]
+
+    def _modes(self, gate: _Gate, probe: Submap) -> list[_Mode]:
+        """Separated maxima of the likelihood over the part of the gate that this target answers for."""
+        c, atlas = self._config.probes, self._atlas
+        side = spaced(c.window_m, START_STEP_M)
+        offsets = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+        inside = (np.hypot(offsets[:, 0], offsets[:, 1]) <= c.window_m) & (
+            np.hypot(*(offsets - gate.expected[:2]).T) <= gate.radius_m
+        )
+        offsets = offsets[inside]
+        if len(offsets) == 0:
+            return []
+        travel = atlas.travel_m[gate.anchor]
+        nodes = atlas.along(travel - c.target_half_m, travel + c.target_half_m)
+        target = atlas.target(gate.anchor, nodes, c.window_m + START_STEP_M)
+        headings = gate.expected[2] + np.deg2rad(spaced(np.rad2deg(gate.heading_rad), START_STEP_DEG))
+        points = probe.cloud.thinned(c.points).points
+        scores = score_starts(target.coarse, points, np.zeros(2), headings, offsets)
+        return [
+            _Mode(gate, target, np.array([*offsets[t], headings[h]]), score)
+            for h, t, score in _peaks(scores, headings, offsets, c.modes_per_target)
+        ]
+
+    def _verify(self, mode: _Mode, probe: Submap) -> Hypothesis:
+        c = self._config.probes
+        cloud = probe.cloud.thinned(REGISTERED_POINTS)
+        alignment = align(mode.target.fine, cloud, mode.pose[None], self._config.registration)
+        pose = alignment.poses[0]
+        scores = {
+            "start": mode.score,
+            "near": float(alignment.near[0]),
+            "fit": float(alignment.fit[0]),
+            "inliers": float(alignment.inliers[0]),
+            "rms_m": float(alignment.rms_m[0]),
+            "gate_sigma_m": mode.gate.sigma_m,
+        }
+        covariance = alignment.covariance(0, self._config.registration, c.floor_m, np.deg2rad(c.floor_deg))
+        scores["loosest_m"] = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1]))
+        refusal = self._refusal(mode, alignment, scores)
+        if not refusal:
+            refusal = self._free_space(mode.target.submap, probe, pose, scores)
+        relative = invert_relative(RelativePose(pose, covariance))
+        quality = scores["near"] * scores["fit"]
+        return Hypothesis(probe.anchor, mode.gate.anchor, relative, quality, mode.gate.sigma_m, scores, refusal)
+
+    def _refusal(self, mode: _Mode, alignment: Alignment, scores: dict[str, float]) -> str:
+        c, pose = self._config.probes, alignment.poses[0]
+        off_m = float(np.hypot(*(pose - mode.gate.expected)[:2]))
+        off_rad = abs(float(wrap_angle(pose[2] - mode.gate.expected[2])))
+        scores["off_m"], scores["off_deg"] = off_m, float(np.rad2deg(off_rad))
+        if scores["near"] < c.near_min:
+            return f"near {scores['near']:.2f} < {c.near_min}"
+        if scores["fit"] < c.fit_min:
+            return f"fit {scores['fit']:.2f} < {c.fit_min}"
+        if off_m > mode.gate.radius_m or off_rad > mode.gate.heading_rad:
+            return f"{off_m:.2f} m, {np.rad2deg(off_rad):.1f} deg from the expected pose: outside the gate"
+        if scores["loosest_m"] > c.loosest_max_m:
+            return f"free along one direction: {scores['loosest_m']:.2f} m > {c.loosest_max_m} m"
+        return ""
+
+    def _free_space(self, target: Submap, probe: Submap, pose: Array, scores: dict[str, float]) -> str:
+        c, ranges = self._config.probes, self._atlas.ranges
+        forth = violation(probe, target, pose, ranges, self._laser)
+        back = violation(target, probe, inverse(pose), ranges, self._laser)
+        scores["violation"] = max(forth, back)
+        if scores["violation"] > c.violation_max:
+            return f"free space violated by {scores['violation']:.2f} > {c.violation_max}"
+        return ""
+
+
+def _peaks(scores: Array, headings: Array, offsets: Array, count: int) -> list[tuple[int, int, float]]:
+    """The best separated maxima of (H, T) scores."""
+    left, out = scores.copy(), []
+    for _ in range(count):
+        h, t = np.unravel_index(int(np.argmax(left)), left.shape)
+        if left[h, t] <= 0.0:
+            break
+        out.append((int(h), int(t), float(left[h, t])))
+        near_h = np.abs(wrap_angle(headings - headings[h])) < np.deg2rad(12.0)
+        near_t = np.hypot(*(offsets - offsets[t]).T) < 0.8
+        left[np.ix_(near_h, near_t)] = 0.0
+    return out
+
+
+def _distinct(found: list[Hypothesis]) -> list[Hypothesis]:
+    """Of hypotheses of one anchor that ran to the same pose, the first."""
+    out: list[Hypothesis] = []
+    for h in found:
+        same = [o for o in out if o.anchor == h.anchor]
+        gaps = [between(o.relative.delta, h.relative.delta) for o in same]
+        if not any(np.hypot(g[0], g[1]) < 0.3 and abs(g[2]) < 0.1 for g in gaps):
+            out.append(h)
+    return out

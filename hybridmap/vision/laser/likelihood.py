@@ -1,0 +1,110 @@
+"""Likelihood field of a cloud: for every cell near a wall its nearest point, and how likely a return is there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.geometry import Array
+from hybridmap.vision.laser.cloud import Cloud
+
+
+@dataclass(frozen=True, slots=True)
+class LikelihoodField:
+    """A grid about a cloud.
+
+    Attributes:
+        low: (2,) corner of cell (0, 0), m.
+        cell_m: side of a cell.
+        shape: cells in x and y.
+        margin: empty cells at each border, so that a clipped look-up meets nothing.
+        labels: (cells,) int32, 1 + index of the nearest point of the cloud within reach, 0 for none.
+        likelihood: (cells,) uint8, 255 exp(-d^2 / 2 sigma^2) of the distance d to that point.
+        points, normals: (1 + P, 2) of the cloud, a dummy in row 0.
+    """
+
+    low: Array
+    cell_m: float
+    shape: tuple[int, int]
+    margin: int
+    labels: NDArray[np.int32]
+    likelihood: NDArray[np.uint8]
+    points: Array
+    normals: Array
+
+    def cells(self, x: Array, y: Array) -> NDArray[np.int64]:
+        """Flat cell numbers of coordinates of any shape; those outside fall on the empty border."""
+        nx, ny = self.shape
+        column = ((x - self.low[0]) * (1.0 / self.cell_m)).clip(self.margin, nx - 1 - self.margin).astype(np.int64)
+        row = ((y - self.low[1]) * (1.0 / self.cell_m)).clip(self.margin, ny - 1 - self.margin).astype(np.int64)
+        return np.asarray(column * ny + row)
+
+
+def build_field(cloud: Cloud, cell_m: float, reach_m: float, sigma_m: float, search_m: float = 0.0) -> LikelihoodField:
+    """Grow every point with a normal into its surroundings, the far cells first so that the nearest point wins.
+
+    Args:
+        cloud: P points with normals.
+        cell_m: side of a cell.
+        reach_m: how far a point reaches.
+        sigma_m: width of the likelihood.
+        search_m: largest translation of the starts that will be scored on this field.
+    """
+    usable = np.flatnonzero((cloud.normals**2).sum(axis=1) > 0.5)
+    points, normals = cloud.points[usable], cloud.normals[usable]
+    reach, margin = int(np.ceil(reach_m / cell_m)), int(np.ceil(search_m / cell_m)) + 1
+    border = reach + 2 * margin + 1
+    if len(points) == 0:
+        points, normals = np.zeros((1, 2)), np.zeros((1, 2))
+    low = points.min(axis=0) - border * cell_m
+    cells = ((points - low) / cell_m).astype(np.int64)
+    nx, ny = (int(n) + border + 1 for n in cells.max(axis=0))
+    offsets, distance_m = _disc(reach, cell_m)
+    index = ((cells[:, 0] * ny + cells[:, 1])[None] + (offsets[:, 0] * ny + offsets[:, 1])[:, None]).ravel()
+    value = np.maximum(1.0, 255.0 * np.exp(-0.5 * (distance_m / sigma_m) ** 2)).astype(np.uint8)
+    labels, likelihood = np.zeros(nx * ny, np.int32), np.zeros(nx * ny, np.uint8)
+    labels[index] = np.tile(np.arange(1, len(points) + 1, dtype=np.int32), len(offsets))
+    likelihood[index] = np.repeat(value, len(points))
+    dummy = np.zeros((1, 2))
+    return LikelihoodField(
+        low, cell_m, (nx, ny), margin, labels, likelihood, np.concatenate([dummy, points]), np.concatenate([dummy, normals])
+    )
+
+
+def _disc(reach: int, cell_m: float) -> tuple[NDArray[np.int64], Array]:
+    """Cell offsets (O, 2) within reach and their length (O,) m, the longest first."""
+    side = np.arange(-reach, reach + 1)
+    offsets = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+    length = np.sqrt((offsets**2).sum(axis=1).astype(np.float64))
+    order = np.argsort(-length, kind="stable")
+    order = order[length[order] <= reach]
+    return offsets[order], length[order] * cell_m
+
+
+def score_starts(field: LikelihoodField, points: Array, center: Array, headings_rad: Array, offsets_m: Array) -> Array:
+    """Mean likelihood of points at every start of a grid.
+
+    Args:
+        field: the target.
+        points: (P, 2) in the moving frame.
+        center: (2,) about which the starts lie, m.
+        headings_rad: (H,) of the moving frame.
+        offsets_m: (T, 2) translations about the centre; at most the field's `search_m`.
+
+    Returns:
+        (H, T) in [0, 1].
+    """
+    ny = field.shape[1]
+    steps = np.round(offsets_m / field.cell_m).astype(np.int64)
+    shift = steps[:, 0] * ny + steps[:, 1]
+    cos, sin = np.cos(headings_rad)[:, None], np.sin(headings_rad)[:, None]
+    x = center[0] + cos * points[:, 0] - sin * points[:, 1]
+    y = center[1] + sin * points[:, 0] + cos * points[:, 1]
+    base = field.cells(x, y)
+    scores = np.empty((len(headings_rad), len(shift)))
+    for h in range(len(headings_rad)):
+        hits = field.likelihood.take(base[h][:, None] + shift[None])
+        scores[h] = hits.sum(axis=0, dtype=np.uint32)
+    return scores / (255.0 * max(len(points), 1))

@@ -1,0 +1,107 @@
+"""Re-proposal: nodes that lie near each other on the optimised map are registered again, finely."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.config.laser import LaserConfig
+from hybridmap.geometry import Array, RelativePose, between, inverse, invert_relative, wrap_angle
+from hybridmap.streams.base import Laser
+from hybridmap.vision.base import Belief
+from hybridmap.vision.laser.hypotheses import Hypothesis
+from hybridmap.vision.laser.likelihood import score_starts
+from hybridmap.vision.laser.registration import Prior, align
+from hybridmap.vision.laser.submap import Atlas, Submap
+from hybridmap.vision.laser.tracking import spaced
+from hybridmap.vision.laser.visibility import violation
+
+
+class Reviser:
+    """Rounds of re-proposal."""
+
+    def __init__(self, config: LaserConfig, atlas: Atlas, laser: Laser) -> None:
+        self._config = config
+        self._atlas = atlas
+        self._laser = laser
+        self._rounds = 0
+        self._done: set[tuple[int, int]] = set()
+
+    def round(self, belief: Belief) -> list[Hypothesis]:
+        """Register every pair that is due; empty once the configured rounds are over."""
+        if self._rounds >= self._config.revisits.rounds or len(self._atlas) == 0:
+            return []
+        self._rounds += 1
+        grid = self._grid()
+        found = []
+        for node in grid:
+            for other in self._partners(int(node), grid, belief.poses_map_node):
+                self._done.add((int(node), other))
+                found.append(self._register(int(node), other, belief.poses_map_node))
+        return found
+
+    def _grid(self) -> NDArray[np.int64]:
+        """Nodes about every so many metres of travel."""
+        travel = np.asarray(self._atlas.travel_m)
+        wanted = np.arange(0.0, travel[-1] + 1e-9, self._config.revisits.every_m)
+        return np.unique(np.searchsorted(travel, wanted).clip(0, len(travel) - 1))
+
+    def _partners(self, node: int, grid: NDArray[np.int64], poses: Array) -> list[int]:
+        """Nearest older node of each earlier pass, at most a few."""
+        c, travel = self._config.revisits, self._atlas.travel_m
+        old = grid[: np.searchsorted(grid, node)]
+        distance = np.hypot(*(poses[old, :2] - poses[node, :2]).T)
+        near = [int(i) for i in np.argsort(distance, kind="stable") if distance[i] < c.radius_m]
+        chosen: list[int] = []
+        for i in near:
+            other = int(old[i])
+            apart = [abs(travel[other] - travel[o]) > c.apart_m for o in chosen]
+            if travel[node] - travel[other] > c.apart_m and all(apart):
+                chosen.append(other)
+        return [o for o in chosen[: c.partners] if (node, o) not in self._done]
+
+    def _submap(self, node: int, half_m: float) -> NDArray[np.int64]:
+        travel = self._atlas.travel_m[node]
+        return self._atlas.along(travel - half_m, travel + half_m)
+
+    def _register(self, node: int, other: int, poses: Array) -> Hypothesis:
+        c, settings = self._config.revisits, self._config.registration
+        target = self._atlas.target(other, self._submap(other, c.target_half_m), 0.5)
+        probe = self._atlas.submap(node, self._submap(node, c.probe_half_m))
+        expected = between(poses[other], poses[node])
+        side = spaced(c.search_m, 0.15)
+        offsets = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+        headings = expected[2] + np.deg2rad(spaced(c.search_deg, 1.5))
+        scores = score_starts(target.coarse, probe.cloud.thinned(100).points, expected[:2], headings, offsets)
+        h, t = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        start = np.array([*(expected[:2] + offsets[t]), headings[h]])
+        prior = Prior(expected, 1.0 / np.array([1.0, 1.0, 0.2]) ** 2)
+        alignment = align(target.fine, probe.cloud.thinned(300), start[None], settings, prior)
+        covariance = alignment.covariance(0, settings, c.floor_m, np.deg2rad(c.floor_deg))
+        pose = alignment.poses[0]
+        figures = {
+            "near": float(alignment.near[0]),
+            "fit": float(alignment.fit[0]),
+            "off_m": float(np.hypot(*(pose - expected)[:2])),
+            "off_deg": float(np.rad2deg(abs(wrap_angle(pose[2] - expected[2])))),
+        }
+        refusal = self._refusal(figures) or self._free_space(target.submap, probe, pose, figures)
+        relative = invert_relative(RelativePose(pose, covariance))
+        return Hypothesis(node, other, relative, figures["near"] * figures["fit"], 0.0, figures, refusal)
+
+    def _refusal(self, figures: dict[str, float]) -> str:
+        c = self._config.probes
+        if figures["near"] < c.near_min:
+            return f"near {figures['near']:.2f} < {c.near_min}"
+        if figures["fit"] < c.fit_min:
+            return f"fit {figures['fit']:.2f} < {c.fit_min}"
+        if figures["off_m"] > 1.0 or figures["off_deg"] > 10.0:
+            return f"{figures['off_m']:.2f} m, {figures['off_deg']:.1f} deg from the map"
+        return ""
+
+    def _free_space(self, target: Submap, probe: Submap, pose: Array, figures: dict[str, float]) -> str:
+        limit, ranges = self._config.probes.violation_max, self._atlas.ranges
+        forth = violation(probe, target, pose, ranges, self._laser)
+        back = violation(target, probe, inverse(pose), ranges, self._laser)
+        figures["violation"] = max(forth, back)
+        return f"free space violated by {figures['violation']:.2f} > {limit}" if figures["violation"] > limit else ""

@@ -1,0 +1,134 @@
+"""Refined self-motion: each new node is registered to the submap of the last ones, with the odometry as prior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridmap.config.laser import LaserConfig
+from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, wrap_angle
+from hybridmap.vision.laser.cloud import Cloud, merged
+from hybridmap.vision.laser.likelihood import LikelihoodField, build_field, score_starts
+from hybridmap.vision.laser.registration import Alignment, Prior, align
+from hybridmap.vision.laser.submap import Atlas
+
+SCORED_POINTS = 90
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """The motion from one node to the next, as the scans have it.
+
+    Attributes:
+        relative: pose of the new node in the frame of the one before; the odometry's where nothing was measured.
+        measured: whether it comes from a registration.
+        contradicts_odometry: a good registration says that the odometry is wrong.
+        inliers, fit: of the registration.
+        reason: one line for people.
+    """
+
+    relative: RelativePose
+    measured: bool
+    contradicts_odometry: bool
+    inliers: float
+    fit: float
+    reason: str
+
+
+class Tracker:
+    """Registers each new node to the submap of the last ones."""
+
+    def __init__(self, config: LaserConfig, atlas: Atlas) -> None:
+        self._config = config
+        self._atlas = atlas
+
+    def step(self, cloud: Cloud, odometry: RelativePose, between_nodes: Callable[[], Iterable[tuple[Array, Cloud]]]) -> Step:
+        """Say how the robot moved from the last node of the atlas to a new one.
+
+        Args:
+            cloud: scan of the new node.
+            odometry: its pose in the frame of the last node.
+            between_nodes: gives, in order, the scans between the two: motion since the last node and cloud.
+        """
+        field = self._field()
+        alignment = self._search(field, cloud, odometry.delta)
+        if alignment.inliers[0] < self._config.tracking.inliers_min:
+            stepped = self._step_by_step(field, cloud, odometry.delta, between_nodes())
+            if stepped.inliers[0] > alignment.inliers[0]:
+                alignment = stepped
+        return self._judge(alignment, odometry)
+
+    def _field(self, extra: Sequence[Cloud] = ()) -> LikelihoodField:
+        settings, n = self._config.registration, len(self._atlas)
+        nodes = range(max(n - self._config.tracking.submap_nodes, 0), n)
+        cloud = self._atlas.submap(n - 1, nodes).cloud
+        if extra:
+            cloud = merged([cloud, *extra], self._config.scan.cell_m)
+        search = self._config.tracking.wide_m + 2 * self._config.scan.cell_m
+        return build_field(cloud, self._config.scan.cell_m, settings.reach_m, settings.field_sigma_m, search)
+
+    def _search(self, field: LikelihoodField, cloud: Cloud, expected: Array) -> Alignment:
+        """Narrow first; wide when that is weak or disagrees with the odometry, and then whichever has more inliers."""
+        c = self._config.tracking
+        narrow = self._grid(field, cloud, expected, c.narrow_m, c.narrow_deg, c.prior_deg)
+        if narrow.inliers[0] >= c.inliers_min and not self._contradicts(narrow.poses[0], expected):
+            return narrow
+        wide = self._grid(field, cloud, expected, c.wide_m, c.wide_deg, c.wide_prior_deg)
+        return wide if wide.inliers[0] > narrow.inliers[0] + 0.03 else narrow
+
+    def _grid(
+        self, field: LikelihoodField, cloud: Cloud, expected: Array, half_m: float, half_deg: float, prior_deg: float
+    ) -> Alignment:
+        c = self._config.tracking
+        headings = np.deg2rad(spaced(half_deg, 2.0))
+        side = spaced(half_m, 0.1)
+        offsets = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+        scores = score_starts(field, cloud.thinned(SCORED_POINTS).points, expected[:2], expected[2] + headings, offsets)
+        scores -= 0.05 * (headings[:, None] / np.deg2rad(prior_deg)) ** 2
+        scores -= 0.05 * ((offsets / (2 * c.prior_m)) ** 2).sum(axis=1)[None]
+        h, t = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        start = np.array([*(expected[:2] + offsets[t]), expected[2] + headings[h]])
+        prior = Prior(expected, 1.0 / np.array([c.prior_m, c.prior_m, np.deg2rad(prior_deg)]) ** 2)
+        return align(field, cloud, start[None], self._config.registration, prior)
+
+    def _step_by_step(
+        self, field: LikelihoodField, cloud: Cloud, odometry: Array, between_nodes: Iterable[tuple[Array, Cloud]]
+    ) -> Alignment:
+        """Register the scans between the nodes one by one, each becoming part of the submap of the next."""
+        pose, last = IDENTITY, IDENTITY
+        seen: list[Cloud] = []
+        for motion, scan in between_nodes:
+            alignment = self._search(field, scan, compose(pose, between(last, motion)))
+            pose, last = alignment.poses[0], motion
+            if alignment.inliers[0] >= self._config.tracking.inliers_weak:
+                seen.append(scan.moved(pose))
+                field = self._field(seen)
+        return self._search(field, cloud, compose(pose, between(last, odometry)))
+
+    def _contradicts(self, pose: Array, expected: Array) -> bool:
+        c = self._config.tracking
+        off_m = float(np.hypot(*(pose - expected)[:2]))
+        return off_m > c.contradiction_m or abs(wrap_angle(pose[2] - expected[2])) > np.deg2rad(c.contradiction_deg)
+
+    def _judge(self, alignment: Alignment, odometry: RelativePose) -> Step:
+        c = self._config.tracking
+        pose, inliers, fit = alignment.poses[0], float(alignment.inliers[0]), float(alignment.fit[0])
+        off_m = float(np.hypot(*(pose - odometry.delta)[:2]))
+        if inliers < c.inliers_weak:
+            return Step(odometry, False, False, inliers, fit, f"inliers {inliers:.2f} < {c.inliers_weak}: odometry kept")
+        if off_m > c.translation_max_m and inliers < c.inliers_min:
+            return Step(odometry, False, False, inliers, fit, f"{off_m:.2f} m from the odometry > {c.translation_max_m} m")
+        covariance = alignment.covariance(0, self._config.registration, c.floor_m, np.deg2rad(c.floor_deg))
+        if inliers < c.inliers_min:
+            covariance = covariance + np.diag([0.05**2, 0.05**2, np.deg2rad(1.5) ** 2])
+        wrong = inliers >= c.inliers_min and self._contradicts(pose, odometry.delta)
+        reason = "contradicts the odometry" if wrong else "agrees with the odometry"
+        return Step(RelativePose(pose, covariance), True, wrong, inliers, fit, f"inliers {inliers:.2f}, {reason}")
+
+
+def spaced(half: float, step: float) -> Array:
+    """Numbers from -half to half, at most `step` apart, 0 among them."""
+    count = int(np.ceil(half / step))
+    return np.linspace(-half, half, 2 * count + 1)
