@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, compose, yaw_from_quaternion
 from hybridmap.streams.bagfile import BagFile, RawMessage
-from hybridmap.streams.mounting import TransformTree, clean_frame, matrix, planar
+from hybridmap.streams.mounting import TransformTree, clean_frame, matrix
 from hybridmap.streams.order import sorted_order
 from hybridmap.streams.topics import ODOMETRY, TRANSFORM, is_static
 from hybridmap.trajectory import Trajectory, format_stamp
@@ -143,11 +143,3 @@ def _take_transforms(index: BagIndex, bag: BagFile, message: RawMessage, odom_fr
             raise StreamError(f"{what}: found {values}, expected a finite translation and a rotation")
         T = matrix((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
         index.transforms.add(parent, child, T, static=is_static(message.topic))
-
-
-def fixed_pose(tree: TransformTree, from_frame: str, to_frame: str) -> Array | None:
-    """(3,) planar pose of one frame in another that it is fixed to; None where they are not joined or are the same."""
-    if from_frame == to_frame:
-        return None
-    T = tree.between(from_frame, to_frame)
-    return None if T is None else planar(T)

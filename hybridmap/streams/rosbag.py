@@ -2,36 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hybridmap.config.root import Config
 from hybridmap.errors import StreamError
+from hybridmap.geometry import Array
 from hybridmap.streams.bagfile import BagFile
-from hybridmap.streams.bagindex import PoseTrack, build_index, fixed_pose
-from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion, StreamReport
-from hybridmap.streams.mounting import clean_frame, laser_pose
-from hybridmap.streams.order import Window, merge, sorted_order
-from hybridmap.streams.scans import ScanDecoder
+from hybridmap.streams.bagindex import PoseTrack, build_index
+from hybridmap.streams.bagsensors import MessageKey, SensorPlan, plan_frames, plan_scans
+from hybridmap.streams.base import Sample, SelfMotion, StreamReport
+from hybridmap.streams.mounting import clean_frame, planar
+from hybridmap.streams.order import Window, merge
 from hybridmap.streams.topics import CAMERA_INFO, IMAGE, ODOMETRY, SCAN, TRANSFORM, select
 from hybridmap.trajectory import Trajectory
 
 _READ = ODOMETRY + SCAN + IMAGE + CAMERA_INFO + TRANSFORM
-
-_Key = tuple[str, int]
-
-
-@dataclass(frozen=True, slots=True)
-class _Planned:
-    """An observation that is to come: its stamp, and the messages it is made of."""
-
-    stamp_ns: int
-    needs: tuple[_Key, ...]
-    decode: Callable[[int, tuple[Any, ...]], Observation]
 
 
 class BagStream:
@@ -56,12 +43,12 @@ class BagStream:
         self.selection = select(self._bag.topics, self._sensors, self._index.frame_of, str(path))
         self._fixed_remarks = list(self.selection.remarks)
         track, what = self._self_motion()
-        self._base_frame = clean_frame(self._sensors.base_frame or track.child or "base_link")
-        carry = fixed_pose(self._index.transforms, track.child, self._base_frame)
+        self._base_frame = self._choose_base(track)
+        carry = self._carry(track, what)
         self._motion_ns, self._motion_poses = track.sorted(what, carry)
-        self._scan_decoder: ScanDecoder | None = None
-        self._planned, self._losses = self._plan_observations()
-        self.rig = self._rig()
+        self._plan_made = self._plan()
+        self._planned, self.rig = self._plan_made.planned, self._plan_made.rig
+        self._fixed_remarks += self._plan_made.remarks
         self._apply(window or Window())
         self.report = StreamReport()
 
@@ -82,12 +69,12 @@ class BagStream:
         Raises:
             StreamError: a message is damaged; the message names topic and place.
         """
-        self.report = StreamReport(dict(self._losses), list(self._fixed_remarks))
+        self.report = StreamReport(dict(self._plan_made.losses), list(self._fixed_remarks))
         for sample in merge(self._motions(), self._observations()):
             self.report.count("odometry" if isinstance(sample, SelfMotion) else "observations")
             yield sample
-        if self._scan_decoder is not None and self._scan_decoder.resampled:
-            self.report.counts["scans with other beams"] = self._scan_decoder.resampled
+        if self._plan_made.decode is not None:
+            self.report.counts |= self._plan_made.decode.counts
 
     def _motions(self) -> Iterator[Sample]:
         for stamp, pose in zip(self._motion_ns, self._motion_poses, strict=True):
@@ -96,18 +83,19 @@ class BagStream:
     def _observations(self) -> Iterator[Sample]:
         """Second pass: read on until the messages of the next planned observation have come."""
         needed = {key for planned in self._planned for key in planned.needs}
-        waiting: dict[_Key, Any] = {}
+        waiting: dict[MessageKey, Any] = {}
         upcoming = iter(self._planned)
-        planned = next(upcoming, None)
-        if planned is None:
+        planned, decode = next(upcoming, None), self._plan_made.decode
+        if planned is None or decode is None:
             return
+        decode.counts.clear()
         for message in self._bag.raw(sorted({topic for topic, _ in needed})):
             key = (message.topic, message.number)
             if key in needed:
                 waiting[key] = message
             while planned is not None and all(key in waiting for key in planned.needs):
                 parts = tuple(self._bag.decode(waiting.pop(key)) for key in planned.needs)
-                yield planned.decode(planned.stamp_ns, parts)
+                yield decode(planned.stamp_ns, parts)
                 planned = next(upcoming, None)
             if planned is None:
                 return
@@ -118,7 +106,9 @@ class BagStream:
         if chosen.odometry is not None:
             return self._index.odometry[chosen.odometry], f"{self._bag.path}: {chosen.odometry}"
         odom = clean_frame(self._sensors.odom_frame)
-        tracks = [self._index.tf_tracks[key] for key in sorted(self._index.tf_tracks)] if chosen.odometry_tf else []
+        known = self._index.tf_tracks.values() if chosen.odometry_tf else ()
+        base = clean_frame(self._sensors.base_frame or "")
+        tracks = sorted(known, key=lambda track: (track.child != base, -len(track.stamps_ns), track.child))
         if not tracks:
             types = ", ".join(f"{topic.name} ({topic.msgtype.replace('/msg/', '/')})" for topic in self._bag.topics) or "none"
             raise StreamError(
@@ -128,34 +118,30 @@ class BagStream:
         self._fixed_remarks.append(f"no Odometry topic: self-motion from the transform {tracks[0].parent} -> {tracks[0].child}")
         return tracks[0], f"{self._bag.path}: transform {tracks[0].parent} -> {tracks[0].child}"
 
-    def _plan_observations(self) -> tuple[list[_Planned], dict[str, int]]:
-        wanted = self._config.vision.sensor
+    def _choose_base(self, track: PoseTrack) -> str:
+        """Frame that is mapped: the configured one, else the one that the odometry moves, else a usual name."""
+        named = clean_frame(self._sensors.base_frame or "") or track.child
+        usual = (frame for frame in ("base_link", "base_footprint") if frame in self._index.transforms.frames)
+        return named or next(usual, "base_link")
+
+    def _carry(self, track: PoseTrack, what: str) -> Array | None:
+        """(3,) pose of the base in the frame that the odometry moves; None where they are the same."""
+        if track.child in ("", self._base_frame):
+            return None
+        T = self._index.transforms.require(track.child, self._base_frame, what, "another sensors.base_frame")
+        return planar(T)
+
+    def _plan(self) -> SensorPlan:
+        wanted, chosen, source = self._config.vision.sensor, self.selection, str(self._bag.path)
         if wanted == "none":
-            return [], {}
-        if self.selection.scan is not None and wanted in ("laser", "auto"):
-            return self._plan_scans(self.selection.scan), {}
+            return SensorPlan()
+        if wanted in ("laser", "auto") and chosen.scan is not None:
+            return plan_scans(chosen.scan, self._index, self._base_frame, self._sensors, source)
         if wanted == "laser":
-            raise StreamError(f"{self._bag.path}: no laser: expected a topic of type sensor_msgs/LaserScan")
-        return [], {}
-
-    def _plan_scans(self, topic: str) -> list[_Planned]:
-        what = f"{self._bag.path}: {topic}"
-        mounting = self._sensors.laser_mounting
-        if mounting is not None:
-            pose, upside_down = np.array([mounting.x_m, mounting.y_m, mounting.yaw_rad]), mounting.upside_down
-        else:
-            T = self._index.transforms.require(self._base_frame, self._index.frame_of(topic), what, "sensors.laser_mounting")
-            pose, upside_down = laser_pose(T, what)
-        decoder = ScanDecoder(self._index.first[topic], pose, upside_down, self._sensors, what)
-        self._scan_decoder = decoder
-        stamps = np.asarray(self._index.stamps_ns[topic], dtype=np.int64)
-        return [
-            _Planned(int(stamps[i]), ((topic, int(i)),), lambda stamp, parts: decoder(parts[0], stamp))
-            for i in sorted_order(stamps, what)
-        ]
-
-    def _rig(self) -> Rig:
-        return Rig(laser=None if self._scan_decoder is None else self._scan_decoder.laser)
+            raise StreamError(f"{source}: no laser: expected a topic of type sensor_msgs/LaserScan")
+        if wanted == "auto" and chosen.color is None and chosen.depth is None:
+            return SensorPlan(remarks=["neither scans nor colour and depth pictures: self-motion alone"])
+        return plan_frames(chosen, self._index, self._base_frame, self._sensors, source)
 
     def _apply(self, window: Window) -> None:
         starts = [int(self._motion_ns[0])] + [planned.stamp_ns for planned in self._planned[:1]]

@@ -39,10 +39,11 @@ class ScanDecoder:
         self._shape = self._layout(first)
         low, high = self._limits(first)
         self.laser = Laser(bearings[::-1].copy() if self._reversed else bearings, low, high, pose_base_laser)
-        self.resampled = 0
+        self.counts: dict[str, int] = {}
 
-    def __call__(self, message: Any, stamp_ns: int) -> LaserScan:
+    def __call__(self, stamp_ns: int, parts: tuple[Any, ...]) -> LaserScan:
         """Decode one message; beams without a valid return become NaN."""
+        (message,) = parts
         ranges = np.array(message.ranges, dtype=np.float32)
         low, high = self._limits(message)
         with np.errstate(invalid="ignore"):
@@ -71,7 +72,7 @@ class ScanDecoder:
 
     def _resample(self, message: Any, ranges: NDArray[np.float32]) -> NDArray[np.float32]:
         """Nearest beam within half a step of each of the first scan's bearings."""
-        self.resampled += 1
+        self.counts["scans with other beams"] = self.counts.get("scans with other beams", 0) + 1
         out = np.full(len(self.laser.bearings_rad), np.nan, dtype=np.float32)
         bearings = self._bearings(message)
         if len(bearings) < 2:
