@@ -1,0 +1,176 @@
+"""What a simulated world is made of: painted rectangles, and the boxes, panels and partitions put together from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybridmap.geometry import Array
+
+Paint = Callable[[np.random.Generator, tuple[int, int], float], NDArray[np.uint8]]
+"""`(generator, (height_px, width_px), px_per_m)` -> (height_px, width_px, 3) uint8, RGB, row 0 at the top."""
+
+UP: Array = np.array([0.0, 0.0, 1.0])
+DOOR_HEIGHT_M = 2.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """A painted rectangle; it faces the side to which `along x up` points.
+
+    Attributes:
+        corner: (3,) lower left corner seen from the front, m.
+        along: (3,) edge from there to the right, m.
+        up: (3,) edge from there upwards, m.
+        paint: draws its texture.
+        px_per_m: texels a metre.
+        glow: light given off, arbitrary unit; 0 for all but lamps and windows.
+        decal: so thin that it casts no shadow (posters, doors).
+        in_depth: whether a depth camera gets its light back (not from glass and screens).
+    """
+
+    corner: Array
+    along: Array
+    up: Array
+    paint: Paint
+    px_per_m: float = 100.0
+    glow: float = 0.0
+    decal: bool = False
+    in_depth: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class World:
+    """A furnished building and the drive through it.
+
+    Attributes:
+        name: what it is called on the command line.
+        surfaces: everything that can be seen.
+        legs: way points (N, 2), m, of each leg; between legs the robot stops and turns on the spot.
+        texture_seed: fixes the detail of the textures, whatever the seed of the noise.
+    """
+
+    name: str
+    surfaces: tuple[Surface, ...]
+    legs: tuple[Array, ...]
+    texture_seed: int = 1
+    notes: str = field(default="")
+
+
+def _direction(yaw_rad: float) -> Array:
+    return np.array([np.cos(yaw_rad), np.sin(yaw_rad), 0.0])
+
+
+def box(
+    center: Sequence[float],
+    size: Sequence[float],
+    paint: Paint,
+    *,
+    bottom_m: float = 0.0,
+    yaw_deg: float = 0.0,
+    faces: Mapping[str, Paint] | None = None,
+    px_per_m: float = 100.0,
+) -> list[Surface]:
+    """An upright box.
+
+    Args:
+        center: x and y of its middle, m.
+        size: extent along its own x (front to back), y and z, m.
+        paint: of every face that `faces` does not name.
+        bottom_m: height of its lower face; on the floor there is none.
+        yaw_deg: direction of its own x axis.
+        faces: paints of `front` (+x), `back`, `left` (+y), `right`, `top`, `bottom`.
+        px_per_m: texels a metre.
+    """
+    ex = _direction(np.deg2rad(yaw_deg)) * size[0]
+    ey = _direction(np.deg2rad(yaw_deg + 90.0)) * size[1]
+    ez = UP * size[2]
+    low = np.array([center[0], center[1], bottom_m]) - 0.5 * (ex + ey)
+    rectangles = {
+        "front": (low + ex, ey, ez),
+        "back": (low + ey, -ey, ez),
+        "left": (low + ex + ey, -ex, ez),
+        "right": (low, ex, ez),
+        "top": (low + ez, ex, ey),
+        "bottom": (low, ey, ex),
+    }
+    if bottom_m <= 0.0:
+        del rectangles["bottom"]
+    paints = faces or {}
+    return [Surface(*edges, paints.get(name, paint), px_per_m) for name, edges in rectangles.items()]
+
+
+def panel(
+    middle: Sequence[float],
+    yaw_deg: float,
+    size: Sequence[float],
+    paint: Paint,
+    *,
+    px_per_m: float = 200.0,
+    stand_off_m: float = 0.012,
+    glow: float = 0.0,
+    in_depth: bool = True,
+) -> Surface:
+    """A thin upright rectangle, such as a poster, facing `yaw_deg`.
+
+    Args:
+        middle: x, y and the height of its lower edge, m: a point of the wall that carries it.
+        yaw_deg: where it faces.
+        size: width and height, m.
+        paint: its texture.
+        px_per_m: texels a metre.
+        stand_off_m: distance from the wall.
+        glow: light given off.
+        in_depth: whether a depth camera sees it.
+    """
+    yaw = np.deg2rad(yaw_deg)
+    right = _direction(yaw + 0.5 * np.pi) * size[0]
+    corner = np.asarray(middle, dtype=np.float64) + stand_off_m * _direction(yaw) - 0.5 * right
+    return Surface(corner, right, UP * size[1], paint, px_per_m, glow=glow, decal=True, in_depth=in_depth)
+
+
+def slab(
+    low: Sequence[float], high: Sequence[float], height_m: float, paint: Paint, *, facing_up: bool, glow: float = 0.0
+) -> Surface:
+    """A horizontal rectangle: floor, ceiling or lamp."""
+    corner = np.array([low[0], low[1], height_m])
+    ex, ey = np.array([high[0] - low[0], 0.0, 0.0]), np.array([0.0, high[1] - low[1], 0.0])
+    along, up = (ex, ey) if facing_up else (ey, ex)
+    return Surface(corner, along, up, paint, px_per_m=80.0, glow=glow, decal=glow > 0.0)
+
+
+def partition(
+    start: ArrayLike,
+    end: ArrayLike,
+    paint: Paint,
+    *,
+    openings: Sequence[tuple[float, float]] = (),
+    height_m: float = 2.6,
+    thickness_m: float = 0.12,
+) -> list[Surface]:
+    """A straight wall with door openings; above an opening it goes on.
+
+    Args:
+        start: (2,) m.
+        end: (2,) m.
+        paint: of its faces.
+        openings: begin and end of each, metres from `start`, in order.
+        height_m: of the ceiling.
+        thickness_m: of the wall.
+    """
+    first, last = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    length = float(np.linalg.norm(last - first))
+    direction = (last - first) / length
+    yaw_deg = float(np.rad2deg(np.arctan2(direction[1], direction[0])))
+    edges = [0.0, *[edge for opening in openings for edge in opening], length]
+    out: list[Surface] = []
+    for index, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        if b - a < 1e-6:
+            continue
+        bottom = DOOR_HEIGHT_M if index % 2 else 0.0
+        middle = first + 0.5 * (a + b) * direction
+        out += box(middle, (b - a, thickness_m, height_m - bottom), paint, bottom_m=bottom, yaw_deg=yaw_deg)
+    return out
