@@ -29,6 +29,4 @@ def evaluate(
     from hybridmap.store import SessionFolder
 
     metrics = evaluate_session(folder, reference, relations)
-    session = SessionFolder(folder)
-    session.merge_metrics(metrics)
-    emit(session.read_metrics().head, metrics, as_json=as_json, title=str(folder))
+    emit(SessionFolder(folder).read_metrics().head, metrics, as_json=as_json, title=str(folder))

@@ -18,7 +18,7 @@ _ONLINE = "_online"
 
 
 def evaluate_session(folder: Path, reference: Path | None = None, relations: Path | None = None) -> list[Metric]:
-    """Evaluate odometry and every back-end of a session, final and online.
+    """Evaluate odometry and every back-end of a session, final and online, and put the figures into its `metrics.json`.
 
     Args:
         folder: the session folder.
@@ -51,6 +51,7 @@ def evaluate_session(folder: Path, reference: Path | None = None, relations: Pat
             metrics += _against_relations(name, trajectory, verified)
     for name, errors in closures.items():
         metrics += _closure_metrics(name, errors)
+    session.merge_metrics(metrics)
     return metrics
 
 

@@ -122,7 +122,7 @@ class MapStore:
             measured = (*_floats(edge.relative.delta), codec.pack_floats(edge.relative.covariance))
         scores = json.dumps({name: float(score) for name, score in edge.scores.items()})
         kind, status = EdgeKind(edge.kind).name.lower(), str(edge.status)
-        row = (number, int(edge.source), int(edge.target), kind, status, edge.reason, *measured, scores, edge.since_node)
+        row = (number, int(edge.source), int(edge.target), kind, status, edge.reason, *measured, scores, int(edge.since_node))
         self._write(f"INSERT OR REPLACE INTO edges VALUES ({_marks(len(row))})", row)
 
     def add_track(self, stamp_ns: int, node: int, delta_node_robot: Array, pose_odom: Array) -> None:

@@ -158,11 +158,18 @@ class SessionFolder:
         return MetricsFile(tree, metrics)
 
     def merge_metrics(self, metrics: Iterable[Metric]) -> None:
-        """Put figures into `metrics.json`: of the same name the new one counts, others stay; order is kept."""
+        """Put figures into `metrics.json`: of the same name the new one counts, others stay; order is kept.
+
+        Raises:
+            StoreError: the file is damaged or cannot be written.
+        """
         before = self.read_metrics()
         rows = {metric.name: metric for metric in before.metrics}
         rows |= {metric.name: metric for metric in metrics}
-        self.write_metrics(before.head, rows.values())
+        try:
+            self.write_metrics(before.head, rows.values())
+        except OSError as error:
+            raise StoreError(f"{self.metrics_json}: cannot be written: {error.strerror}") from None
 
     def write_trajectory(self, name: str, trajectory: Trajectory) -> None:
         """Write an estimate: `odometry`, `<backend>` or `<backend>_online`."""

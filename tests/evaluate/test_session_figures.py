@@ -6,6 +6,7 @@ import pytest
 from hybridmap.errors import EvaluationError, StoreError, StreamError
 from hybridmap.evaluate import evaluate_session
 from hybridmap.geometry import between
+from hybridmap.store import SessionFolder
 from hybridmap.trajectory import read_tum
 from tests.store.sessions import SECOND, ring_map, truth_at, write_session
 
@@ -37,7 +38,9 @@ def test_every_figure_is_there_for_odometry_and_back_end(folder):
     assert figures["loop_precision/graph"].value == pytest.approx(48 / 49)
     assert figures["loop_recall/gtsam-lm"].value == 1.0
     assert figures["relation_rot_mean/gtsam-lm"].unit == "deg"
-    assert len(figures) == len(evaluate_session(folder, None, folder / "relations.txt"))
+    stored = SessionFolder(folder).read_metrics()
+    assert [metric.name for metric in stored.metrics] == list(figures)
+    assert stored.head["primary_backend"] == "gtsam-lm"
 
 
 def test_killed_session_is_evaluated_from_its_map_file(tmp_path):

@@ -34,6 +34,7 @@ def test_map_comes_back_with_every_edge_and_the_same_hash(tmp_path):
             new.reason,
         )
         assert dict(old.scores) == dict(new.scores)
+        assert old.since_node == new.since_node
         assert (old.relative is None) == (new.relative is None)
     for old, new in zip(before.nodes, after.nodes, strict=True):
         assert (old.stamp_ns, old.template, old.travel_m) == (new.stamp_ns, new.template, new.travel_m)
