@@ -1,1 +1,5 @@
-"""report."""
+"""One self-contained page per session: the map, its errors, its corrections, its loop closures and its figures."""
+
+from hybridmap.report.page import write_report
+
+__all__ = ["write_report"]

@@ -1,0 +1,99 @@
+"""Error over time: against the truth where it is known, else against the final map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hybridmap.geometry import Array, wrap_angle
+from hybridmap.graph.experience_map import Status
+from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.report import style
+from hybridmap.report.scene import ODOMETRY, ONLINE, Scene
+from hybridmap.trajectory import NS_PER_S
+
+_FLOOR_M, _FLOOR_DEG = 1e-3, 1e-2
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorSeries:
+    """One back-end's error over time.
+
+    Attributes:
+        time_s: (P,) since the beginning of the recording.
+        position_m, heading_deg: (P,) absolute errors.
+    """
+
+    time_s: Array
+    position_m: Array
+    heading_deg: Array
+
+
+def error_series(scene: Scene) -> dict[str, ErrorSeries]:
+    """Name -> error: of every back-end's final trajectory and of the primary's online one, against the truth.
+
+    Without a truth: of odometry and of what each back-end believed at the time, against the primary's final trajectory.
+    """
+    start_ns = scene.estimates[ODOMETRY].stamps_ns[0]
+    if scene.truth is not None:
+        wanted = [*scene.backends, scene.primary + ONLINE]
+        return {
+            name: _series(pairs.stamps_ns - start_ns, pairs.estimate, pairs.reference)
+            for name, pairs in ((name, scene.pairs[name]) for name in wanted if name in scene.pairs)
+        }
+    final = scene.estimates.get(scene.primary)
+    if final is None or scene.primary == ODOMETRY:
+        return {}
+    wanted = [ODOMETRY, *(name + ONLINE for name in scene.backends if name != ODOMETRY)]
+    return {
+        name: _series(estimate.stamps_ns - start_ns, estimate.poses, final.at(estimate.stamps_ns))
+        for name, estimate in ((name, scene.estimates[name]) for name in wanted if name in scene.estimates)
+    }
+
+
+def error_figure(scene: Scene) -> str | None:
+    """Position and heading error over time, with a mark at every accepted loop; a `data:` URI, None without anything."""
+    series = error_series(scene)
+    if not series:
+        return None
+    styles = style.line_styles(scene.backends)
+    with style.figure(9.6, 5.0) as picture:
+        position, heading = picture.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        for name, errors in series.items():
+            looks = dict(styles[name.removesuffix(ONLINE)])
+            if name.endswith(ONLINE) and scene.truth is not None:
+                looks |= {"linewidth": 0.8, "alpha": 0.6, "zorder": 3, "linestyle": "solid"}
+            label = name.replace(ONLINE, ", as believed at the time")
+            step = max(1, len(errors.time_s) // 2500)
+            position.plot(errors.time_s[::step], np.maximum(errors.position_m, _FLOOR_M)[::step], label=label, **looks)
+            heading.plot(errors.time_s[::step], np.maximum(errors.heading_deg, _FLOOR_DEG)[::step], **looks)
+        _mark_loops(scene, position)
+        against = "ground truth" if scene.truth is not None else "final map"
+        for axes, what in ((position, "position error (m)"), (heading, "heading error (deg)")):
+            axes.set_yscale("log")
+            axes.set_ylabel(what)
+            axes.grid(True, linewidth=0.5)
+        heading.set_xlabel(f"time since the start (s); errors against the {against}")
+        picture.legend(loc="outside upper left", ncols=4)
+        return style.svg_uri(picture)
+
+
+def _series(since_start_ns: Any, estimate: Array, reference: Array) -> ErrorSeries:
+    offset = estimate[:, :2] - reference[:, :2]
+    turned = np.degrees(np.abs(wrap_angle(estimate[:, 2] - reference[:, 2])))
+    return ErrorSeries(np.asarray(since_start_ns / NS_PER_S), np.hypot(offset[:, 0], offset[:, 1]), turned)
+
+
+def _mark_loops(scene: Scene, axes: Any) -> None:
+    nodes = scene.experiences.nodes
+    start_ns = scene.estimates[ODOMETRY].stamps_ns[0]
+    loops = (e for e in scene.experiences.edges if e.kind is EdgeKind.LOOP and e.status is Status.ACCEPTED)
+    times = sorted({(nodes[e.source].stamp_ns - start_ns) / NS_PER_S for e in loops})
+    if times:
+        at_bottom = axes.get_xaxis_transform()
+        axes.plot(
+            times, np.full(len(times), 0.015), transform=at_bottom, linestyle="none", marker="|", markersize=7,
+            color=style.ACCEPTED, label="loop accepted", zorder=7,
+        )  # fmt: skip

@@ -1,0 +1,101 @@
+"""The map: trajectories of every back-end over the truth, and the graph with its loops by what became of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from hybridmap.graph.experience_map import Edge, Status
+from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.report import style
+from hybridmap.report.outline import Raster
+from hybridmap.report.scene import Scene
+
+
+def trajectories_figure(scene: Scene, building: Raster | None) -> str:
+    """Every back-end's trajectory over the truth and over what the primary back-end's map shows; a `data:` URI."""
+    shown = [scene.estimates[name].poses for name in scene.backends if name in scene.estimates]
+    shown += [scene.truth.poses] if scene.truth is not None else []
+    with style.figure(*_size(np.concatenate(shown)[:, :2], building)) as picture:
+        axes = picture.add_subplot()
+        style.draw_building(axes, building)
+        if scene.truth is not None:
+            poses = style.thinned(scene.truth.poses)
+            axes.plot(poses[:, 0], poses[:, 1], color=style.TRUTH, linewidth=3.2, alpha=0.28, label="ground truth", zorder=3)
+        styles = style.line_styles(scene.backends)
+        for name in scene.backends:
+            if name in scene.estimates:
+                poses = style.thinned(scene.estimates[name].poses)
+                label = f"{name} (primary)" if name == scene.primary else name
+                axes.plot(poses[:, 0], poses[:, 1], label=label, **styles[name])
+        start = scene.estimates.get(scene.primary, scene.estimates["odometry"]).poses[0]
+        axes.plot(*start[:2], marker="o", markersize=7, color="white", markeredgecolor="black", zorder=8, label="start")
+        style.metric_axes(axes)
+        picture.legend(loc="outside upper left", ncols=4)
+        return style.svg_uri(picture)
+
+
+def graph_figure(scene: Scene, building: Raster | None) -> str:
+    """Nodes at the primary back-end's poses, chain, and loops by their fate; a `data:` URI."""
+    with style.figure(*_size(scene.nodes[:, :2], building)) as picture:
+        axes = picture.add_subplot()
+        style.draw_building(axes, building, darkness=0.25)
+        chain = [e for e in scene.experiences.edges if e.kind is not EdgeKind.LOOP and e.status is Status.ACCEPTED]
+        _draw_edges(axes, scene, chain, color="#9a9a9a", linewidth=0.8, zorder=2)
+        loops = loops_by_fate(scene)
+        for fate, looks in _FATES.items():
+            _draw_edges(axes, scene, loops[fate], label=f"{fate} ({len(loops[fate])})", **looks)
+        axes.plot(
+            scene.nodes[:, 0], scene.nodes[:, 1], linestyle="none", marker=".", markersize=3.5, color="#222222",
+            label=f"nodes ({len(scene.nodes)})", zorder=6,
+        )  # fmt: skip
+        style.metric_axes(axes)
+        picture.legend(loc="outside upper left", ncols=3)
+        return style.svg_uri(picture)
+
+
+_FATES: dict[str, dict[str, Any]] = {
+    "loops accepted": {"color": style.ACCEPTED, "linewidth": 1.6, "zorder": 5},
+    "accepted, no weight in the primary back-end": {
+        "color": style.UNWEIGHTED,
+        "linewidth": 1.6,
+        "linestyle": (0, (3, 1)),
+        "zorder": 5,
+    },
+    "loops pending": {"color": style.PENDING, "linewidth": 1.1, "linestyle": (0, (4, 2)), "zorder": 4},
+    "loops rejected": {"color": style.REJECTED, "linewidth": 0.7, "linestyle": (0, (1, 1.5)), "alpha": 0.55, "zorder": 3},
+}
+
+
+def loops_by_fate(scene: Scene) -> dict[str, list[Edge]]:
+    """Every loop that was considered, by what became of it, in the order of the legend."""
+    report = scene.reports.get(scene.primary)
+    unweighted = set(report.rejected_edge_ids) if report is not None else set()
+    found: dict[str, list[Edge]] = {fate: [] for fate in _FATES}
+    for number, edge in enumerate(scene.experiences.edges):
+        if edge.kind is not EdgeKind.LOOP:
+            continue
+        if edge.status is Status.ACCEPTED:
+            fate = "accepted, no weight in the primary back-end" if number in unweighted else "loops accepted"
+        else:
+            fate = "loops pending" if edge.status is Status.PENDING else "loops rejected"
+        found[fate].append(edge)
+    return found
+
+
+def _draw_edges(axes: Any, scene: Scene, edges: list[Edge], **looks: Any) -> None:
+    from matplotlib.collections import LineCollection
+
+    if not edges:
+        return
+    ends = np.array([[edge.source, edge.target] for edge in edges])
+    axes.add_collection(LineCollection(scene.nodes[ends][:, :, :2], **looks))
+
+
+def _size(points: Any, building: Raster | None) -> tuple[float, float]:
+    low, high = points.min(axis=0), points.max(axis=0)
+    if building is not None:
+        low = np.minimum(low, [building.extent[0], building.extent[2]])
+        high = np.maximum(high, [building.extent[1], building.extent[3]])
+    return style.fitted_size(*(high - low), width_in=9.6)

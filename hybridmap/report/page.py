@@ -1,0 +1,119 @@
+"""The page itself: gather, draw, fill the template."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from hybridmap.metrics import Metric
+from hybridmap.report import tables
+from hybridmap.report.closures import examples
+from hybridmap.report.correction_figure import correction_figure
+from hybridmap.report.error_figure import error_figure
+from hybridmap.report.map_figure import graph_figure, trajectories_figure
+from hybridmap.report.outline import outlines, raster
+from hybridmap.report.scene import ODOMETRY, Scene, load_scene
+from hybridmap.store import MapStore, SessionFolder
+from hybridmap.trajectory import NS_PER_S, write_text_atomic
+
+_TEMPLATE = "report.html.j2"
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """One of the figures at the top."""
+
+    value: str
+    unit: str
+    label: str
+
+
+def write_report(folder: SessionFolder) -> Path:
+    """Write `report.html` of a session: one page that needs nothing beside it, no network and no script.
+
+    Raises:
+        StoreError: there is no session, or its map or figures are damaged.
+        StreamError: one of its trajectories is damaged.
+    """
+    folder.require()
+    with MapStore.open(folder.path) as store:
+        scene = load_scene(folder, store)
+        text = _render(_content(scene, store))
+    write_text_atomic(folder.report, text)
+    return folder.report
+
+
+def _content(scene: Scene, store: MapStore) -> dict[str, Any]:
+    points_of = outlines(store, len(scene.nodes))
+    building = raster(points_of, scene.nodes)
+    correction = scene.correction
+    start_ns = scene.estimates[ODOMETRY].stamps_ns[0]
+    return {
+        "source": scene.source,
+        "primary": scene.primary,
+        "backends": scene.backends,
+        "reports": [scene.reports[name] for name in scene.backends if name in scene.reports],
+        "known_truth": scene.truth is not None,
+        "tiles": tiles(scene),
+        "remarks": _remarks(scene),
+        "trajectories": trajectories_figure(scene, building),
+        "graph": graph_figure(scene, building),
+        "errors": error_figure(scene),
+        "correction": None if correction is None else correction_figure(correction, points_of),
+        "correction_shift": None if correction is None else tables.number(correction.shift_m),
+        "correction_time": None if correction is None else tables.number(round((correction.stamp_ns - start_ns) / NS_PER_S, 1)),
+        "examples": examples(scene, store),
+        "by_backend": tables.by_backend(scene.metrics, scene.backends),
+        "of_session": tables.of_session(scene.metrics, scene.backends),
+        "config_yaml": scene.config_yaml,
+        "graph_hash": scene.head.get("graph_hash", ""),
+        "version": version("hybridmap"),
+    }
+
+
+def _render(content: dict[str, Any]) -> str:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("hybridmap", "report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(_TEMPLATE).render(content)
+
+
+def tiles(scene: Scene) -> list[Tile]:
+    """What one wants to know first: how good, how far, how many loops, how costly."""
+    named = {metric.name: metric for metric in scene.metrics}
+    wanted = [
+        (f"ate_rmse/{ODOMETRY}", "ATE of odometry"),
+        (f"ate_rmse/{scene.primary}", f"ATE of {scene.primary}"),
+        (f"relation_trans_mean/{ODOMETRY}", "relation error of odometry"),
+        (f"relation_trans_mean/{scene.primary}", f"relation error of {scene.primary}"),
+        ("travel", "driven"),
+        ("duration", "recorded"),
+        ("nodes", "nodes"),
+        ("loops_accepted", "loops accepted"),
+        ("loops_rejected", "loops rejected"),
+        ("cpu_s_per_min", "CPU a minute of recording"),
+    ]
+    return [_tile(named[name], label) for name, label in wanted if name in named]
+
+
+def _tile(metric: Metric, label: str) -> Tile:
+    value, unit = metric.value, metric.unit
+    if metric.unit == "m" and abs(value) < 1.0:
+        return Tile(f"{100 * value:.2g}" if abs(value) < 0.1 else f"{100 * value:.0f}", "cm", label)
+    if unit == "s/min":
+        return Tile(f"{value:.3g}", "s", label)
+    return Tile(f"{value:.0f}" if unit == "1" else f"{value:.3g}", tables.unit(metric), label)
+
+
+def _remarks(scene: Scene) -> list[str]:
+    """What went wrong or was left out on the way."""
+    failed = [f"{name} failed: {why}" for name, why in dict(scene.head.get("failed_backends", {})).items()]
+    return failed + [str(remark) for remark in scene.head.get("remarks", [])]

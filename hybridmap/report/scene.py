@@ -1,0 +1,137 @@
+"""What the page shows, gathered from a session folder and brought into one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from hybridmap.backends.base import SolveReport
+from hybridmap.errors import EvaluationError, HybridMapError
+from hybridmap.evaluate.association import Pairs, associate
+from hybridmap.evaluate.session import session_trajectories
+from hybridmap.evaluate.trajectory import absolute_error_of
+from hybridmap.geometry import IDENTITY, Array, compose
+from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.metrics import Metric
+from hybridmap.store import MapStore, SessionFolder
+from hybridmap.trajectory import Trajectory, read_tum
+
+ODOMETRY = "odometry"
+ONLINE = "_online"
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """The map of the primary back-end just before and after its largest change.
+
+    Attributes:
+        stamp_ns: when.
+        shift_m: how far the node that moved most was moved.
+        before, after: (K, 3) poses of the nodes that there were, in the page's frame.
+    """
+
+    stamp_ns: int
+    shift_m: float
+    before: Array
+    after: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Everything drawn, in the page's frame: that of the ground truth where there is one, else `map`.
+
+    Attributes:
+        source: what was mapped.
+        primary: the back-end that is judged.
+        backends: `odometry`, then every back-end with a solution, the primary first.
+        truth: true trajectory, if known.
+        estimates: name -> trajectory, each aligned to the truth by itself; also `<backend>_online`.
+        pairs: name -> estimate and truth at common stamps, both in the page's frame; empty without a truth.
+        nodes: (N, 3) poses of the nodes by the primary back-end.
+        experiences: nodes and edges.
+        reports: name -> how the back-end's solution came about.
+        correction: the largest one, if any.
+        head, metrics: what `metrics.json` holds.
+        config_yaml: the resolved configuration.
+    """
+
+    source: str
+    primary: str
+    backends: tuple[str, ...]
+    truth: Trajectory | None
+    estimates: dict[str, Trajectory]
+    pairs: dict[str, Pairs]
+    nodes: Array
+    experiences: ExperienceMap
+    reports: dict[str, SolveReport]
+    correction: Correction | None
+    head: dict[str, Any]
+    metrics: list[Metric]
+    config_yaml: str
+
+
+def load_scene(folder: SessionFolder, store: MapStore) -> Scene:
+    """Gather a session.
+
+    Raises:
+        StoreError: the map or the figures are damaged.
+        StreamError: a trajectory is damaged.
+    """
+    truth = read_tum(folder.groundtruth) if folder.groundtruth.is_file() else None
+    estimates = session_trajectories(folder, store)
+    alignments = {} if truth is None else _alignments(estimates, truth)
+    estimates = {
+        name: Trajectory(estimate.stamps_ns, compose(alignments.get(name, IDENTITY), estimate.poses))
+        for name, estimate in estimates.items()
+        if len(estimate)
+    }
+    solutions = store.solutions()
+    primary = store.primary
+    others = [name for name in solutions if name not in (primary, ODOMETRY)]
+    backends = (ODOMETRY, *(name for name in (primary, *others) if name in solutions and name != ODOMETRY))
+    experiences = store.map()
+    place = alignments.get(primary, alignments.get(ODOMETRY, IDENTITY))
+    figures = folder.read_metrics()
+    return Scene(
+        source=store.source,
+        primary=primary,
+        backends=backends,
+        truth=truth,
+        estimates=estimates,
+        pairs={} if truth is None else _pairs(estimates, truth),
+        nodes=compose(place, solutions[primary].poses if primary in solutions else experiences.initial),
+        experiences=experiences,
+        reports={name: solution.report for name, solution in solutions.items()},
+        correction=_correction(store.info("largest_correction"), place),
+        head=figures.head,
+        metrics=figures.metrics,
+        config_yaml=store.config_yaml,
+    )
+
+
+def _alignments(estimates: dict[str, Trajectory], truth: Trajectory) -> dict[str, Array]:
+    found = {}
+    for name, estimate in estimates.items():
+        try:
+            found[name] = absolute_error_of(associate(estimate, truth)).pose_reference_estimate
+        except HybridMapError:
+            continue  # too few stamps in common: drawn where its own frame has it
+    return found
+
+
+def _pairs(estimates: dict[str, Trajectory], truth: Trajectory) -> dict[str, Pairs]:
+    found = {}
+    for name, estimate in estimates.items():
+        try:
+            found[name] = associate(estimate, truth)
+        except EvaluationError:
+            continue
+    return found
+
+
+def _correction(info: Any, place: Array) -> Correction | None:
+    if not info or not info.get("before"):
+        return None
+    before, after = compose(place, info["before"]), compose(place, info["after"])
+    shift = float(info["shift_m"]) if "shift_m" in info else float(abs(after - before)[:, :2].max())
+    return Correction(int(info["stamp_ns"]), shift, before, after)

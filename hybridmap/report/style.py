@@ -1,0 +1,115 @@
+"""How every picture of the page looks: colours that colour-blind people can tell apart, equal axes, embedded as text."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.geometry import Array
+from hybridmap.report.outline import Raster
+
+TRUTH, ODOMETRY, PRIMARY = "#000000", "#d55e00", "#0072b2"
+OTHERS = ("#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#7f6000", "#5b3a8e")
+ACCEPTED, UNWEIGHTED, PENDING, REJECTED = "#009e73", "#cc79a7", "#e69f00", "#d55e00"
+_MAX_POINTS = 2500
+_SETTINGS = {
+    "font.size": 9.0,
+    "font.family": "sans-serif",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#666666",
+    "axes.labelcolor": "#222222",
+    "axes.titlesize": 10.0,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "xtick.color": "#444444",
+    "ytick.color": "#444444",
+    "grid.color": "#e4e4e4",
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "svg.hashsalt": "hybridmap",
+    "svg.fonttype": "path",
+    "path.simplify": True,
+    "path.simplify_threshold": 0.3,
+}
+
+
+def line_styles(backends: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Name -> how its line is drawn; `backends` begins with `odometry` and the primary, as a scene's do."""
+    styles: dict[str, dict[str, Any]] = {}
+    others = [name for name in backends if name != "odometry"]
+    dashes = ((0, (4, 1.2)), (0, (6, 1.2, 1, 1.2)), (0, (1.2, 1.2)))
+    for rank, name in enumerate(others):
+        if rank == 0:
+            styles[name] = {"color": PRIMARY, "linewidth": 1.8, "zorder": 6}
+        else:
+            styles[name] = {
+                "color": OTHERS[(rank - 1) % len(OTHERS)],
+                "linewidth": 1.3,
+                "linestyle": dashes[(rank - 1) % len(dashes)],
+                "zorder": 5,
+            }
+    styles["odometry"] = {"color": ODOMETRY, "linewidth": 1.2, "linestyle": (0, (1, 1)), "zorder": 4}
+    return styles
+
+
+@contextmanager
+def figure(width_in: float, height_in: float) -> Iterator[Any]:
+    """A matplotlib figure in the page's style; no window, no global state."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(_SETTINGS):
+        yield Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def svg_uri(picture: Any) -> str:
+    """The figure as a `data:` URI; the same figure gives the same text."""
+    text = io.BytesIO()
+    picture.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(text.getvalue()).decode("ascii")
+
+
+def photo_uri(rgb: NDArray[np.uint8]) -> str:
+    """A colour picture (H, W, 3) as a `data:` URI."""
+    import cv2
+
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 88])
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+
+
+def thinned(poses: Array) -> Array:
+    """At most some thousand of the poses (P, 3), the last one among them: more cannot be seen."""
+    step = max(1, len(poses) // _MAX_POINTS)
+    return poses if step == 1 else np.concatenate([poses[:-1:step], poses[-1:]])
+
+
+def draw_building(axes: Any, building: Raster | None, darkness: float = 0.45) -> None:
+    """What the robot saw, in grey, under everything else."""
+    if building is None:
+        return
+    axes.imshow(
+        building.grey * darkness, cmap="Greys", vmin=0.0, vmax=1.0, origin="lower", extent=building.extent, zorder=0,
+        interpolation="antialiased",
+    )  # fmt: skip
+
+
+def metric_axes(axes: Any) -> None:
+    """Equal axes in metres."""
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("x (m)")
+    axes.set_ylabel("y (m)")
+    axes.grid(True, linewidth=0.5)
+    axes.set_axisbelow(True)
+
+
+def fitted_size(width_m: float, height_m: float, width_in: float, panels: int = 1) -> tuple[float, float]:
+    """Width and height of a figure, inches, for side-by-side panels that show `width_m` by `height_m`."""
+    shape = max(height_m, 0.5) / max(width_m, 0.5)
+    return width_in, float(np.clip(width_in / panels * shape + 1.1, 2.6, 8.5))

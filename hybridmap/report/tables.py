@@ -1,0 +1,63 @@
+"""The figures of a session as tables: back-ends side by side, and what belongs to none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from hybridmap.metrics import Metric
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line: a measure, its unit and meaning, and a cell for each column (empty where there is no figure)."""
+
+    measure: str
+    unit: str
+    meaning: str
+    cells: tuple[str, ...]
+
+
+def by_backend(metrics: Sequence[Metric], backends: Sequence[str]) -> list[Row]:
+    """A row a measure that at least one of the back-ends has, a cell a back-end."""
+    measures: dict[str, dict[str, Metric]] = {}
+    for metric in metrics:
+        measure, _, stage = metric.name.partition("/")
+        if stage in backends:
+            measures.setdefault(measure, {})[stage] = metric
+    rows = []
+    for measure, found in measures.items():
+        first = next(iter(found.values()))
+        cells = tuple(shown(found[name]) if name in found else "" for name in backends)
+        rows.append(Row(measure, unit(first), first.description, cells))
+    return rows
+
+
+def of_session(metrics: Sequence[Metric], backends: Sequence[str]) -> list[Row]:
+    """A row for each figure that belongs to no back-end."""
+    return [
+        Row(metric.name, unit(metric), metric.description, (shown(metric),))
+        for metric in metrics
+        if metric.name.partition("/")[2] not in backends
+    ]
+
+
+def shown(metric: Metric) -> str:
+    """The value with four digits that matter, and whether it keeps to its bar."""
+    verdict = "" if metric.passed is None else " ✓" if metric.passed else " ✗"
+    return number(metric.value) + verdict
+
+
+def number(value: float) -> str:
+    """Four significant digits, whole numbers as such; a dash where there is none."""
+    if not math.isfinite(value):
+        return "–"
+    if value == round(value) and abs(value) < 1e7:
+        return f"{value:.0f}"
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e7 else f"{value:.4g}"
+
+
+def unit(metric: Metric) -> str:
+    """The unit; nothing for a plain number."""
+    return "" if metric.unit == "1" else metric.unit
