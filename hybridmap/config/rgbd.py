@@ -113,6 +113,8 @@ class RgbdClosingConfig(Section):
     """Unverified edges: standard deviation of the heading, degrees."""
     repropose_m: float = Field(default=1.5, ge=0)
     """At the end, nodes this near on the optimised map are tried again; 0: no."""
+    repropose_rounds: int = Field(default=1, ge=0)
+    """How often."""
     repropose_per_node: int = Field(default=2, ge=1)
     """At the end, candidates tried for a node."""
 
@@ -123,7 +125,7 @@ class RgbdConfig(Section):
     matching: Literal["literal", "ratio", "signed", "plain", "four-band"] = "four-band"
     """How candidates are ranked: the seed's single-band profile with G read in one of four ways, or four row bands."""
     verify: Literal["none", "pnp"] = "pnp"
-    """`pnp`: features and depth, both ways; `none`: the edge is the profile's shift alone (yaw, no translation), as in the seed."""
+    """`pnp`: features and depth, both ways; `none`: the edge is the profile's shift alone (yaw, no translation)."""
     tilt: Literal["auto", "level", "floor"] = "auto"
     """`level`: the camera sits as mounted; `floor`: its tilt and height are measured in each keyframe (hand-held);
     `auto`: level until a floor is seen that contradicts the mounting."""

@@ -6,6 +6,7 @@ a laser scan has one band. Column 0 is the left edge of an image, and the smalle
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -43,14 +44,13 @@ def image_profile(
     share = _cell_means(valid, width, bands)
     depth = _cell_means(depth_m, width, bands)
     seen = share > 1e-6
-    depth = np.where(seen, depth / np.where(seen, share, 1.0), 0.0)
-    depth = _fill_with_mean(depth, seen)
-    return np.concatenate([normalised(intensity, normalise), normalised(depth, normalise)]).astype(np.float32)
+    mean = np.where(seen, depth / np.where(seen, share, 1.0), 0.0)
+    return np.concatenate([normalised(intensity, normalise), normalised(_fill_with_mean(mean, seen), normalise)]).astype(
+        np.float32
+    )
 
 
-def laser_profile(
-    ranges_m: NDArray[np.float32], bearings_rad: Array, width: int, normalise: Normalise = "z"
-) -> Profile:
+def laser_profile(ranges_m: NDArray[np.float32], bearings_rad: Array, width: int, normalise: Normalise = "z") -> Profile:
     """Profile of a scan: its ranges, averaged over `width` equal columns of bearing.
 
     Args:
@@ -74,7 +74,7 @@ def laser_profile(
 
 
 def normalised(bands: NDArray[np.floating], how: Normalise) -> NDArray[np.floating]:
-    """Normalise each row of `(bands, width)`: `z` to mean 0 and standard deviation 1, `mean` to mean 1; flat rows become flat."""
+    """Normalise each row of `(bands, width)`: `z` to mean 0 and standard deviation 1, `mean` to mean 1; flat rows stay flat."""
     mean = bands.mean(axis=1, keepdims=True)
     if how == "mean":
         return np.asarray(bands / np.where(np.abs(mean) > 1e-9, mean, 1.0))
@@ -95,5 +95,5 @@ def _cell_means(image: NDArray[np.generic], width: int, bands: int) -> NDArray[n
 
     height = image.shape[0]
     edges = np.linspace(0, height, bands + 1).round().astype(int)
-    rows = [cv2.reduce(image[a:b], 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F) for a, b in zip(edges, edges[1:], strict=False)]
+    rows = [cv2.reduce(image[a:b], 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F) for a, b in pairwise(edges)]
     return np.asarray(cv2.resize(np.concatenate(rows), (width, bands), interpolation=cv2.INTER_AREA), dtype=np.float64)

@@ -106,7 +106,7 @@ def shifted_differences(query: Floats, stored: Floats, shifts: Indices) -> Float
         padded = np.where(inside, query[band][clipped], 0.0)
         total = cdist(stored[band], padded, "cityblock")
         out[:, band] = total - magnitude[band] @ (~inside).T
-    return np.maximum(out, 0.0) / (width - np.abs(shifts))
+    return np.asarray(np.maximum(out, 0.0) / (width - np.abs(shifts)))
 
 
 def band_weights(bands: int, mu_r: float, mu_d: float) -> Floats:
@@ -122,8 +122,8 @@ def combine(
 ) -> tuple[Floats, Indices]:
     """Score G and best shift of n pairs (eq. 13).
 
-    `literal`: sum mu |g_min - g_bar|, as printed (inverted: a true match lies far from the mean). `ratio`: sum mu g_min / g_bar.
-    `signed`: sum mu (g_min - g_bar). `plain` and `four-band`: sum mu g_min; in all of them each band has its own best shift.
+    `literal`: sum mu |g_min - g_bar|, as printed (inverted: a true match lies far from the mean); `ratio`: sum mu g_min/g_bar;
+    `signed`: sum mu (g_min - g_bar); `plain` and `four-band`: sum mu g_min. In all of them each band has its own best shift.
 
     Args:
         g: (n, bands, S) differences.

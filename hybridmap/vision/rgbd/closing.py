@@ -1,0 +1,203 @@
+"""Loop closure: gate, candidates by profile, verification, and one supporting edge before anything enters the map."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.config.rgbd import RgbdConfig
+from hybridmap.config.vision import MatchingConfig
+from hybridmap.geometry import Array, RelativePose, between, compose, wrap_angle
+from hybridmap.vision.base import Belief, Proposal, Verdict
+from hybridmap.vision.profile import Profile
+from hybridmap.vision.rgbd.keyframe import Keyframe
+from hybridmap.vision.rgbd.pnp import Verifier
+from hybridmap.vision.templates import MODERATE_THRESHOLD, Matcher
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(slots=True)
+class _Hypothesis:
+    """A measured edge, waiting for support or accepted."""
+
+    proposal: Proposal
+    relative: RelativePose
+
+    @property
+    def source(self) -> int:
+        return self.proposal.source
+
+    @property
+    def target(self) -> int:
+        return self.proposal.target
+
+
+class LoopCloser:
+    """Finds loops for one camera. The newer node is the source of an edge."""
+
+    def __init__(
+        self,
+        keyframes: Sequence[Keyframe],
+        matching: MatchingConfig,
+        config: RgbdConfig,
+        verifier: Verifier,
+        yaw_of_shift: Callable[[int], float],
+        new_key: Callable[[], int],
+    ) -> None:
+        self._keyframes = keyframes
+        self._config = config
+        self._closing = config.closing
+        self._verifier = verifier
+        self._yaw_of_shift = yaw_of_shift
+        self._new_key = new_key
+        self._matcher = Matcher(config.matching, matching.mu_r, matching.mu_d, matching.max_shift, matching.g_bar)
+        unverified = config.verify == "none"
+        self._c_t = matching.c_t if matching.c_t is not None or not unverified else MODERATE_THRESHOLD[config.matching]
+        self._hypotheses: list[_Hypothesis] = []
+        self._tried: set[tuple[int, int]] = set()
+        self._travel_at_closure = 0.0
+        self._rounds_left = config.closing.repropose_rounds
+
+    def add_node(self, profile: Profile) -> None:
+        """Store the profile of the next node."""
+        self._matcher.add(profile)
+
+    def close(self, node: int, belief: Belief) -> list[Proposal]:
+        """Look for loops of one node, and settle what was pending."""
+        gated = self._gate(node, belief)
+        changed = self._try_candidates(node, self._ranked(node, gated), belief) if len(gated) else []
+        return [*changed, *self._give_up(before=node - self._closing.pending_nodes)]
+
+    def finish(self, belief: Belief) -> list[Proposal]:
+        """Try pairs that the optimised map puts side by side and that were never tried; then settle everything."""
+        out: list[Proposal] = []
+        if self._rounds_left > 0 and self._closing.repropose_m > 0 and self._config.verify != "none":
+            self._rounds_left -= 1
+            for node in range(len(self._keyframes)):
+                near = self._nearest_untried(node, belief)
+                if near:
+                    out += self._try_candidates(node, near, belief)
+        return [*out, *self._give_up(before=len(self._keyframes))]
+
+    def _gate(self, node: int, belief: Belief) -> Indices:
+        """Nodes old enough, within reach of the drift since the last closure, and looking the same way."""
+        since = float(belief.travel_m[node]) - self._travel_at_closure
+        growth = self._closing.gate_per_m * since
+        radius = self._closing.gate_m + min(growth, self._closing.gate_growth_m)
+        radii: Array = np.full(node, radius)
+        if growth > self._closing.gate_growth_m and self._closing.gate_sigma > 0:
+            spread = np.trace(belief.covariance_from(node)[:node, :2, :2], axis1=1, axis2=2)
+            radii = np.maximum(radii, self._closing.gate_m + self._closing.gate_sigma * np.sqrt(spread))
+        heading = np.deg2rad(self._closing.heading_deg + self._closing.heading_deg_per_m * since)
+        poses = belief.poses_map_node
+        offset = poses[:node, :2] - poses[node, :2]
+        turned = np.abs(wrap_angle(poses[:node, 2] - poses[node, 2]))
+        old = belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s
+        inside = old & (np.hypot(offset[:, 0], offset[:, 1]) <= radii) & (turned <= heading)
+        return np.flatnonzero(inside).astype(np.int64)
+
+    def _ranked(self, node: int, gated: Indices) -> dict[int, dict[str, float]]:
+        """The best candidates by profile, some nodes apart, with their scores."""
+        match = self._matcher.score(self._keyframes[node].profile, gated)
+        chosen: dict[int, dict[str, float]] = {}
+        for i in np.argsort(match.score, kind="stable"):
+            target = int(gated[i])
+            if self._c_t is not None and match.score[i] >= self._c_t:
+                break
+            if all(abs(target - other) >= self._closing.separation for other in chosen):
+                chosen[target] = {"profile_G": float(match.score[i]), "shift": float(match.shift[i])}
+            if len(chosen) == self._closing.candidates:
+                break
+        return chosen
+
+    def _try_candidates(self, node: int, ranked: dict[int, dict[str, float]], belief: Belief) -> list[Proposal]:
+        """Measure each candidate; what has support enters, the best first."""
+        if self._config.verify == "none":
+            return self._accept_unverified(node, ranked, belief)
+        out: list[Proposal] = []
+        entered = 0
+        for target, scores in ranked.items():
+            self._tried.add((node, target))
+            found = self._verifier.verify(self._keyframes[node], self._keyframes[target])
+            scores = {**scores, **found.scores}
+            proposal = Proposal(self._new_key(), "loop", node, target, Verdict.REJECTED, found.reason, found.relative, scores)
+            if found.relative is None:
+                out.append(proposal)
+                continue
+            if entered == self._closing.accept:
+                out.append(replace(proposal, reason="two better edges entered for this node"))
+                continue
+            hypothesis = _Hypothesis(replace(proposal, verdict=Verdict.PENDING, reason="waits for support"), found.relative)
+            raised = self._raise(hypothesis, belief)
+            entered += hypothesis.proposal.verdict is Verdict.ACCEPTED
+            out += raised
+        return out
+
+    def _raise(self, new: _Hypothesis, belief: Belief) -> list[Proposal]:
+        """File a hypothesis; accept it and what it supports if another one agrees."""
+        friends = [h for h in self._hypotheses if self._agrees(new, h, belief)]
+        self._hypotheses.append(new)
+        if not friends and self._closing.support_nodes > 0:
+            return [new.proposal]
+        changed = [new, *(h for h in friends if h.proposal.verdict is Verdict.PENDING)]
+        for h in changed:
+            h.proposal = replace(h.proposal, verdict=Verdict.ACCEPTED, reason="verified and supported")
+        self._travel_at_closure = max(self._travel_at_closure, float(belief.travel_m[new.source]))
+        return [h.proposal for h in changed]
+
+    def _agrees(self, a: _Hypothesis, b: _Hypothesis, belief: Belief) -> bool:
+        """Two edges from different nodes near each other, to nodes near each other, give the same pose through the chain."""
+        apart = abs(a.source - b.source), abs(a.target - b.target)
+        if b.proposal.verdict is Verdict.REJECTED or apart[0] == 0 or max(apart) > self._closing.support_nodes:
+            return False
+        poses = belief.poses_map_node
+        around = compose(between(poses[a.source], poses[b.source]), b.relative.delta)
+        around = compose(around, between(poses[b.target], poses[a.target]))
+        gap = between(a.relative.delta, around)
+        length = sum(
+            abs(float(belief.travel_m[i] - belief.travel_m[j])) for i, j in ((a.source, b.source), (a.target, b.target))
+        )
+        limit_m = self._closing.support_m + 0.03 * length
+        limit_rad = np.deg2rad(self._closing.support_deg + 0.5 * length)
+        return bool(np.hypot(gap[0], gap[1]) < limit_m and abs(gap[2]) < limit_rad)
+
+    def _give_up(self, before: int) -> list[Proposal]:
+        """Reject what has waited for support too long."""
+        late = [h for h in self._hypotheses if h.proposal.verdict is Verdict.PENDING and h.source < before]
+        for h in late:
+            h.proposal = replace(h.proposal, verdict=Verdict.REJECTED, reason="no other edge supports it")
+        return [h.proposal for h in late]
+
+    def _nearest_untried(self, node: int, belief: Belief) -> dict[int, dict[str, float]]:
+        """Earlier nodes that look at the same place from nearly the same pose, nearest first."""
+        poses = belief.poses_map_node
+        gap = np.hypot(*(poses[:node, :2] - poses[node, :2]).T)
+        turned = np.abs(wrap_angle(poses[:node, 2] - poses[node, 2]))
+        old = belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s
+        near = old & (gap <= self._closing.repropose_m) & (turned <= np.deg2rad(0.7 * self._closing.heading_deg))
+        cost = gap + turned
+        chosen: dict[int, dict[str, float]] = {}
+        for i in np.argsort(np.where(near, cost, np.inf), kind="stable")[: int(near.sum())]:
+            target = int(i)
+            if (node, target) in self._tried:
+                continue
+            if all(abs(target - other) >= self._closing.separation for other in chosen):
+                chosen[target] = {"map_distance_m": float(gap[i])}
+            if len(chosen) == self._closing.repropose_per_node:
+                break
+        return chosen
+
+    def _accept_unverified(self, node: int, ranked: dict[int, dict[str, float]], belief: Belief) -> list[Proposal]:
+        """The seed's way: the best match is a closure; its shift gives the yaw, and nothing gives the translation."""
+        for target, scores in ranked.items():
+            delta = np.array([0.0, 0.0, self._yaw_of_shift(int(scores["shift"]))])
+            sigma = np.array([self._closing.shift_sigma_m] * 2 + [np.deg2rad(self._closing.shift_sigma_deg)])
+            relative = RelativePose(delta, np.diag(sigma**2))
+            self._travel_at_closure = float(belief.travel_m[node])
+            reason = "profile below c_t, not verified"
+            return [Proposal(self._new_key(), "loop", node, target, Verdict.ACCEPTED, reason, relative, scores)]
+        return []

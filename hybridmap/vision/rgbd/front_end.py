@@ -1,0 +1,123 @@
+"""The RGB-D front-end: frames in, proposals of edges out."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.config.vision import VisionConfig
+from hybridmap.errors import StreamError
+from hybridmap.geometry import Array, RelativePose
+from hybridmap.streams.base import Camera, Observation, RgbdFrame
+from hybridmap.vision.base import Belief, Proposal, View
+from hybridmap.vision.profile import image_profile
+from hybridmap.vision.rgbd.closing import LoopCloser
+from hybridmap.vision.rgbd.depth_grid import make_grid, place
+from hybridmap.vision.rgbd.features import detect
+from hybridmap.vision.rgbd.keyframe import (
+    Keyframe,
+    WorkingImage,
+    packed_images,
+    working_camera,
+    working_factor,
+    working_image,
+)
+from hybridmap.vision.rgbd.pnp import Verifier
+from hybridmap.vision.rgbd.posture import Posture
+from hybridmap.vision.rgbd.tracking import Tracker
+from hybridmap.vision.templates import ViewTemplates
+
+
+class RgbdFrontEnd:
+    """Scanline profiles, depth registration of consecutive nodes, loops verified by features and depth.
+
+    Implements `vision.base.FrontEnd`.
+
+    Args:
+        config: settings of the visual side.
+        camera: pinhole and mounting of the frames.
+        seed: for RANSAC.
+    """
+
+    def __init__(self, config: VisionConfig, camera: Camera, seed: int) -> None:
+        rgbd, matching, templates = config.rgbd, config.matching, config.templates
+        self._config = config
+        self._full_camera = camera
+        self._factor = working_factor(camera, rgbd.max_width_px)
+        self._camera = working_camera(camera, rgbd.max_width_px)
+        self._bands = config.profile.bands if rgbd.matching == "four-band" else 1
+        self._templates = ViewTemplates(
+            templates.threshold, templates.stable_frames, templates.max_shift, matching.mu_r, matching.mu_d
+        )
+        self._keyframes: list[Keyframe] = []
+        keys = itertools.count()
+        self._tracker = Tracker(self._keyframes, rgbd.registration, keys.__next__)
+        verifier = Verifier(self._camera, rgbd.pnp, rgbd.features, rgbd.registration, seed)
+        self._posture = Posture(rgbd.tilt, camera.T_base_camera, verifier.solver, rgbd.features.ratio)
+        self._closer = LoopCloser(self._keyframes, matching, rgbd, verifier, self._yaw_of_shift, keys.__next__)
+        self._frame: RgbdFrame | None = None
+        self._image: WorkingImage | None = None
+
+    def observe(self, frame: Observation, delta_node_robot: Array) -> View:
+        """Profile one frame and recognise its template.
+
+        Raises:
+            StreamError: not an RGB-D frame, or its size is not the camera's.
+        """
+        if not isinstance(frame, RgbdFrame):
+            raise StreamError(f"vision: the RGB-D front-end needs colour with depth, found {type(frame).__name__}")
+        size = (self._full_camera.height_px, self._full_camera.width_px)
+        if frame.color.shape[:2] != size or frame.depth_m.shape != size:
+            found = f"colour {frame.color.shape[:2]} and depth {frame.depth_m.shape}"
+            raise StreamError(f"vision: frame at {frame.stamp_ns} ns has {found}, expected {size} rows and columns")
+        self._frame = frame
+        self._image = working_image(frame, self._factor)
+        settings = self._config.profile
+        profile = image_profile(self._image.grey, self._image.depth_m, settings.width, self._bands, settings.normalise)
+        seen = self._templates.recognise(profile)
+        return View(frame.stamp_ns, profile, seen.template, seen.founded)
+
+    def add_node(self, node: int, view: View) -> None:
+        """Keep features, surface and images of the frame observed last."""
+        if self._frame is None or self._image is None or node != len(self._keyframes):
+            raise ValueError(f"node {node} cannot be made here: {len(self._keyframes)} nodes so far, observe a frame first")
+        rgbd = self._config.rgbd
+        features = detect(
+            self._image.grey, self._image.depth_m, self._camera, rgbd.features.count, rgbd.features.fast_threshold
+        )
+        grid = make_grid(self._image.depth_m, self._camera, rgbd.registration.grid_px, rgbd.registration.depth_sigma)
+        stance = self._posture.stance(grid, features)
+        color, depth = packed_images(self._frame)
+        surface = place(grid, stance.T_base_camera)
+        self._keyframes.append(Keyframe(view.profile, features, surface, stance.measured, color, depth))
+        self._closer.add_node(view.profile)
+
+    def track(self, node: int, odometry: RelativePose | None) -> list[Proposal]:
+        """Register the new node to the ones before it."""
+        return self._tracker.track(node, odometry)
+
+    def close(self, node: int, belief: Belief) -> list[Proposal]:
+        """Look for loop closures of the new node."""
+        return self._closer.close(node, belief)
+
+    def finish(self, belief: Belief) -> list[Proposal]:
+        """Re-propose on the optimised map; settle what is pending."""
+        return self._closer.finish(belief)
+
+    def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
+        """`profile` float32, `color` (H, W, 3) uint8 RGB, `depth_mm` (H, W) uint16, `T_base_camera` (4, 4) as it was then."""
+        kept = self._keyframes[node]
+        color, depth_mm = kept.images()
+        return {
+            "profile": kept.profile,
+            "color": color,
+            "depth_mm": depth_mm,
+            "T_base_camera": kept.surface.T_base_camera,
+        }
+
+    def _yaw_of_shift(self, shift: int) -> float:
+        """Yaw of the stored view seen from the query: things farther right in the query mean that it looks farther left."""
+        pixels = shift * self._camera.width_px / self._config.profile.width
+        return -float(np.arctan2(pixels, self._camera.fx_px))

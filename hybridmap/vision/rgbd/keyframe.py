@@ -1,0 +1,85 @@
+"""What the RGB-D front-end keeps of a frame that became a node."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.streams.base import Camera, RgbdFrame
+from hybridmap.vision.profile import Profile
+from hybridmap.vision.rgbd.depth_grid import Surface, reduced
+from hybridmap.vision.rgbd.features import Features
+
+
+@dataclass(frozen=True, slots=True)
+class WorkingImage:
+    """A frame at the working width.
+
+    Attributes:
+        grey: (H, W) uint8.
+        depth_m: (H, W) float32, 0 where invalid.
+    """
+
+    grey: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A node's frame: profile, features, surface, and the images, packed without loss.
+
+    Attributes:
+        tilt_measured: the camera's tilt was measured at this keyframe and not taken from the mounting.
+        color_png, depth_png: PNG files; depth in whole millimetres.
+    """
+
+    profile: Profile
+    features: Features
+    surface: Surface
+    tilt_measured: bool
+    color_png: NDArray[np.uint8]
+    depth_png: NDArray[np.uint8]
+
+    def images(self) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+        """Colour (H, W, 3) uint8 RGB and depth (H, W) uint16 mm, as they came."""
+        import cv2
+
+        color = np.asarray(cv2.imdecode(self.color_png, cv2.IMREAD_COLOR), dtype=np.uint8)
+        depth = cv2.imdecode(self.depth_png, cv2.IMREAD_UNCHANGED)
+        return np.ascontiguousarray(color[:, :, ::-1]), np.asarray(depth, dtype=np.uint16)
+
+
+def working_factor(camera: Camera, max_width_px: int) -> int:
+    """Whole factor by which images are reduced."""
+    return max(1, -(-camera.width_px // max_width_px))
+
+
+def working_camera(camera: Camera, max_width_px: int) -> Camera:
+    """Pinhole at the working width."""
+    return reduced(camera, working_factor(camera, max_width_px))
+
+
+def working_image(frame: RgbdFrame, factor: int) -> WorkingImage:
+    """Grey by area averaging, depth by taking the pixel in the middle (averaging would invent surfaces at edges)."""
+    import cv2
+
+    grey = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
+    depth = np.nan_to_num(frame.depth_m, nan=0.0, posinf=0.0, neginf=0.0)
+    if factor > 1:
+        height, width = grey.shape[0] // factor, grey.shape[1] // factor
+        grey = cv2.resize(grey[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA)
+        half = factor // 2
+        depth = np.ascontiguousarray(depth[half::factor, half::factor][:height, :width])
+    return WorkingImage(grey, depth)
+
+
+def packed_images(frame: RgbdFrame) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Colour and depth (whole millimetres) as PNG, without loss."""
+    import cv2
+
+    fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+    depth_mm = np.clip(np.rint(np.nan_to_num(frame.depth_m, posinf=0.0) * 1000.0), 0, 65535).astype(np.uint16)
+    color = np.ascontiguousarray(frame.color[:, :, ::-1])
+    return cv2.imencode(".png", color, fast)[1], cv2.imencode(".png", depth_mm, fast)[1]
