@@ -12,17 +12,17 @@ from hybridmap.config.section import Section
 class WheelErrorConfig(Section):
     """How wrong the wheel odometry is."""
 
-    scale_bias: float = Field(default=0.012, gt=-1)
-    """Relative error of every distance (0.012: reports 1.2 % too much)."""
-    turn_bias: float = Field(default=0.004, gt=-1)
+    scale_bias: float = Field(default=0.02, gt=-1)
+    """Relative error of every distance (0.02: reports 2 % too much)."""
+    turn_bias: float = Field(default=0.01, gt=-1)
     """Relative error of every turn."""
-    heading_bias_deg_per_m: float = 0.05
+    heading_bias_deg_per_m: float = 0.16
     """Pull to the left, degrees per metre driven."""
     translation_m_per_sqrt_m: float = Field(default=0.006, ge=0)
     """White noise of the distance, m per sqrt(m)."""
-    rotation_deg_per_sqrt_m: float = Field(default=0.35, ge=0)
+    rotation_deg_per_sqrt_m: float = Field(default=0.6, ge=0)
     """White noise of the heading, degrees per sqrt(m) driven."""
-    rotation_per_turn: float = Field(default=0.008, ge=0)
+    rotation_per_turn: float = Field(default=0.012, ge=0)
     """White noise of the heading, radians per sqrt(radian) turned."""
     slips_per_m: float = Field(default=0.02, ge=0)
     """Slips a metre driven, on average."""
@@ -35,9 +35,9 @@ class WheelErrorConfig(Section):
 class CameraConfig(Section):
     """The simulated RGB-D camera."""
 
-    width_px: int = Field(default=160, ge=16, le=1920)
+    width_px: int = Field(default=240, ge=16, le=1920)
     """Image width, pixels."""
-    height_px: int = Field(default=120, ge=12, le=1080)
+    height_px: int = Field(default=180, ge=12, le=1080)
     """Image height, pixels."""
     field_of_view_deg: float = Field(default=62.0, gt=10, lt=150)
     """Horizontal field of view, degrees."""

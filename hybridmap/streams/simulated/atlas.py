@@ -59,7 +59,7 @@ class Atlas:
         place = self.places[surface * stride + level.astype(np.int32)]
         u = place[..., 0] + across * place[..., 2]
         v = place[..., 1] + down * place[..., 3]
-        return cv2.remap(self.image, u, v, cv2.INTER_LINEAR).astype(np.float32)
+        return np.asarray(cv2.remap(self.image, u, v, cv2.INTER_LINEAR), dtype=np.float32)
 
 
 def build_atlas(textures: list[Image]) -> Atlas:

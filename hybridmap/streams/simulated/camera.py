@@ -82,12 +82,12 @@ class CameraModel:
         depth = np.where(hits.hit, hits.length, np.float32(self._config.range_max_m))
         # between the widths of the pixel's footprint along and across the slant
         slant = 1.0 / np.sqrt(np.maximum(cosine, np.float32(0.03)))
-        footprint = self._scene.px_per_m[hits.surface] * depth * slant / np.float32(self.camera.fx_px)
+        footprint = (self._scene.px_per_m[hits.surface] * depth * slant / self.camera.fx_px).astype(np.float32)
         seen = self._scene.atlas.sample(hits.surface, hits.across, hits.down, footprint)
         seen[~hits.hit] = _SKY
         seen *= np.float32(gain)
         seen += np.float32(self._config.color_noise) * rng.standard_normal(seen.shape, dtype=np.float32)
-        return np.clip(seen + np.float32(0.5), 0, 255).astype(np.uint8)
+        return np.asarray(np.clip(seen + np.float32(0.5), 0, 255), dtype=np.uint8)
 
     def _depth(self, hits: Hits, cosine: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
         """Depth (H, W) float32 in whole millimetres; axial noise after Nguyen et al. 2012, growing with z^2."""

@@ -16,7 +16,7 @@ def laser_of(config: LaserScannerConfig) -> Laser:
     field = np.deg2rad(config.field_of_view_deg)
     steps = config.beams if config.field_of_view_deg >= 360.0 else config.beams - 1
     first, step = float(np.float32(-0.5 * field)), float(np.float32(field / steps))
-    bearings = first + np.arange(config.beams) * step
+    bearings = first + np.arange(config.beams, dtype=np.float64) * step
     low, high = (float(np.float32(value)) for value in (config.range_min_m, config.range_max_m))
     return Laser(bearings, low, high, np.array([config.forward_m, 0.0, 0.0]))
 

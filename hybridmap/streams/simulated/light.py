@@ -21,7 +21,7 @@ _CELL_M = 0.22
 _RAYS = 40
 _LAMP_REACH_M = 6.0
 _LIFT_M = 0.004
-_AMBIENT, _DIRECT = 0.62, 0.62
+_AMBIENT, _DIRECT = 0.78, 0.9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +34,7 @@ class LightMap:
         """Texture (H, W, 3) with the light on it."""
         height, width = texture.shape[:2]
         smooth = cv2.resize(self.factors, (width, height), interpolation=cv2.INTER_LINEAR)
-        return np.clip(texture * smooth[..., None], 0, 255).astype(np.uint8)
+        return np.asarray(np.clip(texture * smooth[..., None], 0, 255), dtype=np.uint8)
 
 
 def bake(surfaces: Sequence[Surface], caster: Caster) -> list[LightMap]:

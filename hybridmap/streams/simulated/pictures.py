@@ -178,7 +178,7 @@ def whiteboard() -> Paint:
         for _ in range(int(3 + 5 * width / px_per_m)):
             ink = inks[int(rng.integers(len(inks)))]
             start = np.array([rng.uniform(0.05, 0.9) * width, rng.uniform(0.08, 0.9) * height])
-            steps = rng.normal(0, 0.05 * px_per_m, (int(rng.integers(4, 14)), 2)) + [0.02 * px_per_m, 0]
+            steps = rng.normal((0.02 * px_per_m, 0), 0.05 * px_per_m, (int(rng.integers(4, 14)), 2))
             points = (start + np.cumsum(steps, axis=0)).astype(np.int32)
             cv2.polylines(image, [points], bool(rng.random() < 0.3), ink, max(1, round(0.012 * px_per_m)), cv2.LINE_AA)
         for _ in range(4):

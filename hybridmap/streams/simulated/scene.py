@@ -44,11 +44,13 @@ class Caster:
         first = 4 * np.arange(len(surfaces))[:, None, None]
         triangles = (first + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
         self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(triangles.astype(np.uint32)))
+        self._scene.add_triangles(
+            o3d.core.Tensor.from_numpy(vertices.astype(np.float32)), o3d.core.Tensor.from_numpy(triangles.astype(np.uint32))
+        )
 
     def cast(self, rays: NDArray[np.float32]) -> Hits:
         """First hits of rays `(..., 6)` float32: origin, direction."""
-        found = self._scene.cast_rays(o3d.core.Tensor(rays))
+        found = self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays))
         length = found["t_hit"].numpy()
         hit = np.isfinite(length)
         triangle = np.where(hit, found["primitive_ids"].numpy(), 0).astype(np.int32)
@@ -61,7 +63,7 @@ class Caster:
 
     def blocked(self, rays: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Whether anything lies between 0 and 1 lengths of the direction of rays `(..., 6)`."""
-        return np.asarray(self._scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.0, tfar=0.999).numpy())
+        return np.asarray(self._scene.test_occlusions(o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=0.999).numpy())
 
 
 class Scene:

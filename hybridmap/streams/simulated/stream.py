@@ -119,7 +119,7 @@ class SimulatedStream:
                 yield laser.scan(stamp, pose, scan_noise[index])
 
     def _true_pose(self, stamp_ns: int) -> Array:
-        return self._truth.at([stamp_ns])[0]
+        return np.asarray(self._truth.at([stamp_ns])[0])
 
     @cached_property
     def _scene(self) -> Scene:
@@ -138,11 +138,12 @@ class SimulatedStream:
     def _stamps_of(self, rate_hz: float, *, wanted: bool) -> NDArray[np.int64]:
         span_s = float(self._truth.stamps_ns[-1] - _START_NS) / NS_PER_S
         stamps = _stamps_ns(int(span_s * rate_hz) + 2 if wanted else 0, rate_hz)
-        return stamps[stamps <= self._truth.stamps_ns[-1]]
+        return np.asarray(stamps[stamps <= self._truth.stamps_ns[-1]])
 
     def _generators(self) -> list[np.random.Generator]:
         return np.random.default_rng(self._seed).spawn(3)
 
 
 def _stamps_ns(count: int, rate_hz: float) -> NDArray[np.int64]:
-    return _START_NS + np.rint(np.arange(count) * (NS_PER_S / rate_hz)).astype(np.int64)
+    since_start = np.rint(np.arange(count) * (NS_PER_S / rate_hz)).astype(np.int64)
+    return np.asarray(_START_NS + since_start, dtype=np.int64)

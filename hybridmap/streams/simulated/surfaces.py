@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,7 +58,6 @@ class World:
     surfaces: tuple[Surface, ...]
     legs: tuple[Array, ...]
     texture_seed: int = 1
-    notes: str = field(default="")
 
 
 def _direction(yaw_rad: float) -> Array:
@@ -65,7 +65,7 @@ def _direction(yaw_rad: float) -> Array:
 
 
 def box(
-    center: Sequence[float],
+    center: ArrayLike,
     size: Sequence[float],
     paint: Paint,
     *,
@@ -88,7 +88,7 @@ def box(
     ex = _direction(np.deg2rad(yaw_deg)) * size[0]
     ey = _direction(np.deg2rad(yaw_deg + 90.0)) * size[1]
     ez = UP * size[2]
-    low = np.array([center[0], center[1], bottom_m]) - 0.5 * (ex + ey)
+    low = np.append(np.asarray(center, dtype=np.float64), bottom_m) - 0.5 * (ex + ey)
     rectangles = {
         "front": (low + ex, ey, ez),
         "back": (low + ey, -ey, ez),
@@ -167,7 +167,7 @@ def partition(
     yaw_deg = float(np.rad2deg(np.arctan2(direction[1], direction[0])))
     edges = [0.0, *[edge for opening in openings for edge in opening], length]
     out: list[Surface] = []
-    for index, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for index, (a, b) in enumerate(pairwise(edges)):
         if b - a < 1e-6:
             continue
         bottom = DOOR_HEIGHT_M if index % 2 else 0.0
