@@ -243,13 +243,16 @@ class Mapper:
         with self.clock.stage("matching"):
             proposals = self.vision.close(node, self.belief())
         edges = self._enter(proposals)
-        closed = [p for p in proposals if p.verdict is Verdict.ACCEPTED and p.source == node and p.relative is not None]
+        closed = [proposal for proposal in proposals if proposal.verdict is Verdict.ACCEPTED]
         if closed and self.config.edges.hanging == "ratslam":
-            matched = closed[0]
-            assert matched.relative is not None
-            self._at_node = matched.target
-            self._pose_odom_at_node = compose(self._pose_odom_at_node, matched.relative.delta)
+            self._rehang(max(closed, key=lambda proposal: proposal.source))
         return edges
+
+    def _rehang(self, matched: Proposal) -> None:
+        """From now on the robot is at the matched node, which lies in `odom` where the match has it (OpenRatSLAM)."""
+        assert matched.relative is not None
+        self._at_node = matched.target
+        self._pose_odom_at_node = compose(self.map.node(matched.source).pose_odom, matched.relative.delta)
 
     def _enter(self, proposals: list[Proposal]) -> list[int]:
         """Write proposals into the map; a later one with the same key replaces the edge of the earlier."""

@@ -1,0 +1,118 @@
+"""The page: samples in, a map out, without any file."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hybridmap.config import Config
+from hybridmap.errors import StreamError
+from hybridmap.evaluate import absolute_error
+from hybridmap.geometry import between, compose
+from hybridmap.graph.experience_map import Status
+from hybridmap.graph.hashing import graph_hash
+from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.mapper import Mapper
+from hybridmap.streams.base import LaserScan, SelfMotion
+from hybridmap.trajectory import Trajectory
+from tests.streams_for_tests import RoomDrive
+
+
+def drive(mapper: Mapper, stream: RoomDrive) -> list:
+    updates = [update for sample in stream for update in mapper.add(sample)]
+    return updates + mapper.finish()
+
+
+@pytest.fixture(scope="module")
+def mapped():
+    stream = RoomDrive()
+    mapper = Mapper(Config.load("laser"), stream.rig)
+    return mapper, drive(mapper, stream), stream
+
+
+def test_the_map_is_better_than_odometry(mapped):
+    mapper, updates, stream = mapped
+    stamps = np.array([node.stamp_ns for node in mapper.map.nodes])
+    odometry = absolute_error(Trajectory(stamps, mapper.map.initial), stream.groundtruth)
+    optimised = absolute_error(Trajectory(stamps, mapper.poses()), stream.groundtruth)
+    assert odometry.rmse_m > 0.1
+    assert optimised.rmse_m < 0.25 * odometry.rmse_m
+
+
+def test_consecutive_nodes_are_always_joined(mapped):
+    mapper, _, _ = mapped
+    graph = mapper.map.pose_graph()
+    chained = set(zip(graph.sources[~graph.is_loop].tolist(), graph.targets[~graph.is_loop].tolist(), strict=True))
+    assert all((i - 1, i) in chained or (i, i - 1) in chained for i in range(1, len(mapper.map)))
+
+
+def test_every_node_says_why_and_every_edge_too(mapped):
+    mapper, updates, _ = mapped
+    made = [update for update in updates if update.new_node is not None]
+    assert [update.new_node for update in made] == list(range(len(mapper.map)))
+    assert all(update.reason for update in made)
+    assert all(edge.reason for edge in mapper.map.edges)
+
+
+def test_the_correction_brings_odometry_onto_the_map(mapped):
+    mapper, updates, stream = mapped
+    last = [sample for sample in stream if isinstance(sample, SelfMotion)][-1]
+    assert np.allclose(between(compose(mapper.pose_map_odom, last.pose_odom_robot), mapper.pose_map_robot), 0, atol=1e-6)
+
+
+def test_fed_by_hand_in_seconds_gives_the_same_map(mapped):
+    whole, _, stream = mapped
+    mapper = Mapper(Config.load("laser"), stream.rig)
+    for sample in stream:
+        if isinstance(sample, LaserScan):
+            mapper.add_scan(sample.stamp_ns / 1e9, sample.ranges_m)
+        else:
+            mapper.add_odometry(sample.stamp_ns / 1e9, sample.pose_odom_robot)
+    mapper.finish()
+    assert graph_hash(mapper.map) == graph_hash(whole.map)
+
+
+def test_the_pose_follows_the_activity():
+    """No number integrates position beside the network: with other activity the mapper believes to be elsewhere."""
+    mapper = Mapper(Config.load("laser", {"vision.sensor": "none", "neural.rectifier": "softplus", "neural.dtype": "float64"}))
+    for i in range(20):
+        mapper.add_odometry(0.1 * i, [0.05 * i, 0.0, 0.0])
+    before = mapper.integrator.pose
+    mapper.integrator.shift_activity(np.array([0.1, 0.05]))
+    moved = mapper.add_odometry(2.0, [0.95, 0.0, 0.0])
+    assert np.allclose(moved.pose_odom_robot[:2] - before[:2], [0.1, 0.05], atol=1e-4)
+
+
+def test_velocities_make_a_map_of_dead_reckoning():
+    mapper = Mapper(Config.load("laser", {"vision.sensor": "none"}))
+    for i in range(200):
+        mapper.add_velocity(0.05 * i, 0.5, 0.2)
+    mapper.finish()
+    assert len(mapper.map) > 5
+    assert np.hypot(*mapper.pose_map_robot[:2]) == pytest.approx(2 * 2.5 * np.sin(0.5 * 0.2 * 9.95), abs=0.01)
+
+
+def test_odometry_gate_owes_nothing_to_a_back_end():
+    hashes = set()
+    for primary in ("gtsam-lm", "relaxation-ratslam"):
+        overrides = {"edges.gate": "odometry", "backends.names": [primary]}
+        stream = RoomDrive(laps=1.6)
+        mapper = Mapper(Config.load("laser", overrides), stream.rig)
+        drive(mapper, stream)
+        hashes.add(graph_hash(mapper.map))
+    assert len(hashes) == 1
+
+
+def test_rehanging_mode_hangs_the_next_node_on_the_matched_one():
+    stream = RoomDrive(laps=4)
+    mapper = Mapper(Config.load("laser", {"edges.hanging": "ratslam"}), stream.rig)
+    drive(mapper, stream)
+    edges = [edge for edge in mapper.map.edges if edge.kind is EdgeKind.ODOMETRY and edge.status is Status.ACCEPTED]
+    assert any(edge.target != edge.source + 1 for edge in edges)
+
+
+def test_nan_odometry_is_refused_with_its_stamp():
+    stream = RoomDrive(laps=1, nan_at=7)
+    mapper = Mapper(Config.load("laser"), stream.rig)
+    with pytest.raises(StreamError, match=r"0\.700000000.*NaN"):
+        drive(mapper, stream)

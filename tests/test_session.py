@@ -1,0 +1,119 @@
+"""Stream -> mapper -> map file."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybridmap import session
+from hybridmap.config import Config
+from hybridmap.errors import StoreError, StreamError
+from hybridmap.graph.hashing import graph_hash
+from hybridmap.store import MapStore
+from hybridmap.trajectory import read_tum
+from tests.streams_for_tests import RoomDrive
+
+OVERRIDES = {"backends.names": ["gtsam-gnc", "relaxation-ratslam", "odometry"]}
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted((folder / "trajectory").iterdir())}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    out = tmp_path_factory.mktemp("session") / "s"
+    return session.run(RoomDrive(laps=2.2), Config.load("laser", OVERRIDES), out)
+
+
+def test_the_folder_holds_what_is_promised(finished):
+    names = {path.relative_to(finished.folder.path).as_posix() for path in finished.folder.path.rglob("*") if path.is_file()}
+    trajectories = {f"trajectory/{name}.tum" for name in ("odometry", "gtsam-gnc", "relaxation-ratslam")}
+    trajectories |= {f"trajectory/{name}_online.tum" for name in ("odometry", "gtsam-gnc", "relaxation-ratslam")}
+    assert names == {"map.db", "config.yaml", "metrics.json", "reference/groundtruth.tum"} | trajectories
+
+
+def test_the_file_gives_back_the_map(finished):
+    with MapStore.open(finished.folder.path) as store:
+        assert graph_hash(store.map()) == finished.head["graph_hash"]
+        assert set(store.solutions()) == set(OVERRIDES["backends.names"])
+        assert "ranges_m" in store.keyframe(0)
+        assert set(store.snapshot(0)) >= {"grid_phases", "heading"}
+
+
+def test_a_pose_for_every_distinct_stamp(finished):
+    stamps = sorted({sample.stamp_ns for sample in RoomDrive(laps=2.2)})
+    for path in (finished.folder.path / "trajectory").iterdir():
+        assert np.array_equal(read_tum(path).stamps_ns, stamps), path.name
+
+
+def test_the_same_input_gives_the_same_bytes(finished, tmp_path):
+    again = session.run(RoomDrive(laps=2.2), Config.load("laser", OVERRIDES), tmp_path / "s")
+    assert again.head["graph_hash"] == finished.head["graph_hash"]
+    assert digests(tmp_path / "s") == digests(finished.folder.path)
+
+
+def test_a_session_is_not_overwritten_by_chance_but_on_demand(tmp_path):
+    config = Config.load("laser", {"vision.sensor": "none"})
+    session.run(RoomDrive(laps=0.2, with_scans=False), config, tmp_path / "s")
+    with pytest.raises(StoreError, match="overwrite"):
+        session.run(RoomDrive(laps=0.2, with_scans=False), config, tmp_path / "s")
+    (tmp_path / "s" / "notes.txt").write_text("mine")
+    session.run(RoomDrive(laps=0.4, with_scans=False), config, tmp_path / "s", overwrite=True)
+    assert (tmp_path / "s" / "notes.txt").read_text() == "mine"
+
+
+def test_bad_input_leaves_nothing_behind_and_loses_nothing(tmp_path):
+    config = Config.load("laser", {"vision.sensor": "none"})
+    with pytest.raises(StreamError, match="NaN"):
+        session.run(RoomDrive(laps=0.5, nan_at=20), config, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+    kept = session.run(RoomDrive(laps=0.2, with_scans=False), config, tmp_path / "old").head["graph_hash"]
+    with pytest.raises(StreamError, match="NaN"):
+        session.run(RoomDrive(laps=0.5, nan_at=20), config, tmp_path / "old", overwrite=True)
+    with MapStore.open(tmp_path / "old") as store:
+        assert graph_hash(store.map()) == kept
+
+
+def test_nothing_to_map_is_said():
+    class Empty(RoomDrive):
+        def __iter__(self):
+            return iter(())
+
+    with pytest.raises(StreamError, match="nothing to map"):
+        session.run(Empty(), Config.load("laser"), Path("never-made"))
+    assert not Path("never-made").exists()
+
+
+def test_a_killed_run_leaves_a_readable_map(tmp_path):
+    script = (
+        "import sys, time\n"
+        "from pathlib import Path\n"
+        "from hybridmap import session\n"
+        "from hybridmap.config import Config\n"
+        "from tests.streams_for_tests import RoomDrive\n"
+        "class Slow(RoomDrive):\n"
+        "    def __iter__(self):\n"
+        "        for i, sample in enumerate(super().__iter__()):\n"
+        "            if i > 120: print('there', flush=True); time.sleep(60)\n"
+        "            yield sample\n"
+        "session.run(Slow(), Config.load('laser'), Path(sys.argv[1]))\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path / "s")], stdout=subprocess.PIPE, cwd=Path(__file__).parents[1]
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"there\n"
+    time.sleep(0.1)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    with MapStore.open(tmp_path / "s") as store:
+        assert len(store.map()) >= 3
