@@ -64,7 +64,7 @@ class BatchBackend(GraphBackend):
                 return other
         return outcome
 
-    def _finish(self, graph: PoseGraph) -> Outcome:
+    def _solve_whole(self, graph: PoseGraph) -> Outcome:
         outcome = self._optimise(graph, best_start(graph))
         if chi2(graph, outcome.poses) > chi2(graph, graph.initial):
             return Outcome(graph.initial, SolveStatus.DIVERGED, "ended worse than it began; kept the start", outcome.iterations)

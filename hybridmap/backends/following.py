@@ -15,7 +15,7 @@ from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.connectivity import extend, require_connected
-from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,8 @@ class Change:
     Attributes:
         added: (A,) indices into the new graph's edges.
         removed: (R,) indices into the old graph's edges.
-        closes: some node that was there before got or lost an edge, so that solved poses may move.
+        closes: a loop came, an edge went, or one came between nodes that were there before: solved poses may move. Further
+            chain edges of a new node (to the last but one, say) do not count: they wait for the next closure.
     """
 
     added: NDArray[np.int64]
@@ -44,23 +45,28 @@ class Change:
     closes: bool
 
 
-def edges_subset(graph: PoseGraph, edges: NDArray[np.int64] | NDArray[np.bool_]) -> PoseGraph:
+def with_edges(graph: PoseGraph, kept: NDArray[np.int64] | NDArray[np.bool_]) -> PoseGraph:
     """The same nodes with some of the edges."""
     return PoseGraph(
         graph.initial,
-        graph.sources[edges],
-        graph.targets[edges],
-        graph.deltas[edges],
-        graph.information[edges],
-        graph.kinds[edges],
-        graph.edge_ids[edges],
+        graph.sources[kept],
+        graph.targets[kept],
+        graph.deltas[kept],
+        graph.information[kept],
+        graph.kinds[kept],
+        graph.edge_ids[kept],
+        None if graph.entered is None else graph.entered[kept],
     )
 
 
 def prefix(graph: PoseGraph, nodes: int) -> PoseGraph:
-    """The first `nodes` nodes and the edges among them."""
-    inside = np.maximum(graph.sources, graph.targets) < nodes
-    return replace(edges_subset(graph, inside), initial=graph.initial[:nodes])
+    """The graph as it was when it had `nodes` nodes.
+
+    Chain edges are there as soon as both of their ends are; loops that were committed late come late.
+    """
+    both = np.maximum(graph.sources, graph.targets)
+    entry = np.where(graph.kinds < EdgeKind.LOOP, both, np.maximum(both, graph.entry_nodes))
+    return replace(with_edges(graph, entry < nodes), initial=graph.initial[:nodes])
 
 
 def difference(old: PoseGraph | None, new: PoseGraph) -> Change:
@@ -77,13 +83,12 @@ def difference(old: PoseGraph | None, new: PoseGraph) -> Change:
     kept_old[i_old[same]], kept_new[i_new[same]] = True, True
     added, removed = np.flatnonzero(~kept_new), np.flatnonzero(~kept_old)
     newest = np.maximum(new.sources[added], new.targets[added])
-    per_new_node = np.bincount(newest[newest >= old.n_nodes], minlength=1)
-    closes = bool(len(removed)) or bool(np.any(newest < old.n_nodes)) or bool(np.any(per_new_node > 1))
+    closes = bool(len(removed) or np.any(newest < old.n_nodes) or np.any(new.kinds[added] >= EdgeKind.LOOP))
     return Change(added, removed, closes)
 
 
 class GraphBackend(ABC):
-    """What all back-ends share; a solver supplies `_optimise` and may refine `_finish`."""
+    """What all back-ends share; a solver supplies `_optimise` and may refine `_solve_whole`."""
 
     def __init__(self, name: str, config: BackendsConfig) -> None:
         self._name = name
@@ -121,7 +126,7 @@ class GraphBackend(ABC):
         frozen.validate()
         require_connected(frozen)
         try:
-            outcome = self._finish(frozen)
+            outcome = self._solve_whole(frozen)
         except RuntimeError as error:  # gtsam raises nothing more specific
             raise BackendError(f"{self._name}: the solver gave up: {_first_line(error)}") from error
         return self._solution(frozen, frozen.initial, self._checked(frozen, frozen.initial, outcome), started)
@@ -130,7 +135,7 @@ class GraphBackend(ABC):
     def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
         """Work on a whole graph from given poses, knowing nothing of earlier calls."""
 
-    def _finish(self, graph: PoseGraph) -> Outcome:
+    def _solve_whole(self, graph: PoseGraph) -> Outcome:
         """What `solve` does."""
         return self._optimise(graph, graph.initial)
 
@@ -150,7 +155,7 @@ class GraphBackend(ABC):
             return graph.initial[:1]
         if graph.n_nodes < old.n_nodes:
             raise BackendError(f"{self._name}: the graph shrank from {old.n_nodes} to {graph.n_nodes} nodes between updates")
-        edges_subset(graph, change.added).validate()
+        with_edges(graph, change.added).validate()
         if len(change.removed):
             require_connected(graph)
         return self._poses
@@ -172,13 +177,14 @@ class GraphBackend(ABC):
         return replace(outcome, poses=poses)
 
     def _solution(self, graph: PoseGraph, start: Array, outcome: Outcome, started: float) -> Solution:
+        final = chi2(graph, outcome.poses)
         report = SolveReport(
             backend=self._name,
             status=outcome.status,
             message=outcome.message,
             iterations=outcome.iterations,
-            chi2_initial=chi2(graph, start),
-            chi2=chi2(graph, outcome.poses),
+            chi2_initial=final if outcome.poses is start else chi2(graph, start),
+            chi2=final,
             cpu_s=time.process_time() - started,
             rejected_edge_ids=tuple(edge for edge, weight in outcome.weights.items() if weight < 0.5),
             weights=outcome.weights,

@@ -144,7 +144,7 @@ class GncBackend(GraphBackend):
     def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
         return cauchy(graph, start, self._config)
 
-    def _finish(self, graph: PoseGraph) -> Outcome:
+    def _solve_whole(self, graph: PoseGraph) -> Outcome:
         config, limit = self._config.gnc, self._config.max_iterations
         results = []
         if config.start in ("auto", "batch"):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, eye_array, tril
 from scipy.sparse.linalg import splu
 
-from hybridmap.backends.base import SolveStatus
+from hybridmap.backends.base import Solution, SolveStatus
 from hybridmap.backends.following import Change, GraphBackend, Outcome
 from hybridmap.geometry import Array, wrap_angle
 from hybridmap.graph.pose_graph import PoseGraph
@@ -24,7 +24,7 @@ class LinkSweep:
     """One graph's links, prepared for sweeps at a given theta."""
 
     def __init__(self, graph: PoseGraph, theta: float) -> None:
-        order = np.lexsort((graph.edge_ids, graph.sources))
+        order = link_order(graph)
         self.sources, self.targets = graph.sources[order], graph.targets[order]
         self.deltas = graph.deltas[order]
         n, e = graph.n_nodes, graph.n_edges
@@ -57,8 +57,13 @@ class LinkSweep:
 class RatslamRelaxation(GraphBackend):
     """`relaxation-ratslam`: some sweeps whenever the graph has grown."""
 
+    def finish(self, graph: PoseGraph) -> Solution:
+        """See `Backend.finish`: the sweeps of one more update; the state is the map."""
+        return self.update(graph)
+
     def _must_work(self, change: Change) -> bool:
-        return bool(len(change.added) or len(change.removed))
+        del change
+        return True
 
     def _follow(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
         del change

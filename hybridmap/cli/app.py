@@ -10,9 +10,12 @@ from typing import Annotated
 
 import typer
 
+from hybridmap.cli.compare import compare
 from hybridmap.cli.demo import demo
 from hybridmap.cli.evaluate import evaluate
+from hybridmap.cli.export import export
 from hybridmap.cli.map import map_source
+from hybridmap.cli.optimize import optimize
 from hybridmap.errors import HybridMapError
 
 app = typer.Typer(
@@ -47,6 +50,9 @@ def _options(
 app.command("demo")(demo)
 app.command("map")(map_source)
 app.command("evaluate")(evaluate)
+app.command("export")(export)
+app.command("optimize")(optimize)
+app.command("compare")(compare)
 
 
 def main() -> None:

@@ -56,7 +56,7 @@ class RobustConfig(Section):
 class Isam2Config(Section):
     """Incremental smoothing."""
 
-    loop_kernel: Literal["none", "cauchy"] = "cauchy"
+    loop_kernel: Literal["none", "cauchy"] = "none"
     """Kernel on the loop edges."""
     relinearize_threshold: float = Field(default=0.01, gt=0)
     """Largest step of a variable (m, rad) before it is linearised anew."""

@@ -12,6 +12,9 @@ from hybridmap.errors import GraphError
 from hybridmap.geometry import Array, compose, inverse
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 
+_TRUST = np.zeros(len(EdgeKind), dtype=np.int64)  # of a kind of edge, when a new node is placed
+_TRUST[EdgeKind.LOOP], _TRUST[EdgeKind.MANUAL], _TRUST[EdgeKind.ODOMETRY], _TRUST[EdgeKind.REGISTRATION] = 0, 0, 1, 2
+
 
 def require_connected(graph: PoseGraph) -> None:
     """Refuse a graph in which some node cannot be placed relative to node 0.
@@ -29,9 +32,9 @@ def require_connected(graph: PoseGraph) -> None:
 
 
 def extend(graph: PoseGraph, placed: Array) -> Array:
-    """Place the nodes beyond `placed` (M, 3) by the newest edge that joins each to a placed one; (N, 3).
+    """Place the nodes beyond `placed` (M, 3) by the best edge that joins each to an earlier one; (N, 3).
 
-    Odometry and registration edges go before loops.
+    Registration goes before odometry before loops; of equal kinds the nearest neighbour in order, then the newest edge.
 
     Raises:
         GraphError: a node has no edge to an earlier one.
@@ -40,12 +43,11 @@ def extend(graph: PoseGraph, placed: Array) -> Array:
     poses = np.concatenate([placed, np.zeros((n - done, 3))])
     if done == n:
         return poses
-    later = np.maximum(graph.sources, graph.targets)
+    later, earlier = np.maximum(graph.sources, graph.targets), np.minimum(graph.sources, graph.targets)
     candidates = np.flatnonzero(later >= done)
-    rank = graph.kinds[candidates] <= EdgeKind.REGISTRATION
-    best: dict[int, int] = {}
-    for edge in candidates[np.lexsort((candidates, rank))].tolist():  # the last one wins: chain edges, newest last
-        best[int(later[edge])] = edge
+    rank = _TRUST[graph.kinds[candidates]]
+    order = np.lexsort((candidates, earlier[candidates], rank))
+    best = dict(zip(later[candidates][order].tolist(), candidates[order].tolist(), strict=True))  # the last one wins
     for node in range(done, n):
         if node not in best:
             raise GraphError(f"graph: node {node} is not connected to an earlier node")

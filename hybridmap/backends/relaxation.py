@@ -1,0 +1,149 @@
+"""The paper's correction rule (its equation 16) as printed, and with the rate divided by each node's degree.
+
+Both keep the transitions in the world frame of the initial chain, so headings stay as odometry had them, and correct all
+nodes at once: a Jacobi step d += theta (b - L d), L the graph's Laplacian, stable only for theta < 2 / lambda_max(L).
+Divided by the degree it is stable for every theta <= 1, as no eigenvalue of D^-1 L is above 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import eigsh
+
+from hybridmap.backends.base import Solution, SolveStatus
+from hybridmap.backends.following import Change, GraphBackend, Outcome
+from hybridmap.config.backends import RelaxationConfig
+from hybridmap.geometry import Array
+from hybridmap.graph.pose_graph import PoseGraph
+
+_CHECK_EVERY = 50  # sweeps between two looks at the objective
+
+
+@dataclass(frozen=True, slots=True)
+class LinearRule:
+    """The rule on one graph: positions `d` (N, 2), transitions `w` (E, 2) in the world frame.
+
+    Attributes:
+        laplacian: (N, N) sparse, every edge of weight one.
+        pull: (N, 2), the constant part b of the gradient.
+        degree: (N,) links of each node.
+    """
+
+    sources: NDArray[np.int64]
+    targets: NDArray[np.int64]
+    transitions: Array
+    laplacian: csr_array
+    pull: Array
+    degree: Array
+
+    @classmethod
+    def of(cls, graph: PoseGraph) -> LinearRule:
+        """Freeze the transitions at the headings of the graph's `initial`."""
+        yaw = graph.initial[graph.sources, 2]
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        dx, dy = graph.deltas[:, 0], graph.deltas[:, 1]
+        transitions = np.column_stack([cos * dx - sin * dy, sin * dx + cos * dy])
+        n, e = graph.n_nodes, graph.n_edges
+        links = np.arange(e)
+        ends = np.concatenate([graph.targets, graph.sources])
+        signs = np.concatenate([np.ones(e), -np.ones(e)])
+        incidence = csr_array((signs, (ends, np.tile(links, 2))), shape=(n, e))
+        laplacian = csr_array(incidence @ incidence.T)
+        degree = np.bincount(ends, minlength=n).astype(np.float64)
+        return cls(graph.sources, graph.targets, transitions, laplacian, incidence @ transitions, degree)
+
+    def correction(self, positions: Array) -> Array:
+        """The bracket of equation 16 for all nodes, (N, 2) m."""
+        return np.asarray(self.pull - self.laplacian @ positions)
+
+    def objective(self, positions: Array) -> float:
+        """Half the sum of squared link errors, m^2: what the rule descends on."""
+        error = positions[self.targets] - positions[self.sources] - self.transitions
+        return 0.5 * float(np.sum(error * error))
+
+
+def lambda_max(laplacian: csr_array) -> float:
+    """Largest eigenvalue of a graph Laplacian; theta must stay below 2 / lambda_max."""
+    n = laplacian.shape[0]
+    if n <= 16:
+        return float(np.linalg.eigvalsh(laplacian.toarray())[-1])
+    start = np.where(np.arange(n) % 2 == 0, 1.0, -1.0) + np.cos(np.arange(n))  # fixed, so that runs agree to the bit
+    return float(eigsh(laplacian, k=1, which="LA", v0=start, tol=1e-6, return_eigenvectors=False)[0])
+
+
+def relax(rule: LinearRule, positions: Array, rate: float | Array, sweeps: int, tolerance_m: float) -> tuple[Array | None, int]:
+    """Some sweeps of d += rate * correction; the positions (None: they grew without bound) and the sweeps done."""
+    before = rule.objective(positions)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for done in range(1, sweeps + 1):
+            step = rate * rule.correction(positions)
+            positions = positions + step
+            largest = np.abs(step).max()
+            if largest <= tolerance_m:
+                return positions, done
+            if (done % _CHECK_EVERY == 0 or done == sweeps) and not rule.objective(positions) <= 1.000001 * before + 1e-12:
+                return None, done
+    return positions, sweeps
+
+
+class _WorldFrameRelaxation(GraphBackend):
+    """Sweeps whenever the graph has grown; the state is the map, so the end of the drive goes on from it."""
+
+    def finish(self, graph: PoseGraph) -> Solution:
+        """See `Backend.finish`: the sweeps of one more update."""
+        return self.update(graph)
+
+    def _must_work(self, change: Change) -> bool:
+        del change
+        return True
+
+    def _follow(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
+        del change
+        return self._relax(graph, start, self._config.relaxation.sweeps_per_node)
+
+    def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
+        return self._relax(graph, start, self._config.relaxation.solve_sweeps)
+
+    def _relax(self, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
+        config = self._config.relaxation
+        rule = LinearRule.of(graph)
+        rate, note = self._rate(rule, config)
+        if rate is None:
+            return Outcome(start, SolveStatus.DIVERGED, f"{note}; not run", 0)
+        positions, done = relax(rule, start[:, :2], rate, sweeps, config.tolerance_m)
+        if positions is None:
+            return Outcome(start, SolveStatus.DIVERGED, f"{note}; diverged within {done} sweeps, kept the start", done)
+        poses = np.column_stack([positions, graph.initial[:, 2]])
+        status = SolveStatus.CONVERGED if done < sweeps else SolveStatus.MAX_ITERATIONS
+        return Outcome(poses, status, f"{note}; {done} sweeps", done)
+
+    def _rate(self, rule: LinearRule, config: RelaxationConfig) -> tuple[float | Array | None, str]:
+        """The rate of each node, or None to refuse; and a word about it."""
+        raise NotImplementedError
+
+
+class NormalisedRelaxation(_WorldFrameRelaxation):
+    """`relaxation-normalised`: theta divided by the node's degree; never raises its objective."""
+
+    def _rate(self, rule: LinearRule, config: RelaxationConfig) -> tuple[float | Array | None, str]:
+        return _normalised(rule, config), f"theta {config.theta} / degree"
+
+
+class PaperRelaxation(_WorldFrameRelaxation):
+    """`relaxation-paper`: equation 16 as printed; what happens beyond theta_max is configured."""
+
+    def _rate(self, rule: LinearRule, config: RelaxationConfig) -> tuple[float | Array | None, str]:
+        largest = lambda_max(rule.laplacian)
+        theta_max = 2.0 / largest if largest > 0.0 else np.inf
+        note = f"theta {config.theta}, theta_max {theta_max:.4g} = 2/lambda_max, lambda_max {largest:.4g}"
+        if config.theta < theta_max or config.on_unstable == "run":
+            return config.theta, note
+        return (_normalised(rule, config), f"{note}, normalised") if config.on_unstable == "normalise" else (None, note)
+
+
+def _normalised(rule: LinearRule, config: RelaxationConfig) -> Array:
+    return np.asarray((config.theta / np.maximum(rule.degree, 1.0))[:, None])

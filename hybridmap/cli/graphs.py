@@ -1,0 +1,54 @@
+"""What `optimize` and `compare` work on: a graph file, or the graph of a session."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hybridmap.errors import GraphError
+from hybridmap.graph.io import read_graph
+from hybridmap.graph.pose_graph import PoseGraph
+
+
+@dataclass(frozen=True, slots=True)
+class GraphSource:
+    """A graph and where it comes from.
+
+    Attributes:
+        path: the file or session folder.
+        graph: its nodes and accepted edges.
+        is_session: whether `path` is a session folder.
+        head: what a JSON object says about it.
+    """
+
+    path: Path
+    graph: PoseGraph
+    is_session: bool
+    head: dict[str, Any] = field(default_factory=dict)
+
+
+def open_graph(path: Path) -> GraphSource:
+    """Read a g2o or TORO file, or the graph of a session folder.
+
+    Raises:
+        GraphError: a file that is missing, damaged or of another kind, or a session without an edge.
+        StoreError: a folder that holds no session.
+    """
+    if not path.is_dir():
+        graph = read_graph(path)
+        return GraphSource(path, graph, is_session=False, head=_head(path, graph))
+    from hybridmap.graph.hashing import graph_hash
+    from hybridmap.store import MapStore, SessionFolder
+
+    SessionFolder(path).require()
+    with MapStore.open(path) as store:
+        experiences = store.map()
+    graph = experiences.pose_graph()
+    if graph.n_edges == 0:
+        raise GraphError(f"{path}: the map has no accepted edge; there is nothing to optimise")
+    return GraphSource(path, graph, is_session=True, head=_head(path, graph) | {"graph_hash": graph_hash(experiences)})
+
+
+def _head(path: Path, graph: PoseGraph) -> dict[str, Any]:
+    return {"graph": str(path), "nodes": graph.n_nodes, "edges": graph.n_edges, "loops": int(graph.is_loop.sum())}

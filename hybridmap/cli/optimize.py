@@ -1,0 +1,50 @@
+"""`hybridmap optimize`: one graph through one back-end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def optimize(
+    graph: Annotated[Path, typer.Argument(metavar="GRAPH", help="A g2o or TORO file (planar), or a session folder.")],
+    backend: Annotated[
+        str, typer.Option(metavar="NAME", help="Back-end, e.g. gtsam-lm; a wrong name lists them.")
+    ] = "gtsam-lm",
+    out: Annotated[Path | None, typer.Option(metavar="FILE.g2o", help="Write the optimised graph here (m, rad).")] = None,
+    config: Annotated[str | None, typer.Option(help="Configuration with the back-end's settings: a name or a file.")] = None,
+    setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+) -> None:
+    """Optimise a graph: chi2 before and after, status, iterations, CPU seconds.
+
+    Exit code 1, and no file, where the back-end failed or diverged.
+    """
+    from hybridmap.backends import SolveStatus, create
+    from hybridmap.backends.comparison import Row, metrics_of
+    from hybridmap.cli.choose import parse_settings
+    from hybridmap.cli.graphs import open_graph
+    from hybridmap.cli.show import emit
+    from hybridmap.config import Config
+    from hybridmap.graph.io import write_g2o
+
+    chosen = create(backend, Config.load(config, parse_settings(setting)).backends)
+    source = open_graph(graph)
+    solution = chosen.solve(source.graph)
+    report = solution.report
+    solved = report.status not in (SolveStatus.FAILED, SolveStatus.DIVERGED)
+    if out is not None and solved:
+        write_g2o(out, source.graph, solution.poses)
+    head = source.head | {
+        "backend": backend,
+        "status": str(report.status),
+        "message": report.message,
+        "rejected_edge_ids": list(report.rejected_edge_ids),
+    }
+    emit(head, metrics_of([Row(backend, solution)]), as_json=as_json, title=f"{graph}: {backend}: {report.status}")
+    if not as_json:
+        typer.echo(report.message)
+    if not solved:
+        raise typer.Exit(1)
