@@ -1,0 +1,34 @@
+"""`hybridmap export`: a session for Open3D, a navigation stack or another SLAM tool."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+_NAMES = "tum, kitti, g2o, grid, ply, pcd, lineset, posegraph"
+
+
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Session folder, as `hybridmap map` writes it.")],
+    format_name: Annotated[str, typer.Option("--format", metavar="F", help=f"One of: {_NAMES}.")],
+    out: Annotated[Path, typer.Option(metavar="PATH", help="File to write; `grid` writes PATH.yaml and PATH.pgm.")],
+    backend: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Whose poses; default: the session's primary back-end.")
+    ] = None,
+    resolution: Annotated[float, typer.Option(min=0.001, max=10.0, help="Cell of the occupancy grid, m.")] = 0.05,
+    voxel: Annotated[float, typer.Option(min=0.001, max=10.0, help="Clouds keep one point a cube of this side, m.")] = 0.02,
+    max_depth: Annotated[float, typer.Option(min=0.1, help="Depth beyond this is left out, m.")] = 5.0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
+) -> None:
+    """Write trajectories, graphs, clouds or grids in the map frame of one back-end; m and rad."""
+    from hybridmap.cli.show import emit
+    from hybridmap.export import ExportOptions, export_session
+
+    options = ExportOptions(resolution_m=resolution, voxel_m=voxel, max_depth_m=max_depth)
+    written = export_session(folder, format_name, out, backend=backend, overwrite=overwrite, options=options)
+    files = [str(path) for path in written.files]
+    head = {"format": format_name, "backend": written.backend, "files": files}
+    emit(head, written.metrics, as_json=as_json, title=f"{', '.join(files)} ({written.backend})")

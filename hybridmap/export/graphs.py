@@ -1,0 +1,105 @@
+"""The graph for other tools: g2o, Open3D LineSet, Open3D PoseGraph."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hybridmap.errors import ExportError
+from hybridmap.export.view import SessionView
+from hybridmap.geometry import Array, RelativePose, invert_relative
+from hybridmap.graph.experience_map import Edge, Status
+from hybridmap.graph.io import write_g2o
+from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.metrics import Metric
+
+_COLORS = {
+    EdgeKind.ODOMETRY: (0.30, 0.35, 0.45),
+    EdgeKind.REGISTRATION: (0.15, 0.60, 0.35),
+    EdgeKind.LOOP: (0.85, 0.25, 0.20),
+    EdgeKind.MANUAL: (0.55, 0.25, 0.70),
+}
+_REJECTED_COLOR = (0.95, 0.75, 0.35)
+_PLANAR = (3, 4, 2)
+"""Where x, y and yaw stand in Open3D's order: three rotations, three translations."""
+
+
+def write_g2o_graph(view: SessionView, path: Path) -> list[Metric]:
+    """Nodes at the back-end's poses and all accepted edges, 17 significant digits."""
+    graph = view.experiences.pose_graph()
+    write_g2o(path, graph, view.poses)
+    return _counts("g2o", graph.n_nodes, graph.n_edges)
+
+
+def write_lineset(view: SessionView, path: Path) -> list[Metric]:
+    """Nodes as points in the plane z = 0, accepted edges as lines: odometry grey, registration green, loops red.
+
+    A loop that the back-end gave no weight is yellow.
+    """
+    import open3d as o3d
+
+    edges = _accepted(view)
+    if not edges:
+        raise ExportError("lineset: the graph has no edge; a LineSet without lines cannot be read back")
+    points = np.column_stack([view.poses[:, :2], np.zeros(len(view.poses))])
+    lines = np.array([(edge.source, edge.target) for edge in edges.values()], dtype=np.int32)
+    colors = [_REJECTED_COLOR if n in view.rejected else _COLORS[edge.kind] for n, edge in edges.items()]
+    drawn = o3d.geometry.LineSet(o3d.utility.Vector3dVector(points), o3d.utility.Vector2iVector(lines))
+    drawn.colors = o3d.utility.Vector3dVector(np.array(colors))
+    if not o3d.io.write_line_set(path, drawn):
+        raise ExportError(f"{path.name}: Open3D could not write the LineSet")
+    return _counts("lineset", len(points), len(lines))
+
+
+def write_posegraph(view: SessionView, path: Path) -> list[Metric]:
+    """Open3D's PoseGraph: nodes `T_map_node`; edges carry the source seen from the target, loops are `uncertain`.
+
+    Out of the plane the information is as large as the largest within it, so that Open3D's optimiser stays planar.
+
+    Raises:
+        ExportError: the graph has no edge; `read_pose_graph` fails on such a file.
+    """
+    import open3d as o3d
+
+    edges = _accepted(view)
+    if not edges:
+        raise ExportError("posegraph: the graph has no edge, and Open3D cannot read a PoseGraph without edges")
+    registration = o3d.pipelines.registration
+    drawn = registration.PoseGraph()
+    for pose in view.poses:
+        drawn.nodes.append(registration.PoseGraphNode(planar_matrix(pose)))
+    for edge in edges.values():
+        assert edge.relative is not None
+        turned = invert_relative(edge.relative)
+        uncertain = edge.kind is EdgeKind.LOOP
+        matrix, information = planar_matrix(turned.delta), _spatial_information(turned)
+        drawn.edges.append(registration.PoseGraphEdge(edge.source, edge.target, matrix, information, uncertain))
+    o3d.io.write_pose_graph(path, drawn)
+    if not path.is_file():
+        raise ExportError(f"{path.name}: Open3D could not write the PoseGraph")
+    return _counts("posegraph", len(drawn.nodes), len(drawn.edges))
+
+
+def planar_matrix(pose: Array) -> Array:
+    """The (4, 4) homogeneous matrix of a planar pose (3,)."""
+    matrix = np.eye(4)
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    matrix[:2, :2] = [[cos, -sin], [sin, cos]]
+    matrix[:2, 3] = pose[:2]
+    return matrix
+
+
+def _spatial_information(relative: RelativePose) -> Array:
+    planar = np.linalg.inv(relative.covariance)
+    information = np.eye(6) * float(np.max(np.diag(planar)))
+    information[np.ix_(_PLANAR, _PLANAR)] = 0.5 * (planar + planar.T)
+    return information
+
+
+def _accepted(view: SessionView) -> dict[int, Edge]:
+    return {number: edge for number, edge in enumerate(view.experiences.edges) if edge.status is Status.ACCEPTED}
+
+
+def _counts(name: str, nodes: int, edges: int) -> list[Metric]:
+    return [Metric(f"nodes/{name}", nodes, "1", "nodes written"), Metric(f"edges/{name}", edges, "1", "edges written")]

@@ -1,0 +1,173 @@
+"""The occupancy grid that `map_server` of ROS reads, ray-cast from laser scans or depth keyframes.
+
+Log-odds as in S. Thrun, W. Burgard, D. Fox, "Probabilistic Robotics", 2005, section 9.2; the files as documented by
+`map_server` (trinary mode).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.errors import ExportError
+from hybridmap.export.keyframes import depth_points, laser_points
+from hybridmap.export.view import SessionView
+from hybridmap.geometry import Array, compose, transform_points
+from hybridmap.metrics import Metric
+from hybridmap.streams.base import Camera
+from hybridmap.trajectory import write_text_atomic
+
+_HIT, _MISS, _LIMIT = 0.9, -0.4, 4.0
+"""Log-odds that a return adds to its cell, that a beam passing adds, and where they saturate."""
+
+_OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
+_OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
+_MARGIN_CELLS = 10
+_SHIFT = 4
+"""Fractional bits of OpenCV's polygon corners."""
+_BEAM_GAP_RAD = np.radians(5.0)
+_MAX_CELLS = 400_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """An occupancy grid.
+
+    Attributes:
+        log_odds: (H, W) float32; positive is occupied, negative free, zero unknown; row 0 has the smallest y.
+        origin_m: (2,) position in `map` of the lower left corner of cell (0, 0).
+        resolution_m: side of a cell.
+    """
+
+    log_odds: NDArray[np.float32]
+    origin_m: Array
+    resolution_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Fan:
+    """Beams of one keyframe in `map`: where they start (2,), where they return (K, 2), and the bearing of each (K,)."""
+
+    origin: Array
+    ends: Array
+    bearings: Array
+
+
+def write_grid(view: SessionView, path: Path) -> list[Metric]:
+    """Write `path` (yaml) and the picture beside it (pgm): 0 occupied, 254 free, 205 unknown, top row = largest y.
+
+    Raises:
+        ExportError: the session keeps neither ranges nor depth, or the grid would be too large.
+    """
+    grid = build_grid(view)
+    occupancy = 1.0 / (1.0 + np.exp(-grid.log_odds))
+    picture: NDArray[np.uint8] = np.full(grid.log_odds.shape, _UNKNOWN, dtype=np.uint8)
+    picture[occupancy > _OCCUPIED_THRESHOLD] = _OCCUPIED
+    picture[occupancy < 1.0 - _OCCUPIED_THRESHOLD] = _FREE
+    height, width = grid.log_odds.shape
+    image = path.with_suffix(".pgm")
+    image.write_bytes(f"P5\n{width} {height}\n255\n".encode() + picture[::-1].tobytes())
+    write_text_atomic(
+        path,
+        f"image: {image.name}\n"
+        f"mode: trinary\n"
+        f"resolution: {grid.resolution_m:.17g}\n"
+        f"origin: [{grid.origin_m[0]:.17g}, {grid.origin_m[1]:.17g}, 0.0]\n"
+        f"negate: 0\n"
+        f"occupied_thresh: {_OCCUPIED_THRESHOLD}\n"
+        f"free_thresh: {_FREE_THRESHOLD}\n",
+    )
+    cell = grid.resolution_m**2
+    return [
+        Metric("size/grid", width * height, "1", f"cells, {width} x {height} of {grid.resolution_m} m"),
+        Metric("occupied/grid", float(np.count_nonzero(picture == _OCCUPIED)) * cell, "m^2", "area found occupied"),
+        Metric("free/grid", float(np.count_nonzero(picture == _FREE)) * cell, "m^2", "area found free"),
+    ]
+
+
+def build_grid(view: SessionView) -> Grid:
+    """Ray-cast every keyframe into log-odds.
+
+    Raises:
+        ExportError: as `write_grid`.
+    """
+    fans = list(_fans(view))
+    if not fans:
+        raise ExportError(
+            "grid: the session's keyframes hold no valid range and no obstacle in depth; map with a laser or camera"
+        )
+    resolution = view.options.resolution_m
+    corners = np.concatenate([np.vstack([fan.origin[None], fan.ends]) for fan in fans])
+    low = np.floor(corners.min(axis=0) / resolution).astype(np.int64) - _MARGIN_CELLS
+    size = np.floor(corners.max(axis=0) / resolution).astype(np.int64) + _MARGIN_CELLS + 1 - low
+    if size[0] * size[1] > _MAX_CELLS:
+        raise ExportError(f"grid: {size[0]} x {size[1]} cells of {resolution} m are too many; give a coarser --resolution")
+    log_odds = np.zeros((int(size[1]), int(size[0])), np.float32)
+    for fan in fans:
+        _cast(log_odds, fan, low, resolution)
+    return Grid(log_odds, low * resolution, resolution)
+
+
+def _cast(log_odds: NDArray[np.float32], fan: _Fan, low: NDArray[np.int64], resolution: float) -> None:
+    """Add one keyframe: cells that a return falls into gain, cells that beams pass lose."""
+    import cv2
+
+    origin = fan.origin / resolution - low
+    ends = fan.ends / resolution - low
+    cells = np.floor(ends).astype(np.int64)
+    window = np.floor(np.vstack([ends, origin[None]])).astype(np.int64)
+    first, last = window.min(axis=0) - 1, window.max(axis=0) + 2
+    passed = np.zeros((int(last[1] - first[1]), int(last[0] - first[0])), np.uint8)
+    corners = np.rint((_wedges(origin, ends, fan.bearings) - first - 0.5) * (1 << _SHIFT)).astype(np.int32)
+    if len(corners):
+        cv2.fillPoly(passed, [corners], 1, shift=_SHIFT)
+    hit = np.zeros_like(passed)
+    hit[cells[:, 1] - first[1], cells[:, 0] - first[0]] = 1
+    part = log_odds[first[1] : last[1], first[0] : last[0]]
+    part += np.where(hit > 0, np.float32(_HIT), np.where(passed > 0, np.float32(_MISS), np.float32(0.0)))
+    np.clip(part, -_LIMIT, _LIMIT, out=part)
+
+
+def _wedges(origin: Array, ends: Array, bearings: Array) -> Array:
+    """(3 W, 2) corners of the triangles between neighbouring beams, each as far as the shorter of its two reaches."""
+    near = np.flatnonzero(np.diff(bearings) <= _BEAM_GAP_RAD)
+    reach = np.maximum(np.linalg.norm(ends - origin, axis=1), 1e-9)
+    shorter = np.minimum(reach[near], reach[near + 1])
+    left = origin + (ends[near] - origin) * (shorter / reach[near])[:, None]
+    right = origin + (ends[near + 1] - origin) * (shorter / reach[near + 1])[:, None]
+    return np.stack([np.broadcast_to(origin, left.shape), left, right], axis=1).reshape(-1, 2)
+
+
+def _fans(view: SessionView) -> Iterator[_Fan]:
+    rig = view.store.rig
+    for node, pose in enumerate(view.poses):
+        keyframe = view.store.keyframe(node)
+        if "ranges_m" in keyframe and rig.laser is not None:
+            ends, valid = laser_points(keyframe, rig.laser)
+            order = np.argsort(rig.laser.bearings_rad[valid], kind="stable")
+            fan = _Fan(rig.laser.pose_base_laser[:2], ends[valid][order], rig.laser.bearings_rad[valid][order])
+        elif "depth_mm" in keyframe and rig.camera is not None:
+            points = depth_points(keyframe, rig.camera, view.options.max_depth_m).xyz
+            fan = _fan_of_depth(points, rig.camera, view)
+        else:
+            continue
+        if len(fan.ends):
+            yield _Fan(compose(pose, [*fan.origin, 0.0])[:2], transform_points(pose, fan.ends), fan.bearings)
+
+
+def _fan_of_depth(points: Array, camera: Camera, view: SessionView) -> _Fan:
+    """The nearest obstacle in each of as many bearings as half the picture has columns."""
+    origin = camera.T_base_camera[:2, 3]
+    tall = (points[:, 2] >= view.options.obstacle_low_m) & (points[:, 2] <= view.options.obstacle_high_m)
+    offset = points[tall, :2] - origin
+    bearing, reach = np.arctan2(offset[:, 1], offset[:, 0]), np.hypot(offset[:, 0], offset[:, 1])
+    step = 2.0 / camera.fx_px
+    column = np.floor(bearing / step).astype(np.int64)
+    order = np.lexsort((reach, column))
+    _, first = np.unique(column[order], return_index=True)
+    nearest = order[first]
+    return _Fan(origin, origin + offset[nearest], bearing[nearest])
