@@ -14,17 +14,17 @@ class PlaceConfig(Section):
 
     attractor_side: int = Field(default=32, ge=8, le=256)
     """Cells along a side of the place attractor; the place code has side * side entries."""
-    attractor_cell_m: float = Field(default=0.2, gt=0)
+    attractor_cell_m: float = Field(default=0.16, gt=0)
     """Metres a cell of the place attractor; the sheet wraps after side * cell metres."""
-    attractor_width_cells: float = Field(default=1.1, ge=1.0, le=6.0)
+    attractor_width_cells: float = Field(default=1.4, ge=1.2, le=6.0)
     """Standard deviation of the attractor's bump, cells."""
     grid_inputs_side: int = Field(default=4, ge=3)
     """Grid cells along a side of each sheet that project to place cells; must divide the sheet's side."""
     learning_rate: float = Field(default=0.0005, ge=0, le=1)
     """eta of the Hebbian rule, per learning step."""
-    recruit_threshold: float = Field(default=0.6, gt=0, lt=1)
+    recruit_threshold: float = Field(default=0.3, gt=0, lt=1)
     """A cell is recruited where no other responds above this share of its peak."""
-    inhibition: float = Field(default=0.5, ge=0, lt=1)
+    inhibition: float = Field(default=0.6, ge=0, lt=1)
     """C_inh_p, as a share of a field's peak drive; larger means narrower fields."""
     learning_period_steps: int = Field(default=4, ge=1)
     """Moving steps between two learning steps (four at 30 Hz: the theta rhythm)."""

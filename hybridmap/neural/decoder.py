@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,10 +25,10 @@ class Decoded:
 
 
 class PhaseDecoder:
-    """Least squares on the phases of all bands of all modules, with the wraps resolved near a prior position.
+    """Least squares on the phases of all bands of all modules, with the wraps resolved from where to start.
 
-    One module repeats after its spacing; the phases of all modules together repeat only far beyond the largest. The prior
-    says which repetition is meant. It enters nowhere else: anywhere inside its basin the answer is the same.
+    One module repeats after its spacing; the phases of all modules together repeat only far beyond the largest. A start says
+    which repetition is meant, and enters nowhere else: anywhere inside its basin the answer is the same.
     """
 
     _AGREEMENT_CYCLES = 0.06
@@ -35,35 +36,43 @@ class PhaseDecoder:
     def __init__(self, wave_vectors: NDArray[np.float64], box_m: float) -> None:
         """Take wave vectors (M, 3, 2), cycles per metre, and the half side of the scanned box, m."""
         self._waves = wave_vectors.reshape(-1, 2)
-        self._solve = np.linalg.pinv(self._waves)
-        shortest = 1.0 / float(np.linalg.norm(self._waves, axis=1).max())
-        ticks = np.arange(-np.ceil(box_m / (shortest / 6.0)), np.ceil(box_m / (shortest / 6.0)) + 1) * (shortest / 6.0)
-        self._ticks = ticks
+        self._solve = np.linalg.pinv(self._waves).T
+        tick = 1.0 / (6.0 * float(np.linalg.norm(self._waves, axis=1).max()))
+        half = int(np.ceil(box_m / tick))
+        self._ticks = np.arange(-half, half + 1) * tick
 
-    def decode(self, phases_cycles: NDArray[np.float64], priors_m: list[Array]) -> Decoded:
+    def decode(self, phases_cycles: NDArray[np.float64], starts_m: Array, far_m: Callable[[], Array]) -> Decoded:
         """Decode phases (M, 3), cycles.
 
         Args:
             phases_cycles: (M, 3) phases of the sheets' first modes.
-            priors_m: positions (2,); the first from which the modules agree is taken. Where none is close enough, the box
-                around the last one is scanned for the position on which all modules agree best.
+            starts_m: (S, 2) likely positions; the first from which the modules come to agree gives the answer. Where none
+                does, the box around the last one is scanned for the position on which the modules agree best.
+            far_m: gives further starts (F, 2), tried only where the box holds no agreement either.
         """
         phases = phases_cycles.reshape(-1)
-        for prior in priors_m:
-            found = self._refine(phases, prior)
+        for start in starts_m:
+            found = self._refine(phases, start[None])
             if found.misfit_cycles < self._AGREEMENT_CYCLES:
                 return found
-        return self._refine(phases, self._scan(phases, priors_m[-1]))
+        near = self._refine(phases, self._scan(phases, starts_m[-1])[None])
+        if near.misfit_cycles < self._AGREEMENT_CYCLES:
+            return near
+        far = self._refine(phases, far_m())
+        return far if far.misfit_cycles < self._AGREEMENT_CYCLES else near
 
-    def _refine(self, phases: NDArray[np.float64], start_m: Array) -> Decoded:
-        position = start_m
+    def _refine(self, phases: NDArray[np.float64], starts_m: Array) -> Decoded:
+        """Gauss-Newton from each start (S, 2), twice; the best agreement wins."""
+        position = starts_m
         for _ in range(2):
-            residual = phases - self._waves @ position
-            residual -= np.round(residual)
-            position = position + self._solve @ residual
-        residual = phases - self._waves @ position
-        residual -= np.round(residual)
-        return Decoded(position, float(np.sqrt(residual @ residual / residual.size)))
+            position = position + self._residual(phases, position) @ self._solve
+        misfit = np.sqrt(np.mean(self._residual(phases, position) ** 2, axis=1))
+        best = int(np.argmin(misfit))
+        return Decoded(position[best], float(misfit[best]))
+
+    def _residual(self, phases: NDArray[np.float64], position_m: Array) -> NDArray[np.float64]:
+        residual = phases - position_m @ self._waves.T
+        return np.asarray(residual - np.round(residual))
 
     def _scan(self, phases: NDArray[np.float64], centre_m: Array) -> Array:
         along_x = np.exp(2j * np.pi * np.outer(self._ticks, self._waves[:, 0]))

@@ -15,14 +15,18 @@ from hybridmap.neural.head_direction import HeadDirectionRing
 from hybridmap.neural.place import PlaceCells
 from hybridmap.neural.torus import LowModes, shift_sheets
 
+_PART_OF_WRAP = 0.1
+_WRAPS = np.stack(np.meshgrid(np.arange(-8.0, 9.0), np.arange(-8.0, 9.0)), axis=-1).reshape(-1, 2)
+
 
 class PathIntegrator:
     """Head direction -> band -> grid -> place -> place attractor.
 
     The pose is read from the head-direction ring and from the phases of all grid sheets together. No number integrates
-    position beside the network. What the read-out needs besides is which repetition of the code is meant: the place
-    attractor's bump says it up to the attractor's own wrap (some metres), and the last decoded position says which of those.
-    Both are a prior only: within the box around it, other activity means another pose.
+    position beside the network. What the read-out needs besides is which repetition of the code is meant. The last decoded
+    position and the place attractor's bump say where to start; where the modules do not agree there, the box around it is
+    scanned, and then the attractor's other wraps (8 each way). The start picks a repetition and enters nowhere else: other
+    activity means another pose.
     """
 
     def __init__(self, config: NeuralConfig) -> None:
@@ -82,8 +86,10 @@ class PathIntegrator:
 
     def decode(self) -> Decoded:
         """Decode the position from all sheets together, with how well the modules agree."""
-        priors = [self._last_decoded_m, self.attractor.unwrapped_m(self._last_decoded_m)]
-        decoded = self._decoder.decode(self.grid.band_phases(), priors)
+        near = self.attractor.unwrapped_m(self._last_decoded_m)
+        decoded = self._decoder.decode(
+            self.grid.band_phases(), np.stack([self._last_decoded_m, near]), lambda: near + _WRAPS * self.attractor.extent_m
+        )
         self._last_decoded_m = decoded.position_m
         return decoded
 
@@ -133,12 +139,19 @@ class PathIntegrator:
         self._last_decoded_m = np.asarray(snapshot["near_m"], dtype=np.float64).copy()
 
     def _translate(self, displacement_m: Array) -> None:
+        """Move the network; a jump is taken in parts, so that the read-out sees each turn of the attractor's wrap."""
+        parts = int(np.ceil(np.linalg.norm(displacement_m) / (_PART_OF_WRAP * self.attractor.extent_m)))
+        for _ in range(parts):
+            self._translate_part(displacement_m / parts)
+
+    def _translate_part(self, displacement_m: Array) -> None:
         advance = self.bands.step(displacement_m)
         self.grid.step(advance, self.bands.phasors())
         self.attractor.step(displacement_m)
         self._moves += 1
         if self._moves % self.config.place.learning_period_steps == 0:
             self.place.learn(self.grid.activity)
+            self.decode()
 
 
 def _grid(config: NeuralConfig) -> GridModules:

@@ -17,14 +17,14 @@ class PlaceCells:
 
     The printed rule bounds no weight and leaves most cells with several fields. Here weights are non-negative with rows of
     unit length, and where no cell responds above the threshold a new one is recruited in one step: its weights are the grid
-    cells' present rates above their mean (C_inh_g). Coarse modules weigh more, in proportion to their spacing, which is what
-    keeps side peaks down. Everything is deterministic.
+    cells' present rates above their mean (C_inh_g). Coarse modules weigh more (by the root of their spacing), which widens a
+    field without letting side peaks through. Everything is deterministic.
     """
 
     def __init__(self, config: PlaceConfig, sheet_side: int, spacings_m: NDArray[np.float64]) -> None:
         self.config = config
         self._stride = sheet_side // config.grid_inputs_side
-        self._module_weight = (spacings_m / spacings_m.max()).astype(np.float32)[:, None]
+        self._module_weight = np.sqrt(spacings_m / spacings_m.max()).astype(np.float32)[:, None]
         self._weights = np.zeros((256, len(spacings_m) * config.grid_inputs_side**2), dtype=np.float32)
         self._recruited = 0
 

@@ -1,0 +1,53 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from hybridmap.neural.torus import LowModes, shift_sheets, split_shift
+
+
+def smooth_sheets(seed: int) -> np.ndarray:
+    modes = LowModes(32, 4)
+    return modes.inverse(modes.forward(np.random.default_rng(seed).normal(size=(3, 32, 32))))
+
+
+def test_transforms_are_those_of_numpy():
+    sheets = np.random.default_rng(0).normal(size=(3, 32, 32))
+    full = np.fft.fft2(sheets)
+    modes = LowModes(32, 4).forward(sheets)
+    assert modes == pytest.approx(full[:, np.arange(-4, 5)][:, :, np.arange(5)])
+
+
+def test_inverse_undoes_forward_on_low_modes():
+    sheets = smooth_sheets(1)
+    modes = LowModes(32, 4)
+    assert modes.inverse(modes.forward(sheets)) == pytest.approx(sheets, abs=1e-12)
+
+
+@settings(max_examples=20, deadline=None)
+@given(whole=hnp.arrays(np.int64, (3, 2), elements=st.integers(-40, 40)), seed=st.integers(0, 9))
+def test_a_shift_by_whole_cells_is_a_roll(whole, seed):
+    sheets, modes = smooth_sheets(seed), LowModes(32, 4)
+    expected = np.stack([np.roll(s, w, axis=(0, 1)) for s, w in zip(sheets, whole, strict=True)])
+    assert modes.inverse(modes.forward(sheets) * modes.shift(whole / 32)) == pytest.approx(expected, abs=1e-10)
+    assert shift_sheets(sheets, whole / 32) == pytest.approx(expected, abs=1e-10)
+
+
+def test_the_first_shell_has_six_modes():
+    squared = LowModes(32, 4).squared_wave_number()
+    half = {(int(p), int(q)) for p, q in np.argwhere(squared == 1) - [4, 0]}
+    assert half == {(1, 0), (-1, 0), (0, 1), (1, 1)}
+
+
+@given(st.floats(-1e6, 1e6))
+def test_floor_and_residual(shift):
+    whole, residual = split_shift(np.array([shift]))
+    assert 0.0 <= residual[0] <= 1.0
+    assert whole[0] + residual[0] == pytest.approx(shift)
+
+
+def test_floor_of_a_negative_shift():
+    whole, residual = split_shift(np.array([-0.3, 0.3, -2.0]))
+    assert whole.tolist() == [-1, 0, -2]
+    assert residual == pytest.approx([0.7, 0.3, 0.0])
