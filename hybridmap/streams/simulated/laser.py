@@ -43,5 +43,5 @@ class LaserModel:
         return LaserScan(stamp_ns, self._valid(ranges.astype(np.float32), dropped))
 
     def _valid(self, ranges: NDArray[np.float32], dropped: NDArray[np.bool_]) -> NDArray[np.float32]:
-        inside = (ranges >= np.float32(self.laser.range_min_m)) & (ranges <= np.float32(self.laser.range_max_m))
+        inside = (ranges >= np.float32(self.laser.range_min_m)) & (ranges < np.float32(self.laser.range_max_m))
         return np.where(inside & ~dropped, ranges, np.float32(np.nan))
