@@ -18,7 +18,7 @@ from hybridmap.streams.bagfile import BagFile, RawMessage
 from hybridmap.streams.mounting import TransformTree, clean_frame, matrix
 from hybridmap.streams.order import sorted_order
 from hybridmap.streams.topics import ODOMETRY, TRANSFORM, is_static
-from hybridmap.trajectory import Trajectory, format_stamp
+from hybridmap.trajectory import NS_PER_S, Trajectory, format_stamp
 
 
 @dataclass(slots=True)
@@ -133,7 +133,7 @@ def _take_transforms(index: BagIndex, bag: BagFile, message: RawMessage, odom_fr
         p, q = transform.transform.translation, transform.transform.rotation
         what = f"{bag.path}: {message.topic}: {parent} -> {child}"
         stamp = transform.header.stamp
-        stamp_ns = int(getattr(stamp, "sec", 0)) * 1_000_000_000 + int(getattr(stamp, "nanosec", 0))
+        stamp_ns = int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
         if parent == odom_frame and not is_static(message.topic):
             track = index.tf_tracks.setdefault((parent, child), PoseTrack(parent, child))
             if not track.stamps_ns or track.stamps_ns[-1] != stamp_ns:  # tf is published again and again
