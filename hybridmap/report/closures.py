@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,12 +13,15 @@ from hybridmap.geometry import Array, between, transform_points
 from hybridmap.graph.experience_map import Edge, Status
 from hybridmap.report import style
 from hybridmap.report.map_figure import loops_by_fate
-from hybridmap.report.outline import outline
 from hybridmap.report.scene import ODOMETRY, Scene
 from hybridmap.store import MapStore
 from hybridmap.trajectory import NS_PER_S
 
 _ACCEPTED_EXAMPLES = 3
+_NEIGHBOURS = 6
+_MAX_POINTS = 3000
+_SIMILAR_HEADING_RAD = np.radians(40.0)
+_APART_S = 20.0
 _NEW, _OLD = style.PRIMARY, style.ODOMETRY
 
 
@@ -45,13 +48,19 @@ class Example:
     profiles: str | None
 
 
-def examples(scene: Scene, store: MapStore) -> list[Example]:
-    """Some accepted closures, spread over the drive, and one that was refused after it had been measured."""
+def examples(scene: Scene, store: MapStore, points_of: Mapping[int, Array]) -> list[Example]:
+    """Some accepted closures, spread over the drive, and one that was refused after it had been measured.
+
+    Args:
+        scene: the session.
+        store: its keyframes.
+        points_of: node -> what it saw, (M, 2) in `base_link`, m.
+    """
     fates = loops_by_fate(scene)
-    chosen = spread(fates["loops accepted"] or fates["accepted, no weight in the primary back-end"], _ACCEPTED_EXAMPLES)
-    refused = fates["loops rejected"]
-    chosen += spread([edge for edge in refused if edge.relative is not None] or refused, 1)
-    return [_example(scene, store, edge) for edge in chosen]
+    accepted = fates["loops accepted"] or fates["accepted, no weight in the primary back-end"]
+    chosen = spread(_telling(scene, accepted, _ACCEPTED_EXAMPLES), _ACCEPTED_EXAMPLES)
+    chosen += spread(_telling(scene, fates["loops rejected"], 1), 1)
+    return [_example(scene, store, edge, points_of) for edge in chosen]
 
 
 def spread(edges: Sequence[Edge], count: int) -> list[Edge]:
@@ -61,24 +70,36 @@ def spread(edges: Sequence[Edge], count: int) -> list[Edge]:
     return [edges[(2 * k + 1) * len(edges) // (2 * count)] for k in range(count)]
 
 
-def _example(scene: Scene, store: MapStore, edge: Edge) -> Example:
-    new, old = store.keyframe(edge.source), store.keyframe(edge.target)
-    delta = edge.relative.delta if edge.relative is not None else between(scene.nodes[edge.source], scene.nodes[edge.target])
-    points = outline(new, store.rig), outline(old, store.rig)
-    photos = tuple(style.photo_uri(frame["color"]) for frame in (new, old) if "color" in frame)
-    profiles = [frame["profile"] for frame in (new, old) if "profile" in frame]
+def _telling(scene: Scene, edges: Sequence[Edge], least: int) -> list[Edge]:
+    """Edges by newer node; where there are enough, only those that were measured, lie far apart in time, look the same way."""
+    stamps_s = np.array([node.stamp_ns for node in scene.experiences.nodes]) / NS_PER_S
+    tests = (
+        lambda e: e.relative is not None,
+        lambda e: abs(stamps_s[e.source] - stamps_s[e.target]) >= _APART_S,
+        lambda e: e.relative is not None and abs(e.relative.delta[2]) < _SIMILAR_HEADING_RAD,
+    )
+    kept = sorted(edges, key=lambda e: (e.source, e.target))
+    for test in tests:
+        better = [edge for edge in kept if test(edge)]
+        kept = better if len(better) >= least else kept
+    return kept
+
+
+def _example(scene: Scene, store: MapStore, edge: Edge, points_of: Mapping[int, Array]) -> Example:
+    accepted = edge.status is Status.ACCEPTED
+    both = f"node {edge.source} and node {edge.target}"
+    frames = store.keyframe(edge.source), store.keyframe(edge.target)
+    photos = tuple(style.photo_uri(frame["color"]) for frame in frames if "color" in frame)
+    profiles = [frame["profile"] for frame in frames if "profile" in frame]
     return Example(
-        title=f"node {edge.source} sees node {edge.target} again" if edge.status is Status.ACCEPTED
-        else f"node {edge.source} and node {edge.target}: {edge.status}",
-        accepted=edge.status is Status.ACCEPTED,
+        title=f"{both}: the same place" if accepted else f"{both}: {edge.status}",
+        accepted=accepted,
         reason=edge.reason,
         facts=_facts(scene, edge),
         photos=photos if len(photos) == 2 else (),
-        overlay=_overlay(points[0], points[1], delta, measured=edge.relative is not None)
-        if len(points[0]) and len(points[1])
-        else None,
+        overlay=_overlay(scene, edge, points_of),
         profiles=_profiles(profiles[0], profiles[1], round(edge.scores.get("shift", 0.0))) if len(profiles) == 2 else None,
-    )  # fmt: skip
+    )
 
 
 def _facts(scene: Scene, edge: Edge) -> tuple[tuple[str, str], ...]:
@@ -98,34 +119,55 @@ def _facts(scene: Scene, edge: Edge) -> tuple[tuple[str, str], ...]:
     return tuple(rows)
 
 
-def _overlay(new: Array, old: Array, delta: Array, *, measured: bool) -> str:
+def _seen_around(scene: Scene, node: int, points_of: Mapping[int, Array]) -> Array:
+    """What a node and its neighbours along the drive saw, (M, 2) in the frame of the node, m."""
+    nodes = range(max(0, node - _NEIGHBOURS), min(len(scene.nodes), node + _NEIGHBOURS + 1))
+    delta = between(scene.nodes[node], scene.nodes)
+    seen = [transform_points(delta[k], points_of[k]) for k in nodes if k in points_of]
+    points = np.concatenate(seen) if seen else np.zeros((0, 2))
+    return points[:: max(1, len(points) // _MAX_POINTS)]
+
+
+def _overlay(scene: Scene, edge: Edge, points_of: Mapping[int, Array]) -> str | None:
+    new, old = (_seen_around(scene, node, points_of) for node in (edge.source, edge.target))
+    if not len(new) or not len(old):
+        return None
+    delta = edge.relative.delta if edge.relative is not None else between(scene.nodes[edge.source], scene.nodes[edge.target])
     placed = transform_points(delta, old)
-    with style.figure(3.4, 3.0) as picture:
+    with style.figure(3.8, 3.4) as picture:
         axes = picture.add_subplot()
-        size = {"linestyle": "none", "markersize": 2.2, "alpha": 0.7}
-        axes.plot(placed[:, 0], placed[:, 1], marker="s", color=_OLD, label="older node", **size)
-        axes.plot(new[:, 0], new[:, 1], marker="o", color=_NEW, label="newer node", **size)
-        axes.plot(0, 0, marker=(3, 0, -90), markersize=8, color=_NEW)
-        axes.plot(*delta[:2], marker=(3, 0, float(np.degrees(delta[2])) - 90), markersize=8, color=_OLD)
+        dots: dict[str, Any] = {"linestyle": "none", "marker": ".", "markeredgewidth": 0, "rasterized": True}
+        axes.plot(placed[:, 0], placed[:, 1], color=_OLD, markersize=4.0, alpha=0.6, label="older", **dots)
+        axes.plot(new[:, 0], new[:, 1], color=_NEW, markersize=2.6, alpha=0.8, label="newer", **dots)
+        _draw_robot(axes, delta, _OLD)
+        _draw_robot(axes, np.zeros(3), _NEW)
         style.metric_axes(axes)
-        axes.set_title("laid over by the measured pose" if measured else "laid over as the map has them", fontsize=8.5)
-        picture.legend(loc="outside lower center", ncols=2)
+        how = "by the measured pose" if edge.relative is not None else "as the map has them (nothing was measured)"
+        axes.set_title(f"laid over each other {how}", fontsize=8.5)
+        legend = picture.legend(loc="outside lower center", ncols=2, markerscale=3.0)
+        for handle in legend.legend_handles:
+            handle.set_alpha(1.0)
         return style.svg_uri(picture)
+
+
+def _draw_robot(axes: Any, pose: Array, color: str) -> None:
+    marker = (3, 0, float(np.degrees(pose[2])) - 90.0)
+    axes.plot(*pose[:2], marker=marker, markersize=10, color=color, markeredgecolor="white", zorder=6)
 
 
 def _profiles(new: NDArray[Any], old: NDArray[Any], shift: int) -> str:
     bands, width = new.shape
     spacing = 1.15 * float(max(np.ptp(new, axis=1).max(), np.ptp(old, axis=1).max(), 1e-6))
     column = np.arange(width)
-    with style.figure(3.4, 3.0) as picture:
+    with style.figure(3.8, 3.4) as picture:
         axes = picture.add_subplot()
         for band in range(bands):
             base = (bands - 1 - band) * spacing
             axes.plot(column + shift, old[band] + base, color=_OLD, linewidth=1.0, linestyle=(0, (4, 1)))
             axes.plot(column, new[band] + base, color=_NEW, linewidth=1.0)
         axes.set_yticks([(bands - 1 - band) * spacing for band in range(bands)], _band_names(bands))
-        axes.set_xlabel(f"column; older one shifted by {shift}" if shift else "column")
-        axes.set_title("scanline profiles (normalised)", fontsize=8.5)
+        axes.set_xlabel(f"column; the older one moved by {shift}" if shift else "column")
+        axes.set_title("scanline profiles, normalised", fontsize=8.5)
         return style.svg_uri(picture)
 
 

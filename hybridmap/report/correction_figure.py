@@ -17,14 +17,15 @@ def correction_figure(correction: Correction, points_of: Mapping[int, Array]) ->
     """Two panels on the same axes: nodes and what they saw, before and after; a `data:` URI."""
     both = np.concatenate([correction.before, correction.after])[:, :2]
     low, high = both.min(axis=0) - 1.5, both.max(axis=0) + 1.5
-    with style.figure(*style.fitted_size(*(high - low), width_in=9.6, panels=2)) as picture:
-        left, right = picture.subplots(1, 2, sharex=True, sharey=True)
+    with style.figure(*style.fitted_size(high - low, panels=2)) as picture:
+        left, right = picture.subplots(1, 2)
         _panel(left, "before", correction.before, points_of, style.ODOMETRY)
         _panel(right, "after", correction.after, points_of, style.PRIMARY)
         _draw_shifts(right, correction)
         right.set_ylabel("")
-        left.set_xlim(low[0], high[0])
-        left.set_ylim(low[1], high[1])
+        for axes in (left, right):
+            axes.set_xlim(low[0], high[0])
+            axes.set_ylim(low[1], high[1])
         return style.svg_uri(picture)
 
 
@@ -33,7 +34,7 @@ def _panel(axes: Any, title: str, poses: Array, points_of: Mapping[int, Array], 
     axes.plot(poses[:, 0], poses[:, 1], color=color, linewidth=1.0, marker=".", markersize=3, zorder=4)
     axes.plot(*poses[-1, :2], marker="o", markersize=7, color="white", markeredgecolor="black", zorder=6)
     axes.set_title(title)
-    style.metric_axes(axes)
+    style.metric_axes(axes, adjustable="box")
 
 
 def _draw_shifts(axes: Any, correction: Correction) -> None:
@@ -41,4 +42,4 @@ def _draw_shifts(axes: Any, correction: Correction) -> None:
     from matplotlib.collections import LineCollection
 
     shifts = np.stack([correction.before[:, :2], correction.after[:, :2]], axis=1)
-    axes.add_collection(LineCollection(shifts, color=style.ODOMETRY, linewidth=0.6, alpha=0.6, zorder=3))
+    axes.add_collection(LineCollection(list(shifts), color=style.ODOMETRY, linewidth=0.6, alpha=0.6, zorder=3))

@@ -15,6 +15,7 @@ from hybridmap.report.scene import ODOMETRY, ONLINE, Scene
 from hybridmap.trajectory import NS_PER_S
 
 _FLOOR_M, _FLOOR_DEG = 1e-3, 1e-2
+_INTERVALS = 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,24 +60,25 @@ def error_figure(scene: Scene) -> str | None:
     if not series:
         return None
     styles = style.line_styles(scene.backends)
-    with style.figure(9.6, 5.0) as picture:
+    with style.figure(style.PAGE_WIDTH_IN, 5.0) as picture:
         position, heading = picture.subplots(2, 1, sharex=True, height_ratios=(3, 2))
         for name, errors in series.items():
             looks = dict(styles[name.removesuffix(ONLINE)])
             if name.endswith(ONLINE) and scene.truth is not None:
                 looks |= {"linewidth": 0.8, "alpha": 0.6, "zorder": 3, "linestyle": "solid"}
             label = name.replace(ONLINE, ", as believed at the time")
-            step = max(1, len(errors.time_s) // 2500)
-            position.plot(errors.time_s[::step], np.maximum(errors.position_m, _FLOOR_M)[::step], label=label, **looks)
-            heading.plot(errors.time_s[::step], np.maximum(errors.heading_deg, _FLOOR_DEG)[::step], **looks)
+            drawn = over_intervals(errors, _INTERVALS)
+            position.plot(drawn.time_s, np.maximum(drawn.position_m, _FLOOR_M), label=label, **looks)
+            heading.plot(drawn.time_s, np.maximum(drawn.heading_deg, _FLOOR_DEG), **looks)
         _mark_loops(scene, position)
         against = "ground truth" if scene.truth is not None else "final map"
         for axes, what in ((position, "position error (m)"), (heading, "heading error (deg)")):
             axes.set_yscale("log")
+            axes.yaxis.set_major_formatter("{x:g}")
             axes.set_ylabel(what)
             axes.grid(True, linewidth=0.5)
         heading.set_xlabel(f"time since the start (s); errors against the {against}")
-        picture.legend(loc="outside upper left", ncols=4)
+        picture.legend(loc="outside upper left", ncols=5)
         return style.svg_uri(picture)
 
 
@@ -84,6 +86,21 @@ def _series(since_start_ns: Any, estimate: Array, reference: Array) -> ErrorSeri
     offset = estimate[:, :2] - reference[:, :2]
     turned = np.degrees(np.abs(wrap_angle(estimate[:, 2] - reference[:, 2])))
     return ErrorSeries(np.asarray(since_start_ns / NS_PER_S), np.hypot(offset[:, 0], offset[:, 1]), turned)
+
+
+def over_intervals(errors: ErrorSeries, count: int) -> ErrorSeries:
+    """Root mean square over `count` equal intervals of time; empty ones are left out."""
+    if len(errors.time_s) <= count:
+        return errors
+    first, last = errors.time_s[0], errors.time_s[-1]
+    interval = np.minimum(((errors.time_s - first) / (last - first) * count).astype(np.int64), count - 1)
+    number = np.bincount(interval, minlength=count)
+    seen = number > 0
+    sums = [np.bincount(interval, weights=values, minlength=count)[seen] for values in (
+        errors.time_s, errors.position_m**2, errors.heading_deg**2
+    )]  # fmt: skip
+    time, position, heading = (total / number[seen] for total in sums)
+    return ErrorSeries(time, np.sqrt(position), np.sqrt(heading))
 
 
 def _mark_loops(scene: Scene, axes: Any) -> None:

@@ -32,7 +32,7 @@ def trajectories_figure(scene: Scene, building: Raster | None) -> str:
         start = scene.estimates.get(scene.primary, scene.estimates["odometry"]).poses[0]
         axes.plot(*start[:2], marker="o", markersize=7, color="white", markeredgecolor="black", zorder=8, label="start")
         style.metric_axes(axes)
-        picture.legend(loc="outside upper left", ncols=4)
+        picture.legend(loc="outside upper left", ncols=6)
         return style.svg_uri(picture)
 
 
@@ -40,7 +40,7 @@ def graph_figure(scene: Scene, building: Raster | None) -> str:
     """Nodes at the primary back-end's poses, chain, and loops by their fate; a `data:` URI."""
     with style.figure(*_size(scene.nodes[:, :2], building)) as picture:
         axes = picture.add_subplot()
-        style.draw_building(axes, building, darkness=0.25)
+        style.draw_building(axes, building, darkness=0.35)
         chain = [e for e in scene.experiences.edges if e.kind is not EdgeKind.LOOP and e.status is Status.ACCEPTED]
         _draw_edges(axes, scene, chain, color="#9a9a9a", linewidth=0.8, zorder=2)
         loops = loops_by_fate(scene)
@@ -90,7 +90,7 @@ def _draw_edges(axes: Any, scene: Scene, edges: list[Edge], **looks: Any) -> Non
     if not edges:
         return
     ends = np.array([[edge.source, edge.target] for edge in edges])
-    axes.add_collection(LineCollection(scene.nodes[ends][:, :, :2], **looks))
+    axes.add_collection(LineCollection(list(scene.nodes[ends][:, :, :2]), **looks))
 
 
 def _size(points: Any, building: Raster | None) -> tuple[float, float]:
@@ -98,4 +98,4 @@ def _size(points: Any, building: Raster | None) -> tuple[float, float]:
     if building is not None:
         low = np.minimum(low, [building.extent[0], building.extent[2]])
         high = np.maximum(high, [building.extent[1], building.extent[3]])
-    return style.fitted_size(*(high - low), width_in=9.6)
+    return style.fitted_size(high - low)

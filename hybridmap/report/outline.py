@@ -18,6 +18,7 @@ _DEPTH_COLUMNS = 80
 _MAX_DEPTH_M = 6.0
 _MAX_KEYFRAMES = 1500
 _PIXELS = 900
+_FAINTEST = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +65,8 @@ def raster(points_of: Mapping[int, Array], poses: Array) -> Raster | None:
     counts, _, _ = np.histogram2d(points[:, 0], points[:, 1], bins=tuple(bins), range=np.stack([low, top], axis=1))
     seen = counts[counts > 0]
     full = float(np.percentile(seen, 90)) if len(seen) else 1.0
-    grey = np.minimum(np.log1p(counts.T) / np.log1p(full), 1.0).astype(np.float32)
+    strength = np.minimum(np.log1p(counts.T) / np.log1p(full), 1.0)
+    grey = np.where(counts.T > 0, _FAINTEST + (1.0 - _FAINTEST) * strength, 0.0).astype(np.float32)
     return Raster(grey, (float(low[0]), float(top[0]), float(low[1]), float(top[1])))
 
 

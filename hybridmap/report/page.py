@@ -62,9 +62,9 @@ def _content(scene: Scene, store: MapStore) -> dict[str, Any]:
         "graph": graph_figure(scene, building),
         "errors": error_figure(scene),
         "correction": None if correction is None else correction_figure(correction, points_of),
-        "correction_shift": None if correction is None else tables.number(correction.shift_m),
+        "correction_shift": None if correction is None else " ".join(tables.length(correction.shift_m)),
         "correction_time": None if correction is None else tables.number(round((correction.stamp_ns - start_ns) / NS_PER_S, 1)),
-        "examples": examples(scene, store),
+        "examples": examples(scene, store, points_of),
         "by_backend": tables.by_backend(scene.metrics, scene.backends),
         "of_session": tables.of_session(scene.metrics, scene.backends),
         "config_yaml": scene.config_yaml,
@@ -105,12 +105,11 @@ def tiles(scene: Scene) -> list[Tile]:
 
 
 def _tile(metric: Metric, label: str) -> Tile:
-    value, unit = metric.value, metric.unit
-    if metric.unit == "m" and abs(value) < 1.0:
-        return Tile(f"{100 * value:.2g}" if abs(value) < 0.1 else f"{100 * value:.0f}", "cm", label)
-    if unit == "s/min":
-        return Tile(f"{value:.3g}", "s", label)
-    return Tile(f"{value:.0f}" if unit == "1" else f"{value:.3g}", tables.unit(metric), label)
+    if metric.unit == "m":
+        return Tile(*tables.length(metric.value), label)
+    if metric.unit == "s/min":
+        return Tile(f"{metric.value:.3g}", "s", label)
+    return Tile(f"{metric.value:.0f}" if metric.unit == "1" else f"{metric.value:.3g}", tables.unit(metric), label)
 
 
 def _remarks(scene: Scene) -> list[str]:

@@ -17,6 +17,7 @@ from hybridmap.report.outline import Raster
 TRUTH, ODOMETRY, PRIMARY = "#000000", "#d55e00", "#0072b2"
 OTHERS = ("#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#7f6000", "#5b3a8e")
 ACCEPTED, UNWEIGHTED, PENDING, REJECTED = "#009e73", "#cc79a7", "#e69f00", "#d55e00"
+PAGE_WIDTH_IN = 9.6
 _MAX_POINTS = 2500
 _SETTINGS = {
     "font.size": 9.0,
@@ -72,7 +73,7 @@ def figure(width_in: float, height_in: float) -> Iterator[Any]:
 def svg_uri(picture: Any) -> str:
     """The figure as a `data:` URI; the same figure gives the same text."""
     text = io.BytesIO()
-    picture.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    picture.savefig(text, format="svg", dpi=160, metadata={"Date": None, "Creator": None})
     return "data:image/svg+xml;base64," + base64.b64encode(text.getvalue()).decode("ascii")
 
 
@@ -90,7 +91,7 @@ def thinned(poses: Array) -> Array:
     return poses if step == 1 else np.concatenate([poses[:-1:step], poses[-1:]])
 
 
-def draw_building(axes: Any, building: Raster | None, darkness: float = 0.45) -> None:
+def draw_building(axes: Any, building: Raster | None, darkness: float = 0.55) -> None:
     """What the robot saw, in grey, under everything else."""
     if building is None:
         return
@@ -100,16 +101,16 @@ def draw_building(axes: Any, building: Raster | None, darkness: float = 0.45) ->
     )  # fmt: skip
 
 
-def metric_axes(axes: Any) -> None:
+def metric_axes(axes: Any, adjustable: str = "datalim") -> None:
     """Equal axes in metres."""
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal", adjustable=adjustable)
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
     axes.grid(True, linewidth=0.5)
     axes.set_axisbelow(True)
 
 
-def fitted_size(width_m: float, height_m: float, width_in: float, panels: int = 1) -> tuple[float, float]:
-    """Width and height of a figure, inches, for side-by-side panels that show `width_m` by `height_m`."""
-    shape = max(height_m, 0.5) / max(width_m, 0.5)
-    return width_in, float(np.clip(width_in / panels * shape + 1.1, 2.6, 8.5))
+def fitted_size(span_m: Array, panels: int = 1) -> tuple[float, float]:
+    """Width and height of a figure, inches, whose side-by-side panels each show `span_m` (2,), m."""
+    shape = max(float(span_m[1]), 0.5) / max(float(span_m[0]), 0.5)
+    return PAGE_WIDTH_IN, float(np.clip(PAGE_WIDTH_IN / panels * shape + 1.1, 2.6, 8.5))

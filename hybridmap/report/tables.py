@@ -20,7 +20,7 @@ class Row:
 
 
 def by_backend(metrics: Sequence[Metric], backends: Sequence[str]) -> list[Row]:
-    """A row a measure that at least one of the back-ends has, a cell a back-end."""
+    """A row a measure that at least one of the back-ends has, a cell a back-end; the last column's words explain it."""
     measures: dict[str, dict[str, Metric]] = {}
     for metric in metrics:
         measure, _, stage = metric.name.partition("/")
@@ -28,9 +28,9 @@ def by_backend(metrics: Sequence[Metric], backends: Sequence[str]) -> list[Row]:
             measures.setdefault(measure, {})[stage] = metric
     rows = []
     for measure, found in measures.items():
-        first = next(iter(found.values()))
+        last = next(found[name] for name in reversed(backends) if name in found)
         cells = tuple(shown(found[name]) if name in found else "" for name in backends)
-        rows.append(Row(measure, unit(first), first.description, cells))
+        rows.append(Row(measure, unit(last), last.description, cells))
     return rows
 
 
@@ -56,6 +56,14 @@ def number(value: float) -> str:
     if value == round(value) and abs(value) < 1e7:
         return f"{value:.0f}"
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e7 else f"{value:.4g}"
+
+
+def length(value_m: float) -> tuple[str, str]:
+    """A length as people say it: (digits, unit), below a metre in cm."""
+    if not math.isfinite(value_m):
+        return "–", "m"
+    value, name = (100.0 * value_m, "cm") if abs(value_m) < 1.0 else (value_m, "m")
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.2g}" if abs(value) < 10 else f"{value:.3g}", name
 
 
 def unit(metric: Metric) -> str:
