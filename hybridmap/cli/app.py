@@ -16,6 +16,7 @@ from hybridmap.cli.evaluate import evaluate
 from hybridmap.cli.export import export
 from hybridmap.cli.map import map_source
 from hybridmap.cli.optimize import optimize
+from hybridmap.cli.simulate import simulate
 from hybridmap.errors import HybridMapError
 
 app = typer.Typer(
@@ -53,6 +54,7 @@ app.command("evaluate")(evaluate)
 app.command("export")(export)
 app.command("optimize")(optimize)
 app.command("compare")(compare)
+app.command("simulate")(simulate)
 
 
 def main() -> None:

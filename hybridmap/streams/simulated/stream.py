@@ -48,7 +48,7 @@ class SimulatedStream:
         self._report = StreamReport()
         truth = drive(self._world.legs, DriveLimits(config.speed_m_s, config.turn_rate_rad_s), 1.0 / config.odometry_rate_hz)
         if config.duration_s is not None:
-            truth = truth[: max(2, int(config.duration_s * config.odometry_rate_hz) + 1)]
+            truth = truth[: max(3, int(config.duration_s * config.odometry_rate_hz) + 1)]
         stamps = _stamps_ns(len(truth), config.odometry_rate_hz)
         self._truth = Trajectory(stamps, np.column_stack([truth[:, :2], as_transmitted(truth[:, 2])]))
         self._odometry = wheel_odometry(truth, config.wheels, self._generators()[_WHEELS])
@@ -72,6 +72,11 @@ class SimulatedStream:
     def groundtruth(self) -> Trajectory:
         """True poses of `base_link` in the world at the stamps of the odometry."""
         return self._truth
+
+    @property
+    def odometry(self) -> Trajectory:
+        """What the wheels report: poses of `base_link` in `odom`."""
+        return Trajectory(self._truth.stamps_ns, self._odometry)
 
     @property
     def expected_observations(self) -> int:

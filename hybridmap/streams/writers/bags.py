@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 from hybridmap.errors import StreamError
@@ -81,17 +80,15 @@ def write_rosbag2(
         StreamError: the place is taken or cannot be written to, or the stream holds what a bag cannot.
     """
     suffix = _SUFFIXES[storage]
-    bare = path.suffix in _SUFFIXES.values()
-    if bare and path.suffix != suffix:
+    bare = path.suffix.lower() in _SUFFIXES.values()
+    if bare and path.suffix.lower() != suffix:
         raise StreamError(f"{path}: a {storage} bag ends in {suffix}")
     with staged(path, overwrite=overwrite) as partial:
-        if not bare:
-            return _write_folder(stream, partial, storage, progress)
-        with TemporaryDirectory(prefix=f".{path.stem}.", dir=path.parent) as scratch:
-            folder = Path(scratch) / path.stem
-            counts = _write_folder(stream, folder, storage, progress)
+        folder = partial.with_suffix("") if bare else partial
+        counts = _write_folder(stream, folder, storage, progress)
+        if bare:
             next(folder.glob(f"*{suffix}")).rename(partial)
-            return counts
+    return counts
 
 
 def _write_folder(stream: Stream, folder: Path, storage: str, progress: Progress) -> dict[str, int]:

@@ -21,23 +21,23 @@ def silent(done: int, total: int | None) -> None:
 
 @contextmanager
 def staged(path: Path, *, overwrite: bool) -> Iterator[Path]:
-    """Yield a path beside `path` to write to; it takes its place when the block ends without an error.
+    """Yield a path of the same name in a folder beside `path`; it takes its place when the block ends without an error.
 
     Raises:
         StreamError: something is there already that may not be replaced, or the place cannot be written to.
     """
     _check(path, overwrite=overwrite)
-    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
+    scratch = path.with_name(f".{path.name}.partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _remove(partial)
-        yield partial
+        _remove(scratch)
+        scratch.mkdir(parents=True)
+        yield scratch / path.name
         _remove(path)
-        partial.rename(path)
+        (scratch / path.name).rename(path)
     except OSError as error:
         raise StreamError(f"{path}: cannot be written: {error.strerror or error}") from None
     finally:
-        _remove(partial)
+        _remove(scratch)
 
 
 def _check(path: Path, *, overwrite: bool) -> None:

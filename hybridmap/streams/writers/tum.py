@@ -41,7 +41,7 @@ def write_tum(stream: Stream, folder: Path, *, overwrite: bool = False, progress
     camera = stream.rig.camera
     if camera is None:
         raise StreamError(f"{folder}: a TUM folder holds colour and depth, and {stream.name} has no camera; write a bag")
-    counts = {"odometry": 0, "frames": 0, "scans left out": 0}
+    left_out = 0
     with staged(folder, overwrite=overwrite) as partial:
         for name in ("rgb", "depth"):
             (partial / name).mkdir(parents=True)
@@ -55,14 +55,15 @@ def write_tum(stream: Stream, folder: Path, *, overwrite: bool = False, progress
                 _write_pictures(partial, stamps[-1], sample)
                 progress(len(stamps), stream.expected_observations)
             else:
-                counts["scans left out"] += 1
+                left_out += 1
         _write_lists(partial, stamps)
         _write_poses(partial / "odometry.txt", "wheel odometry: base_link in odom", odometry)
         if (truth := stream.groundtruth) is not None:
             lines = [_pose_line(int(stamp), pose) for stamp, pose in zip(truth.stamps_ns, truth.poses, strict=True)]
             _write_poses(partial / "groundtruth_base.txt", "true pose of base_link in the world", lines)
         (partial / "camera.yaml").write_text(_calibration(camera), encoding="utf-8")
-    return counts | {"odometry": len(odometry), "frames": len(stamps)}
+    counts = {"odometry": len(odometry), "frames": len(stamps)}
+    return counts | ({"scans left out": left_out} if left_out else {})
 
 
 def _pose_line(stamp_ns: int, pose: Array) -> str:
