@@ -12,13 +12,16 @@ from hybridmap.geometry import Array
 from hybridmap.streams.bagfile import BagFile
 from hybridmap.streams.bagindex import PoseTrack, build_index
 from hybridmap.streams.bagsensors import MessageKey, SensorPlan, plan_frames, plan_scans
-from hybridmap.streams.base import Sample, SelfMotion, StreamReport
+from hybridmap.streams.base import LaserScan, RgbdFrame, Sample, SelfMotion, StreamReport
 from hybridmap.streams.mounting import clean_frame, planar
 from hybridmap.streams.order import Window, merge
 from hybridmap.streams.topics import CAMERA_INFO, IMAGE, ODOMETRY, SCAN, TRANSFORM, select
 from hybridmap.trajectory import Trajectory
 
 _READ = ODOMETRY + SCAN + IMAGE + CAMERA_INFO + TRANSFORM
+
+
+_COUNT_OF: dict[type, str] = {SelfMotion: "odometry", LaserScan: "scans", RgbdFrame: "frames"}
 
 
 class BagStream:
@@ -41,16 +44,23 @@ class BagStream:
             self._bag, (topic.name for topic in self._bag.topics if topic.msgtype in _READ), self._sensors.odom_frame
         )
         self.selection = select(self._bag.topics, self._sensors, self._index.frame_of, str(path))
-        self._fixed_remarks = list(self.selection.remarks)
+        self.remarks = list(self.selection.remarks)
         track, what = self._self_motion()
         self._base_frame = self._choose_base(track)
         carry = self._carry(track, what)
         self._motion_ns, self._motion_poses = track.sorted(what, carry)
         self._plan_made = self._plan()
-        self._planned, self.rig = self._plan_made.planned, self._plan_made.rig
-        self._fixed_remarks += self._plan_made.remarks
+        self._planned, self.rig, self.losses = self._plan_made.planned, self._plan_made.rig, self._plan_made.losses
+        self.remarks += self._plan_made.remarks
         self._apply(window or Window())
         self.report = StreamReport()
+
+    @property
+    def uses(self) -> dict[str, str]:
+        """Role -> topic that the samples come from."""
+        needless = {"scan"} if self.rig.laser is None else set()
+        needless |= {"color", "depth", "color_info", "depth_info"} if self.rig.camera is None else set()
+        return {role: topic for role, topic in self.selection.uses().items() if role not in needless}
 
     @property
     def groundtruth(self) -> Trajectory | None:
@@ -69,9 +79,9 @@ class BagStream:
         Raises:
             StreamError: a message is damaged; the message names topic and place.
         """
-        self.report = StreamReport(dict(self._plan_made.losses), list(self._fixed_remarks))
+        self.report = StreamReport(dict(self.losses), list(self.remarks))
         for sample in merge(self._motions(), self._observations()):
-            self.report.count("odometry" if isinstance(sample, SelfMotion) else "observations")
+            self.report.count(_COUNT_OF[type(sample)])
             yield sample
         if self._plan_made.decode is not None:
             self.report.counts |= self._plan_made.decode.counts
@@ -115,7 +125,7 @@ class BagStream:
                 f"{self._bag.path}: no odometry: expected a topic of type nav_msgs/Odometry or the transform "
                 f"{odom!r} -> base on /tf; topics found: {types}"
             )
-        self._fixed_remarks.append(f"no Odometry topic: self-motion from the transform {tracks[0].parent} -> {tracks[0].child}")
+        self.remarks.append(f"no Odometry topic: self-motion from the transform {tracks[0].parent} -> {tracks[0].child}")
         return tracks[0], f"{self._bag.path}: transform {tracks[0].parent} -> {tracks[0].child}"
 
     def _choose_base(self, track: PoseTrack) -> str:

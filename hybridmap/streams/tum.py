@@ -49,10 +49,10 @@ class TumStream:
         """
         self.name = folder.name or str(folder)
         self._folder, self._sensors = folder, config.sensors
-        self._remarks: list[str] = []
+        self.remarks: list[str] = []
         self._odometry = self._read_odometry()
         self._calibration, self._T_base_camera, self._units_per_m = _read_calibration(folder, config.sensors)
-        self._pairs, self._losses = _read_pairs(folder, config.sensors.sync_tolerance_s)
+        self._pairs, self.losses = _read_pairs(folder, config.sensors.sync_tolerance_s)
         if config.vision.sensor == "laser":
             raise StreamError(f"{folder}: no laser: a TUM folder holds colour and depth; set vision.sensor to rgbd")
         if config.vision.sensor == "none":
@@ -76,10 +76,19 @@ class TumStream:
         Raises:
             StreamError: a picture is damaged or of another size or kind than expected.
         """
-        self.report = StreamReport(dict(self._losses), list(self._remarks))
+        self.report = StreamReport(dict(self.losses), list(self.remarks))
         for sample in merge(self._motions(), self._frames()):
-            self.report.count("odometry" if isinstance(sample, SelfMotion) else "observations")
+            self.report.count("odometry" if isinstance(sample, SelfMotion) else "frames")
             yield sample
+
+    @property
+    def uses(self) -> dict[str, str]:
+        """Role -> file that the samples come from."""
+        listed = (self._folder / "associations.txt").is_file()
+        lists = {"frames": "associations.txt"} if listed else {"color": "rgb.txt", "depth": "depth.txt"}
+        truths = [name for name in ("groundtruth_base.txt", "groundtruth.txt") if (self._folder / name).is_file()]
+        found = {"odometry": self._sensors.odometry_file or "odometry.txt"} | (lists if self._pairs else {})
+        return found | ({"groundtruth": truths[0]} if truths else {})
 
     def _motions(self) -> Iterator[Sample]:
         for stamp, pose in zip(self._odometry.stamps_ns, self._odometry.poses, strict=True):
@@ -153,12 +162,16 @@ def _read_lines(path: Path, fields: int) -> list[tuple[int, list[str]]]:
     return lines
 
 
-def _read_list(path: Path) -> tuple[NDArray[np.int64], list[Path]]:
-    """Stamps (N,) and pictures of `rgb.txt` or `depth.txt`, sorted."""
-    lines = _read_lines(path, 2)
-    stamps = np.array([_stamp_ns(words[0], path, number) for number, words in lines], dtype=np.int64)
+def read_picture_list(path: Path, stamp_column: int = 0) -> tuple[NDArray[np.int64], list[list[str]]]:
+    """Stamps (N,) and fields of the lines of `rgb.txt`, `depth.txt` or `associations.txt`, sorted by stamp.
+
+    Raises:
+        StreamError: the file is missing, empty or damaged, or its stamps go back.
+    """
+    lines = _read_lines(path, 4 if path.name == "associations.txt" else 2)
+    stamps = np.array([_stamp_ns(words[stamp_column], path, number) for number, words in lines], dtype=np.int64)
     order = sorted_order(stamps, str(path))
-    return stamps[order], [path.parent / lines[i][1][1] for i in order]
+    return stamps[order], [lines[i][1] for i in order]
 
 
 def _read_pairs(folder: Path, tolerance_s: float) -> tuple[list[_Pair], dict[str, int]]:
@@ -166,27 +179,24 @@ def _read_pairs(folder: Path, tolerance_s: float) -> tuple[list[_Pair], dict[str
     listed = folder / "associations.txt"
     if listed.is_file():
         return _read_associations(listed), {}
-    color_ns, colors = _read_list(folder / "rgb.txt")
-    depth_ns, depths = _read_list(folder / "depth.txt")
+    color_ns, colors = read_picture_list(folder / "rgb.txt")
+    depth_ns, depths = read_picture_list(folder / "depth.txt")
     pairs = pair_nearest(color_ns, depth_ns, tolerance_s)
     losses = {"unmatched color": pairs.unmatched_color, "unmatched depth": pairs.unmatched_depth}
     if not len(pairs.color):
         raise StreamError(f"{folder}: no colour picture has a depth picture within sensors.sync_tolerance_s = {tolerance_s} s")
-    matched = [_Pair(int(color_ns[i]), colors[i], depths[j]) for i, j in zip(pairs.color, pairs.depth, strict=True)]
-    return matched, losses
+    matched = zip(pairs.color, pairs.depth, strict=True)
+    return [_Pair(int(color_ns[i]), folder / colors[i][1], folder / depths[j][1]) for i, j in matched], losses
 
 
 def _read_associations(path: Path) -> list[_Pair]:
     """`stamp rgb stamp depth`; where the first picture is the depth one, the other way round."""
-    lines = _read_lines(path, 4)
-    swapped = "depth" in lines[0][1][1] and "depth" not in lines[0][1][3]
+    first = _read_lines(path, 4)[0][1]
+    swapped = "depth" in first[1] and "depth" not in first[3]
     color, depth = (2, 0) if swapped else (0, 2)
-    stamps = np.array([_stamp_ns(words[color], path, number) for number, words in lines], dtype=np.int64)
-    folder = path.parent
-    return [
-        _Pair(int(stamps[i]), folder / lines[i][1][color + 1], folder / lines[i][1][depth + 1])
-        for i in sorted_order(stamps, str(path))
-    ]
+    stamps, lines = read_picture_list(path, stamp_column=color)
+    named = zip(stamps, lines, strict=True)
+    return [_Pair(int(stamp), path.parent / words[color + 1], path.parent / words[depth + 1]) for stamp, words in named]
 
 
 def _read_poses(path: Path) -> tuple[NDArray[np.int64], Array]:

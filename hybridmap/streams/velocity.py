@@ -29,7 +29,7 @@ class VelocityStream:
         """
         self.name = path.name
         self.rig = Rig()
-        samples = _read_table(path)
+        samples = read_table(path)
         low, high = (window or Window()).limits_ns(samples[0].stamp_ns)
         self._samples = [sample for sample in samples if low <= sample.stamp_ns <= high]
         if not self._samples:
@@ -37,6 +37,7 @@ class VelocityStream:
         truth = path.with_name(f"{path.stem}_groundtruth.tum")
         self.groundtruth: Trajectory | None = read_tum(truth) if truth.is_file() else None
         self.expected_observations: int | None = 0
+        self.uses = {"velocity": path.name} | ({"groundtruth": truth.name} if truth.is_file() else {})
         self.report = StreamReport()
 
     def __iter__(self) -> Iterator[Sample]:
@@ -45,7 +46,12 @@ class VelocityStream:
         yield from self._samples
 
 
-def _read_table(path: Path) -> list[Velocity]:
+def read_table(path: Path) -> list[Velocity]:
+    """All rows of a velocity table, in order of stamp.
+
+    Raises:
+        StreamError: as `VelocityStream`.
+    """
     with path.open(encoding="utf-8", errors="replace", newline="") as file:
         rows = csv.reader(file)
         header = tuple(name.strip() for name in next(rows, []))

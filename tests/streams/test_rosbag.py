@@ -37,7 +37,7 @@ def test_every_format_gives_the_same_samples(tmp_path, kind, folder):
         assert [sample.stamp_ns for sample in samples] == [100 * NS + i * NS // 20 for i in range(12)]
         np.testing.assert_allclose(samples[4].pose_odom_robot, [0.2, 0.0, 0.0])
         np.testing.assert_array_equal(samples[5].ranges_m, np.float32([1, 2, 3, 4, 7]))
-        assert stream.report.counts == {"odometry": 6, "observations": 6}
+        assert stream.report.counts == {"odometry": 6, "scans": 6}
     assert stream.expected_observations == 6
     np.testing.assert_allclose(stream.rig.laser.bearings_rad, [-1.0, -0.5, 0.0, 0.5, 1.0])
     np.testing.assert_allclose(stream.rig.laser.pose_base_laser, [0.2, 0.0, 0.0])
@@ -407,7 +407,7 @@ def test_depth_of_another_camera_is_registered_to_colour(tmp_path):
 def test_recordings_give_what_their_readme_says(data_dir, source, motions, scans, first_s, last_s):
     stream = open_stream(data_dir / source, Config())
     samples = list(stream)
-    assert stream.report.counts == {"odometry": motions, "observations": scans}
+    assert stream.report.counts == {"odometry": motions, "scans": scans}
     assert samples[0].stamp_ns == round(first_s * NS)
     assert samples[-1].stamp_ns == round(last_s * NS)
     assert stream.expected_observations == scans

@@ -58,7 +58,7 @@ def test_frames_and_odometry_in_order(folder):
         for i, frame in enumerate(frames):
             np.testing.assert_array_equal(frame.color, color_pixels(i))
             np.testing.assert_array_equal(frame.depth_m, (depth_mm(i) / 5000.0).astype(np.float32))
-    assert stream.report.counts == {"odometry": 6, "observations": 3, "unmatched color": 0, "unmatched depth": 0}
+    assert stream.report.counts == {"odometry": 6, "frames": 3, "unmatched color": 0, "unmatched depth": 0}
     camera = stream.rig.camera
     assert (camera.width_px, camera.height_px, camera.fy_px) == (8, 6, 10.5)
     np.testing.assert_allclose(camera.T_base_camera[:3, 3], [0.1, 0.0, 0.5])

@@ -1,0 +1,208 @@
+"""What a source holds, what mapping would use of it, and what is missing or damaged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.config.root import Config
+from hybridmap.errors import HybridMapError, StreamError
+from hybridmap.streams.base import Rig, Stream
+from hybridmap.streams.open import kind_of, open_stream, world_of
+from hybridmap.trajectory import NS_PER_S, read_tum
+
+_LONG_GAP_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One topic, list or file of a source.
+
+    Attributes:
+        name: topic or file.
+        kind: message type, or what the file is.
+        count: messages, pictures or rows.
+        stamps_ns: header stamps in the order of recording; empty where they are not known.
+    """
+
+    name: str
+    kind: str
+    count: int
+    stamps_ns: NDArray[np.int64]
+
+    @property
+    def span_s(self) -> tuple[float, float] | None:
+        """First and last stamp, s."""
+        if not len(self.stamps_ns):
+            return None
+        return float(self.stamps_ns.min() / NS_PER_S), float(self.stamps_ns.max() / NS_PER_S)
+
+    @property
+    def duration_s(self) -> float:
+        """Last minus first stamp, s; 0 where unknown."""
+        return int(self.stamps_ns.max() - self.stamps_ns.min()) / NS_PER_S if len(self.stamps_ns) else 0.0
+
+    @property
+    def rate_hz(self) -> float:
+        """Mean rate, Hz; NaN where unknown."""
+        return (len(self.stamps_ns) - 1) / self.duration_s if self.duration_s > 0 else float("nan")
+
+    @property
+    def longest_gap_s(self) -> float:
+        """Longest time without a message, s; 0 where unknown."""
+        return float(np.diff(np.sort(self.stamps_ns)).max(initial=0) / NS_PER_S)
+
+
+@dataclass(slots=True)
+class Inspection:
+    """The findings.
+
+    Attributes:
+        source: what was inspected.
+        kind: `ROS 1 bag`, `TUM RGB-D folder`, ...
+        parts: what it holds.
+        uses: role -> topic or file that mapping would take.
+        rig: sensors that it would map with.
+        remarks: choices and assumptions.
+        problems: what is missing or damaged, a line each.
+        reason: why it cannot be mapped; None if it can.
+    """
+
+    source: str
+    kind: str
+    parts: list[Part] = field(default_factory=list)
+    uses: dict[str, str] = field(default_factory=dict)
+    rig: Rig = field(default_factory=Rig)
+    remarks: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    reason: str | None = None
+
+    @property
+    def mappable(self) -> bool:
+        """Whether mapping would run."""
+        return self.reason is None
+
+
+def inspect_source(source: str | Path, config: Config) -> Inspection:
+    """Look into a source without mapping it.
+
+    Args:
+        source: as for `open_stream`.
+        config: topic names, mounting, sensor.
+
+    Raises:
+        StreamError: it cannot even be opened.
+    """
+    world = world_of(source)
+    if world is not None:
+        found = Inspection(str(source), "simulated world", remarks=["rendered while it is mapped; nothing is missing"])
+        _try_to_open(found, source, config)
+        return found
+    path = Path(source)
+    found = Inspection(str(path), kind_of(path))
+    found.parts = _PARTS[found.kind](path, found.problems)
+    stream = _try_to_open(found, source, config)
+    found.problems += [line for part in found.parts if part.name in found.uses.values() for line in _gaps(part)]
+    if stream is not None and not stream.expected_observations and found.kind != "velocity table":
+        found.remarks.append("no scans or frames: dead reckoning and the neural part only")
+    if found.kind == "velocity table":
+        found.remarks.append("a velocity table: dead reckoning and the neural part only")
+    return found
+
+
+def _try_to_open(found: Inspection, source: str | Path, config: Config) -> Stream | None:
+    """Open as mapping would, and note what it would use or why it cannot."""
+    try:
+        stream = open_stream(source, config)
+        truth = stream.groundtruth
+    except HybridMapError as error:
+        found.reason = str(error)
+        found.problems.append(str(error))
+        return None
+    found.rig = stream.rig
+    found.uses |= getattr(stream, "uses", {})
+    found.remarks += getattr(stream, "remarks", [])
+    losses: dict[str, int] = getattr(stream, "losses", {})
+    found.problems += [f"{count} {name}" for name, count in losses.items() if count]
+    if truth is not None:
+        found.remarks.append(f"ground truth: {len(truth)} poses")
+    return stream
+
+
+def _gaps(part: Part) -> list[str]:
+    gap = part.longest_gap_s
+    usual = 1.0 / part.rate_hz if part.rate_hz > 0 else 0.0
+    if gap < max(_LONG_GAP_S, 5.0 * usual):
+        return []
+    at = int(np.argmax(np.diff(np.sort(part.stamps_ns))))
+    after_s = (int(np.sort(part.stamps_ns)[at]) - int(part.stamps_ns.min())) / NS_PER_S
+    return [f"{part.name}: nothing for {gap:.2f} s, {after_s:.1f} s after its beginning"]
+
+
+def _bag_parts(path: Path, problems: list[str]) -> list[Part]:
+    from hybridmap.streams.bagfile import BagFile
+    from hybridmap.streams.topics import CAMERA_INFO, IMAGE, ODOMETRY, SCAN
+
+    bag = BagFile(path)
+    stamped = [topic.name for topic in bag.topics if topic.msgtype in ODOMETRY + SCAN + IMAGE + CAMERA_INFO and topic.count]
+    stamps: dict[str, list[int]] = {name: [] for name in stamped}
+    try:
+        for message in bag.raw(stamped):
+            stamps[message.topic].append(bag.stamp_ns(message))
+    except StreamError as error:
+        problems.append(str(error))
+    parts = []
+    for topic in bag.topics:
+        seen = np.asarray(stamps.get(topic.name, []), dtype=np.int64)
+        parts.append(Part(topic.name, topic.msgtype.replace("/msg/", "/"), topic.count, seen))
+        if topic.name in stamps and len(seen) != topic.count:
+            problems.append(f"{topic.name}: {len(seen)} messages can be read of the {topic.count} that the bag says it holds")
+        if topic.count == 0:
+            problems.append(f"{topic.name}: no messages")
+    return parts
+
+
+def _tum_parts(path: Path, problems: list[str]) -> list[Part]:
+    from hybridmap.streams.tum import read_picture_list
+
+    parts = []
+    for name in ("associations.txt", "rgb.txt", "depth.txt"):
+        if (path / name).is_file():
+            parts += _part_or_problem(path / name, "pictures", lambda p: read_picture_list(p)[0], problems)
+    for file in sorted(path.glob("*.txt")):
+        if file.name.startswith(("odom", "groundtruth")):
+            kind = "odometry" if file.name.startswith("odom") else "ground truth"
+            parts += _part_or_problem(file, kind, lambda p: read_tum(p).stamps_ns, problems)
+    if not (path / "camera.yaml").is_file():
+        problems.append("camera.yaml: no calibration and mounting")
+    return parts
+
+
+def _part_or_problem(path: Path, kind: str, read: Callable[[Path], NDArray[np.int64]], problems: list[str]) -> list[Part]:
+    try:
+        stamps = read(path)
+    except StreamError as error:
+        problems.append(str(error))
+        return [Part(path.name, kind, 0, np.zeros(0, dtype=np.int64))]
+    return [Part(path.name, kind, len(stamps), stamps)]
+
+
+def _velocity_parts(path: Path, problems: list[str]) -> list[Part]:
+    from hybridmap.streams.velocity import read_table
+
+    def stamps(table: Path) -> NDArray[np.int64]:
+        return np.array([sample.stamp_ns for sample in read_table(table)], dtype=np.int64)
+
+    return _part_or_problem(path, "velocities", stamps, problems)
+
+
+_PARTS: dict[str, Callable[[Path, list[str]], list[Part]]] = {
+    "ROS 1 bag": _bag_parts,
+    "ROS 2 bag": _bag_parts,
+    "TUM RGB-D folder": _tum_parts,
+    "velocity table": _velocity_parts,
+}
