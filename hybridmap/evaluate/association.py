@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,14 +68,15 @@ def associate(estimate: Trajectory, reference: Trajectory, max_gap_s: float = MA
 
 def travel(poses: Array) -> Array:
     """Path length (P,) at each pose, m. Steps enter once they exceed 5 cm together, so that jitter is no travel."""
-    total = np.zeros(len(poses))
-    anchor, length = poses[0, :2], 0.0
-    for k in range(1, len(poses)):
-        step = float(np.hypot(*(poses[k, :2] - anchor)))
+    total, length = [], 0.0
+    positions = poses[:, :2].tolist()
+    anchor = positions[0]
+    for position in positions:
+        step = math.dist(anchor, position)
         if step >= _DEAD_BAND_M:
-            anchor, length = poses[k, :2], length + step
-        total[k] = length
-    return total
+            anchor, length = position, length + step
+        total.append(length)
+    return np.array(total)
 
 
 def _span(trajectory: Trajectory) -> str:

@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.errors import ExportError
-from hybridmap.export.keyframes import depth_points, laser_points
-from hybridmap.export.view import SessionView
+from hybridmap.export.keyframes import depth_points, laser_points, mounting
+from hybridmap.export.view import ExportOptions, SessionView
 from hybridmap.geometry import Array, compose, transform_points
 from hybridmap.metrics import Metric
-from hybridmap.streams.base import Camera
 from hybridmap.trajectory import write_text_atomic
 
 _HIT, _MISS, _LIMIT = 0.9, -0.4, 4.0
@@ -152,21 +151,19 @@ def _fans(view: SessionView) -> Iterator[_Fan]:
             fan = _Fan(rig.laser.pose_base_laser[:2], ends[valid][order], rig.laser.bearings_rad[valid][order])
         elif "depth_mm" in keyframe and rig.camera is not None:
             points = depth_points(keyframe, rig.camera, view.options.max_depth_m).xyz
-            fan = _fan_of_depth(points, rig.camera, view)
+            fan = _fan_of_depth(points, mounting(keyframe, rig.camera)[:2, 3], 2.0 / rig.camera.fx_px, view.options)
         else:
             continue
         if len(fan.ends):
             yield _Fan(compose(pose, [*fan.origin, 0.0])[:2], transform_points(pose, fan.ends), fan.bearings)
 
 
-def _fan_of_depth(points: Array, camera: Camera, view: SessionView) -> _Fan:
-    """The nearest obstacle in each of as many bearings as half the picture has columns."""
-    origin = camera.T_base_camera[:2, 3]
-    tall = (points[:, 2] >= view.options.obstacle_low_m) & (points[:, 2] <= view.options.obstacle_high_m)
+def _fan_of_depth(points: Array, origin: Array, step_rad: float, options: ExportOptions) -> _Fan:
+    """The nearest obstacle in each bearing, one every two columns of the picture, seen from the camera at `origin` (2,)."""
+    tall = (points[:, 2] >= options.obstacle_low_m) & (points[:, 2] <= options.obstacle_high_m)
     offset = points[tall, :2] - origin
     bearing, reach = np.arctan2(offset[:, 1], offset[:, 0]), np.hypot(offset[:, 0], offset[:, 1])
-    step = 2.0 / camera.fx_px
-    column = np.floor(bearing / step).astype(np.int64)
+    column = np.floor(bearing / step_rad).astype(np.int64)
     order = np.lexsort((reach, column))
     _, first = np.unique(column[order], return_index=True)
     nearest = order[first]

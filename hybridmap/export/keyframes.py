@@ -48,11 +48,16 @@ def depth_points(keyframe: Mapping[str, NDArray[Any]], camera: Camera, max_depth
     scale = depth_mm.shape[1] / camera.width_px
     x = ((u + 0.5) / scale - 0.5 - camera.cx_px) / camera.fx_px * z
     y = ((v + 0.5) / scale - 0.5 - camera.cy_px) / camera.fy_px * z
-    T_base_camera = np.asarray(keyframe.get("T_base_camera", camera.T_base_camera), dtype=np.float64)
+    T_base_camera = mounting(keyframe, camera)
     xyz = np.stack([x, y, z], axis=1) @ T_base_camera[:3, :3].T + T_base_camera[:3, 3]
     color = keyframe.get("color")
     same_size = color is not None and color.shape[:2] == depth_mm.shape
     return Points(xyz, color[valid] / 255.0 if color is not None and same_size else None)
+
+
+def mounting(keyframe: Mapping[str, NDArray[Any]], camera: Camera) -> Array:
+    """(4, 4) pose of the camera in `base_link` at a keyframe: its own where it has one (a carried camera tilts)."""
+    return np.asarray(keyframe.get("T_base_camera", camera.T_base_camera), dtype=np.float64)
 
 
 def laser_points(keyframe: Mapping[str, NDArray[Any]], laser: Laser) -> tuple[Array, NDArray[np.bool_]]:

@@ -42,14 +42,25 @@ def pack(array: NDArray[Any]) -> Packed:
 
 
 def unpack(packed: Packed) -> NDArray[Any]:
-    """The array that was packed."""
+    """The array that was packed.
+
+    Raises:
+        StoreError: the bytes are damaged.
+    """
+    try:
+        return _unpack(packed)
+    except (zlib.error, ValueError, TypeError) as error:
+        raise StoreError(f"map file: an array in it is damaged: {error}") from None
+
+
+def _unpack(packed: Packed) -> NDArray[Any]:
     dtype, shape = np.dtype(packed.dtype), json.loads(packed.shape)
     if packed.codec == "png":
         import cv2
 
         pixels = cv2.imdecode(np.frombuffer(packed.data, np.uint8), cv2.IMREAD_UNCHANGED)
         if pixels is None:
-            raise StoreError("map file: an image in it is damaged")
+            raise ValueError("not an image")
         return np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels).reshape(shape)
     return np.frombuffer(zlib.decompress(packed.data), dtype).reshape(shape).copy()
 
