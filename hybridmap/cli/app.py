@@ -14,6 +14,7 @@ from hybridmap.cli.compare import compare
 from hybridmap.cli.demo import demo
 from hybridmap.cli.evaluate import evaluate
 from hybridmap.cli.export import export
+from hybridmap.cli.inspect import inspect
 from hybridmap.cli.map import map_source
 from hybridmap.cli.optimize import optimize
 from hybridmap.cli.simulate import simulate
@@ -55,6 +56,7 @@ app.command("export")(export)
 app.command("optimize")(optimize)
 app.command("compare")(compare)
 app.command("simulate")(simulate)
+app.command("inspect")(inspect)
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.root import Config
 from hybridmap.errors import HybridMapError, StreamError
-from hybridmap.streams.base import Rig, Stream
+from hybridmap.streams.base import Rig
 from hybridmap.streams.open import kind_of, open_stream, world_of
 from hybridmap.trajectory import NS_PER_S, read_tum
 
@@ -105,16 +105,14 @@ def inspect_source(source: str | Path, config: Config) -> Inspection:
     path = Path(source)
     found = Inspection(str(path), kind_of(path))
     found.parts = _PARTS[found.kind](path, found.problems)
-    stream = _try_to_open(found, source, config)
+    _try_to_open(found, source, config)
     found.problems += [line for part in found.parts if part.name in found.uses.values() for line in _gaps(part)]
-    if stream is not None and not stream.expected_observations and found.kind != "velocity table":
-        found.remarks.append("no scans or frames: dead reckoning and the neural part only")
     if found.kind == "velocity table":
         found.remarks.append("a velocity table: dead reckoning and the neural part only")
     return found
 
 
-def _try_to_open(found: Inspection, source: str | Path, config: Config) -> Stream | None:
+def _try_to_open(found: Inspection, source: str | Path, config: Config) -> None:
     """Open as mapping would, and note what it would use or why it cannot."""
     try:
         stream = open_stream(source, config)
@@ -122,7 +120,7 @@ def _try_to_open(found: Inspection, source: str | Path, config: Config) -> Strea
     except HybridMapError as error:
         found.reason = str(error)
         found.problems.append(str(error))
-        return None
+        return
     found.rig = stream.rig
     found.uses |= getattr(stream, "uses", {})
     found.remarks += getattr(stream, "remarks", [])
@@ -130,7 +128,6 @@ def _try_to_open(found: Inspection, source: str | Path, config: Config) -> Strea
     found.problems += [f"{count} {name}" for name, count in losses.items() if count]
     if truth is not None:
         found.remarks.append(f"ground truth: {len(truth)} poses")
-    return stream
 
 
 def _gaps(part: Part) -> list[str]:

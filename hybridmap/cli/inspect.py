@@ -1,0 +1,118 @@
+"""`hybridmap inspect`: what a source holds, what mapping would use, what is missing or damaged."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from hybridmap.metrics import Metric
+    from hybridmap.streams.inspection import Inspection
+
+Topic = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic to use instead of the one found.")]
+
+
+def inspect(
+    source: Annotated[str, typer.Argument(help="A .bag, .mcap or .db3 file, a ROS 2 bag or TUM folder, a .csv, or a world.")],
+    config: Annotated[str | None, typer.Option(help="Configuration to map with: a name or a file.")] = None,
+    odometry_topic: Topic = None,
+    scan_topic: Topic = None,
+    color_topic: Topic = None,
+    depth_topic: Topic = None,
+    camera_info_topic: Topic = None,
+    odometry_file: Annotated[str | None, typer.Option(help="TUM folder: the odometry file to use.")] = None,
+    setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. sensors.sync_tolerance_s=0.05.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+) -> None:
+    """What a recording holds (counts, rates in Hz, spans in s), what mapping would use, what is missing or damaged."""
+    from hybridmap.cli.choose import parse_settings
+    from hybridmap.config import Config
+    from hybridmap.metrics import to_json
+    from hybridmap.streams.inspection import inspect_source
+
+    overrides: dict[str, Any] = {
+        "sensors.odometry_topic": odometry_topic,
+        "sensors.scan_topic": scan_topic,
+        "sensors.color_topic": color_topic,
+        "sensors.depth_topic": depth_topic,
+        "sensors.camera_info_topic": camera_info_topic,
+        "sensors.odometry_file": odometry_file,
+    }
+    overrides = {key: value for key, value in overrides.items() if value is not None} | parse_settings(setting)
+    found = inspect_source(source, Config.load(config, overrides))
+    if as_json:
+        sys.stdout.write(to_json(_head(found), _metrics(found)) + "\n")
+    else:
+        _show(found)
+
+
+def _head(found: Inspection) -> dict[str, Any]:
+    parts = [{"name": part.name, "type": part.kind, "count": part.count, "span_s": part.span_s} for part in found.parts]
+    return {
+        "source": found.source,
+        "kind": found.kind,
+        "parts": parts,
+        "uses": found.uses,
+        "sensor": _sensor(found),
+        "remarks": found.remarks,
+        "problems": found.problems,
+        "mappable": found.mappable,
+        "reason": found.reason,
+    }
+
+
+def _metrics(found: Inspection) -> list[Metric]:
+    from hybridmap.metrics import Metric
+
+    rows = []
+    for part in found.parts:
+        name = part.name.lstrip("/")
+        rows += [
+            Metric(f"count/{name}", part.count, "1", f"messages of {part.kind}"),
+            Metric(f"rate/{name}", part.rate_hz, "Hz", "mean rate by header stamps"),
+            Metric(f"duration/{name}", part.duration_s, "s", "first to last header stamp"),
+            Metric(f"longest_gap/{name}", part.longest_gap_s, "s", "longest time without a message"),
+        ]
+    return rows
+
+
+def _sensor(found: Inspection) -> str:
+    if found.rig.laser is not None:
+        return f"laser, {len(found.rig.laser.bearings_rad)} beams, {found.rig.laser.range_max_m:.2f} m"
+    if found.rig.camera is not None:
+        return f"RGB-D, {found.rig.camera.width_px}x{found.rig.camera.height_px} pixels"
+    return "none"
+
+
+def _show(found: Inspection) -> None:
+    lines = [f"{found.source}: {found.kind}", *_table(found)]
+    lines += [f"uses {role}: {name}" for role, name in found.uses.items()]
+    lines.append(f"maps with: {_sensor(found)}")
+    lines += [f"note: {remark}" for remark in found.remarks]
+    lines += [f"problem: {problem}" for problem in found.problems]
+    lines.append("mappable: yes" if found.mappable else f"mappable: no, because {found.reason}")
+    sys.stdout.write("\n".join(lines) + "\n")
+
+
+def _table(found: Inspection) -> list[str]:
+    """Aligned columns that are never cut, for topic names are there to be copied."""
+    if not found.parts:
+        return []
+    rows = [("topic or file", "type", "count", "rate Hz", "from s", "for s", "longest gap s")]
+    for part in found.parts:
+        span = part.span_s
+        rate = "" if math.isnan(part.rate_hz) else f"{part.rate_hz:.2f}"
+        times = (f"{span[0]:.3f}", f"{part.duration_s:.3f}", f"{part.longest_gap_s:.3f}") if span else ("", "", "")
+        rows.append((part.name, part.kind, str(part.count), rate, *times))
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    aligned = [
+        [
+            cell.ljust(width) if column < 2 else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        for row in rows
+    ]
+    return ["  " + "  ".join(cells).rstrip() for cells in aligned]
