@@ -23,12 +23,13 @@ class PlaceAttractor:
     def __init__(self, side: int, cell_m: float, width_cells: float, dtype: DTypeLike = np.float64) -> None:
         self.cell_m = cell_m
         self._side = side
-        angle = 2.0 * np.pi * np.outer(np.arange(side), np.arange(side // 2)) / side
-        self._cos, self._sin = np.cos(angle), np.sin(angle)
         wave = 2.0 * np.pi * np.arange(side // 2) / side
+        angle = np.outer(wave, np.arange(side))
+        gain = np.exp(-0.5 * (width_cells * wave) ** 2) * np.where(wave == 0, 1.0, 2.0) / side
         self._wave = wave
-        gain = np.exp(-0.5 * (width_cells * wave) ** 2) / side
-        self._gain = np.where(wave == 0, gain, 2.0 * gain)
+        self._kernel = np.concatenate([gain[:, None] * np.cos(angle), gain[:, None] * np.sin(angle)])
+        self._offsets = np.arange(side)[:, None] - np.arange(side)
+        self._phasors = np.exp(1j * angle[1])
         self._dtype = np.dtype(dtype)
         self._remappings: dict[tuple[int, int], NDArray[np.int64]] = {}
         offset = (np.arange(side) + side // 2) % side - side // 2
@@ -43,10 +44,12 @@ class PlaceAttractor:
     def step(self, displacement_m: NDArray[np.float64]) -> None:
         """Move the bump by a displacement (2,) in the world, m, and let the cells compete once."""
         whole, residual = split_shift(displacement_m / self.cell_m)
-        moved = np.roll(self.activity, (int(whole[0]), int(whole[1])), axis=(0, 1))
-        spread = self._weights(residual[0]) @ moved @ self._weights(residual[1]).T
+        phase = residual[:, None] * self._wave
+        kernels = (np.concatenate([np.cos(phase), np.sin(phase)], axis=1) @ self._kernel).astype(self._dtype, copy=False)
+        along_x, along_y = (kernels[axis].take(self._offsets - int(whole[axis]), mode="wrap") for axis in (0, 1))
+        spread = along_x @ self.activity @ along_y.T
         np.maximum(spread, 0.0, out=spread)
-        self.activity = self._normalised(spread * spread).astype(self._dtype)
+        self.activity = self._normalised(spread * spread)
 
     def settle(self, iterations: int = 10) -> None:
         """Let the cells compete without self-motion, until one bump is left."""
@@ -55,8 +58,7 @@ class PlaceAttractor:
 
     def position_m(self) -> Array:
         """Return the bump's position (2,) by population vector, m in [0, extent)."""
-        turn = np.exp(2j * np.pi * np.arange(self._side) / self._side)
-        z = np.array([turn @ self.activity.sum(axis=1), turn @ self.activity.sum(axis=0)])
+        z = np.array([self._phasors @ self.activity.sum(axis=1), self._phasors @ self.activity.sum(axis=0)])
         return np.asarray(np.angle(z) / (2.0 * np.pi) % 1.0 * self.extent_m)
 
     def unwrapped_m(self, near_m: Array) -> Array:
@@ -89,12 +91,6 @@ class PlaceAttractor:
             drawn = np.arange(size) if tx == ty == 0 else np.random.default_rng(seed).permutation(size)
             self._remappings[tx, ty] = drawn
         return self._remappings[tx, ty]
-
-    def _weights(self, residual: float) -> NDArray[np.floating]:
-        """Gaussian recurrent weights (N, N) shifted by a fraction of a cell: row i receives from column j."""
-        cos, sin = self._gain * np.cos(self._wave * residual), self._gain * np.sin(self._wave * residual)
-        row_cos, row_sin = self._cos * cos + self._sin * sin, self._sin * cos - self._cos * sin
-        return np.asarray(row_cos @ self._cos.T + row_sin @ self._sin.T, dtype=self._dtype)
 
     @staticmethod
     def _normalised(rates: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 ORIENTATIONS_DEG = (0.0, 60.0, 120.0)
+
+
+@dataclass(frozen=True, slots=True)
+class BandMotion:
+    """What the band rings tell the grid sheets in a step, decoded from their rates before and after it.
+
+    Attributes:
+        turns: (M, 3) unit phasors of how far each ring moved.
+        phasors: (M, 3) unit phasors of where it is now.
+    """
+
+    turns: NDArray[np.complexfloating]
+    phasors: NDArray[np.complexfloating]
 
 
 class BandRings:
@@ -36,6 +51,7 @@ class BandRings:
         self.wave_vectors: NDArray[np.float64] = (
             np.stack([np.cos(angles), np.sin(angles)], axis=-1) / self.periods_m[:, None, None]
         )
+        self._turn = 2j * np.pi * self.wave_vectors
         preferred = 2.0 * np.pi * (np.arange(cells) / cells + 0.5)
         self._weights = np.stack([np.cos(preferred), np.sin(preferred)], axis=1).astype(dtype)
         self._sharpness = -1.0 / (2.0 * (2.0 * np.pi * width) ** 2)
@@ -45,8 +61,8 @@ class BandRings:
 
     def phasors(self) -> NDArray[np.complexfloating]:
         """Return the unit phasors exp(2 pi i phi), (M, 3), decoded from the activity."""
-        vector = self.activity @ self._weights
-        z = vector.view(self._complex)[..., 0]
+        vector = self.activity.reshape(-1, self._weights.shape[0]) @ self._weights
+        z = vector.view(self._complex).reshape(self.activity.shape[:2])
         return np.asarray(z / np.abs(z))
 
     def phases(self) -> NDArray[np.float64]:
@@ -57,18 +73,21 @@ class BandRings:
         """Return the stationary rates (M, 3, n) at given phases (M, 3), cycles."""
         return self._rates(np.exp(2j * np.pi * phases).astype(self._complex))
 
-    def step(self, displacement_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Move every ring by a displacement (2,) in the world, m.
-
-        Returns:
-            (M, 3) advance of each ring's decoded phase, cycles in [-0.5, 0.5): what the ring tells the sheet.
-        """
+    def step(self, displacement_m: NDArray[np.float64]) -> BandMotion:
+        """Move every ring by a displacement (2,) in the world, m; says what the rings tell the sheets."""
         before = self.phasors()
-        turn = np.exp((2j * np.pi) * (self.wave_vectors @ displacement_m))
-        self.activity = self._rates((before * turn).astype(self._complex))
-        return np.asarray(np.angle(self.phasors() * before.conj()), dtype=np.float64) / (2.0 * np.pi)
+        turn = np.exp(self._turn @ displacement_m)
+        self.activity = self._rates((before * turn).astype(self._complex, copy=False))
+        after = self.phasors()
+        return BandMotion(after * before.conj(), after)
 
     def _rates(self, phasors: NDArray[np.complexfloating]) -> NDArray[np.floating]:
-        vector = phasors[..., None].view(self._weights.dtype)
-        offset = np.arccos(np.clip(vector @ self._tuning, -1.0, 1.0))
-        return np.asarray(np.exp(self._sharpness * offset * offset))
+        vector = np.ascontiguousarray(phasors).reshape(-1, 1).view(self._weights.dtype)
+        offset = vector @ self._tuning
+        np.minimum(offset, 1.0, out=offset)
+        np.maximum(offset, -1.0, out=offset)
+        np.arccos(offset, out=offset)
+        offset *= offset
+        offset *= self._sharpness
+        np.exp(offset, out=offset)
+        return np.asarray(offset.reshape(*phasors.shape, -1))

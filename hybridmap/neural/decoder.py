@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -36,43 +37,47 @@ class PhaseDecoder:
     def __init__(self, wave_vectors: NDArray[np.float64], box_m: float) -> None:
         """Take wave vectors (M, 3, 2), cycles per metre, and the half side of the scanned box, m."""
         self._waves = wave_vectors.reshape(-1, 2)
-        self._solve = np.linalg.pinv(self._waves).T
+        self._solve = np.linalg.pinv(self._waves)
         tick = 1.0 / (6.0 * float(np.linalg.norm(self._waves, axis=1).max()))
         half = int(np.ceil(box_m / tick))
         self._ticks = np.arange(-half, half + 1) * tick
 
-    def decode(self, phases_cycles: NDArray[np.float64], starts_m: Array, far_m: Callable[[], Array]) -> Decoded:
+    def decode(self, phases_cycles: NDArray[np.float64], last_m: Array, starts_m: Callable[[], Array]) -> Decoded:
         """Decode phases (M, 3), cycles.
+
+        Tried in this order, until the modules agree: from `last_m`; from the first of `starts_m`; the position on which the
+        modules agree best in the box around that; from all of `starts_m`. Where nothing agrees, the best of the box is given.
 
         Args:
             phases_cycles: (M, 3) phases of the sheets' first modes.
-            starts_m: (S, 2) likely positions; the first from which the modules come to agree gives the answer. Where none
-                does, the box around the last one is scanned for the position on which the modules agree best.
-            far_m: gives further starts (F, 2), tried only where the box holds no agreement either.
+            last_m: (2,) where the robot was decoded last.
+            starts_m: gives further starts (S, 2), the likeliest first; called only where `last_m` fails.
         """
         phases = phases_cycles.reshape(-1)
-        for start in starts_m:
-            found = self._refine(phases, start[None])
-            if found.misfit_cycles < self._AGREEMENT_CYCLES:
-                return found
-        near = self._refine(phases, self._scan(phases, starts_m[-1])[None])
+        found = self._refine(phases, last_m)
+        if found.misfit_cycles < self._AGREEMENT_CYCLES:
+            return found
+        starts = starts_m()
+        found = self._refine(phases, starts[0])
+        if found.misfit_cycles < self._AGREEMENT_CYCLES:
+            return found
+        near = self._refine(phases, self._scan(phases, starts[0]))
         if near.misfit_cycles < self._AGREEMENT_CYCLES:
             return near
-        far = self._refine(phases, far_m())
+        far = min((self._refine(phases, start) for start in starts), key=lambda decoded: decoded.misfit_cycles)
         return far if far.misfit_cycles < self._AGREEMENT_CYCLES else near
 
-    def _refine(self, phases: NDArray[np.float64], starts_m: Array) -> Decoded:
-        """Gauss-Newton from each start (S, 2), twice; the best agreement wins."""
-        position = starts_m
-        for _ in range(2):
-            position = position + self._residual(phases, position) @ self._solve
-        misfit = np.sqrt(np.mean(self._residual(phases, position) ** 2, axis=1))
-        best = int(np.argmin(misfit))
-        return Decoded(position[best], float(misfit[best]))
-
-    def _residual(self, phases: NDArray[np.float64], position_m: Array) -> NDArray[np.float64]:
-        residual = phases - position_m @ self._waves.T
-        return np.asarray(residual - np.round(residual))
+    def _refine(self, phases: NDArray[np.float64], start_m: Array) -> Decoded:
+        """Take whole cycles from a start (2,), solve for the position, and again until the whole cycles stay the same."""
+        wraps = np.round(phases - self._waves @ start_m)
+        for _ in range(4):
+            position = self._solve @ (phases - wraps)
+            offset = phases - self._waves @ position
+            before, wraps = wraps, np.round(offset)
+            if np.array_equal(before, wraps):
+                break
+        residual = offset - wraps
+        return Decoded(position, math.sqrt(float(residual @ residual) / residual.size))
 
     def _scan(self, phases: NDArray[np.float64], centre_m: Array) -> Array:
         along_x = np.exp(2j * np.pi * np.outer(self._ticks, self._waves[:, 0]))

@@ -48,7 +48,7 @@ def combine_bands(cycles: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     misfit = cycles[:, 1] - cycles[:, 0] - cycles[:, 2]
     misfit = (misfit - np.round(misfit)) / 3.0
-    return np.stack([cycles[:, 0] + misfit, cycles[:, 2] + misfit], axis=1)
+    return cycles[:, ::2] + misfit[:, None]
 
 
 class GridModules:
@@ -77,31 +77,49 @@ class GridModules:
         self._gains = gains.astype(dtype)
         self._rectifier = rectifier
         self._centre = fourier_modes
-        self._stripe = 0.5 * band_drive * side**2
+        self._input = self._input_weights(band_drive, side)
         wave = 2.0 * np.pi * np.arange(side) / side
         seed = np.cos(wave[:, None]) + np.cos(wave) + np.cos(wave[:, None] + wave)
         self.activity: NDArray[np.floating] = np.repeat((1.0 + 0.3 * seed)[None], modules, axis=0).astype(dtype)
-        still, phasors = np.zeros((modules, 3)), np.ones((modules, 3), dtype=np.complex128)
+        still = np.ones((modules, 3), dtype=self._input.dtype)
         for _ in range(300):
-            self.step(still, phasors)
+            self.step(still, still)
 
-    def step(self, advance_cycles: NDArray[np.float64], band_phasors: NDArray[np.complexfloating]) -> None:
+    def step(self, band_turns: NDArray[np.complexfloating], band_phasors: NDArray[np.complexfloating]) -> None:
         """Advance by one time constant.
 
         Args:
-            advance_cycles: (M, 3) advance of the band rings in this step, cycles.
-            band_phasors: (M, 3) unit phasors of the band rings after it.
+            band_turns: (M, 3) unit phasors of how far each band ring moved in this step.
+            band_phasors: (M, 3) unit phasors of where the band rings are after it.
         """
-        modes = self.modes.forward(self.activity) * self.modes.shift(combine_bands(advance_cycles)) * self._gains
-        stripes = self._stripe * band_phasors.conj()
-        k = self._centre
-        modes[:, k + 1, 0] += stripes[:, 0]
-        modes[:, k - 1, 0] += stripes[:, 0].conj()
-        modes[:, k + 1, 1] += stripes[:, 1]
-        modes[:, k, 1] += stripes[:, 2]
-        drive = self.modes.inverse(modes)
-        drive += 1.0
-        self.activity = self._rectifier(drive)
+        modes = self.modes.forward(self.activity)
+        modes *= self.modes.shift(self._sheet_turns(band_turns))
+        modes *= self._gains
+        modes += self._band_input(band_phasors)
+        self.activity = self._rectifier(self.modes.inverse(modes))
+
+    @staticmethod
+    def _sheet_turns(bands: NDArray[np.complexfloating]) -> NDArray[np.complexfloating]:
+        """The two shifts of each sheet as unit phasors (M, 2); `combine_bands` for phasors."""
+        misfit = bands[:, 1] * (bands[:, 0] * bands[:, 2]).conj()
+        share = np.exp(np.angle(misfit) * (1j / 3.0)).astype(bands.dtype)
+        return np.asarray(bands[:, ::2] * share[:, None])
+
+    def _band_input(self, phasors: NDArray[np.complexfloating]) -> NDArray[np.complexfloating]:
+        """Modes (M, 2K+1, K+1) of I_BC: uniform excitation and the stripes of the three bands."""
+        drive = np.empty((len(phasors), 5), dtype=self._input.dtype)
+        drive[:, 0] = 1.0
+        drive[:, 1:4] = phasors.conj()
+        drive[:, 4] = phasors[:, 0]
+        return np.asarray(drive @ self._input).reshape(len(phasors), *self._gains.shape)
+
+    def _input_weights(self, band_drive: float, side: int) -> NDArray[np.complexfloating]:
+        """Weights (5, modes) from uniform input, the three bands and the conjugate of the first to the sheet's modes."""
+        k, stripe = self._centre, 0.5 * band_drive * side**2
+        weights = np.zeros((5, 2 * k + 1, k + 1), dtype=np.result_type(self._gains.dtype, np.complex64))
+        weights[0, k, 0] = side**2
+        weights[1, k + 1, 0] = weights[2, k + 1, 1] = weights[3, k, 1] = weights[4, k - 1, 0] = stripe
+        return weights.reshape(5, -1)
 
     def band_phases(self) -> NDArray[np.float64]:
         """Return the phases (M, 3) of the first hexagonal modes of the activity, cycles in [-0.5, 0.5]."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
@@ -24,25 +26,24 @@ class HeadDirectionRing:
         self._readout = (self._kernel * (2.0 / cells)).astype(dtype)
         self.activity: NDArray[np.floating] = 1.0 + self._kernel[0]
 
-    def direction(self) -> tuple[float, float]:
-        """Return (cos phi, sin phi) as decoded from the activity, of length one."""
-        c, s = self._readout @ self.activity
-        norm = float(np.hypot(float(c), float(s)))
-        return float(c) / norm, float(s) / norm
+    def direction(self, ahead_rad: float = 0.0) -> tuple[float, float]:
+        """Return (cos, sin) of the decoded heading, turned by `ahead_rad` (half of a turn about to be made: the mid-point)."""
+        c, s = (self._readout @ self.activity).tolist()
+        norm = math.hypot(c, s)
+        cos, sin = math.cos(ahead_rad) / norm, math.sin(ahead_rad) / norm
+        return c * cos - s * sin, c * sin + s * cos
 
     @property
     def heading_rad(self) -> float:
         """Decoded heading, rad in [-pi, pi]."""
-        c, s = self._readout @ self.activity
-        return float(np.arctan2(s, c))
+        c, s = self.direction()
+        return math.atan2(s, c)
 
     def turn(self, angle_rad: float) -> None:
         """Rotate the population vector by omega dt, rad, left positive."""
         if angle_rad == 0.0:
             return
-        c, s = self.direction()
-        cos, sin = float(np.cos(angle_rad)), float(np.sin(angle_rad))
-        vector = np.array([c * cos - s * sin, c * sin + s * cos], dtype=self._kernel.dtype)
+        vector = np.array(self.direction(angle_rad), dtype=self._kernel.dtype)
         self.activity = 1.0 + vector @ self._kernel
 
     def rates(self, turn_rate_rad_s: float = 0.0, modulation_s: float = 0.1) -> NDArray[np.floating]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -16,7 +18,7 @@ from hybridmap.neural.place import PlaceCells
 from hybridmap.neural.torus import LowModes, shift_sheets
 
 _PART_OF_WRAP = 0.1
-_WRAPS = np.stack(np.meshgrid(np.arange(-8.0, 9.0), np.arange(-8.0, 9.0)), axis=-1).reshape(-1, 2)
+_WRAPS = np.array(sorted(((x, y) for x in range(-8, 9) for y in range(-8, 9)), key=lambda w: (w[0] ** 2 + w[1] ** 2, w)), float)
 
 
 class PathIntegrator:
@@ -58,11 +60,10 @@ class PathIntegrator:
             return
         config = self.config
         half_turn = 0.5 * (config.turn_gain * dyaw + config.heading_bias_rad_m * dx)
-        cos, sin = np.cos(0.5 * dyaw), np.sin(0.5 * dyaw)
-        self.head_direction.turn(half_turn)
+        cos, sin = math.cos(0.5 * dyaw), math.sin(0.5 * dyaw)
         forward, left = config.gain * (cos * dx + sin * dy), config.gain * (cos * dy - sin * dx)
-        c, s = self.head_direction.direction()
-        self.head_direction.turn(half_turn)
+        c, s = self.head_direction.direction(half_turn)
+        self.head_direction.turn(2.0 * half_turn)
         if dx != 0.0 or dy != 0.0:
             self._translate(np.array([c * forward - s * left, s * forward + c * left]))
 
@@ -86,10 +87,7 @@ class PathIntegrator:
 
     def decode(self) -> Decoded:
         """Decode the position from all sheets together, with how well the modules agree."""
-        near = self.attractor.unwrapped_m(self._last_decoded_m)
-        decoded = self._decoder.decode(
-            self.grid.band_phases(), np.stack([self._last_decoded_m, near]), lambda: near + _WRAPS * self.attractor.extent_m
-        )
+        decoded = self._decoder.decode(self.grid.band_phases(), self._last_decoded_m, self._attractor_starts)
         self._last_decoded_m = decoded.position_m
         return decoded
 
@@ -138,15 +136,19 @@ class PathIntegrator:
         self.attractor.activity = np.asarray(snapshot["attractor"], dtype=dtype).copy()
         self._last_decoded_m = np.asarray(snapshot["near_m"], dtype=np.float64).copy()
 
+    def _attractor_starts(self) -> Array:
+        """Where the attractor's bump may be, (S, 2), m: nearest to the last decoded position first."""
+        return self.attractor.unwrapped_m(self._last_decoded_m) + _WRAPS * self.attractor.extent_m
+
     def _translate(self, displacement_m: Array) -> None:
         """Move the network; a jump is taken in parts, so that the read-out sees each turn of the attractor's wrap."""
-        parts = int(np.ceil(np.linalg.norm(displacement_m) / (_PART_OF_WRAP * self.attractor.extent_m)))
+        parts = math.ceil(math.hypot(*displacement_m) / (_PART_OF_WRAP * self.attractor.extent_m))
         for _ in range(parts):
             self._translate_part(displacement_m / parts)
 
     def _translate_part(self, displacement_m: Array) -> None:
-        advance = self.bands.step(displacement_m)
-        self.grid.step(advance, self.bands.phasors())
+        motion = self.bands.step(displacement_m)
+        self.grid.step(motion.turns, motion.phasors)
         self.attractor.step(displacement_m)
         self._moves += 1
         if self._moves % self.config.place.learning_period_steps == 0:

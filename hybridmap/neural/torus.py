@@ -30,7 +30,7 @@ class LowModes:
     def forward(self, sheets: NDArray[np.floating]) -> NDArray[np.complexfloating]:
         """Return the modes of sheets (M, N, N)."""
         half = (sheets.reshape(-1, self.side) @ self._columns).view(self._complex)
-        return np.asarray(self._left @ half.reshape(-1, self.side, len(self.second)))
+        return np.asarray(np.matmul(self._left, half.reshape(-1, self.side, len(self.second))))
 
     def inverse(self, modes: NDArray[np.complexfloating]) -> NDArray[np.floating]:
         """Return the sheets (M, N, N) that have these modes and no others."""
@@ -39,10 +39,15 @@ class LowModes:
             -1, self.side, self.side
         )
 
-    def shift(self, shift_cycles: NDArray[np.float64]) -> NDArray[np.complexfloating]:
-        """Return the factors (M, 2K+1, K+1) that move sheets by shifts (M, 2), cycles of the sheet."""
-        turn = np.exp((-2j * np.pi) * shift_cycles[:, :, None] * self.first)
-        return np.asarray(turn[:, 0, :, None] * turn[:, 1, None, len(self.second) - 1 :], dtype=self._complex)
+    def shift(self, turns: NDArray[np.complexfloating]) -> NDArray[np.complexfloating]:
+        """Return the factors (M, 2K+1, K+1) that move sheets by shifts given as unit phasors exp(2 pi i shift), (M, 2)."""
+        count = len(self.second)
+        powers = np.empty((len(turns), 2, count), dtype=self._complex)
+        powers[:, :, 0] = 1.0
+        powers[:, :, 1:] = turns.conj()[:, :, None]
+        np.multiply.accumulate(powers, axis=2, out=powers)
+        first = np.concatenate([powers[:, 0, :0:-1].conj(), powers[:, 0]], axis=1)
+        return np.asarray(first[:, :, None] * powers[:, 1, None, :])
 
     def squared_wave_number(self) -> NDArray[np.int64]:
         """Return |k|^2 (2K+1, K+1) in the hexagonal metric: axes 120 degrees apart, first shell (1,0), (0,1), (1,1)."""

@@ -7,6 +7,7 @@ from neural_drives import arc, wander
 from hybridmap import geometry
 from hybridmap.config.neural import NeuralConfig
 from hybridmap.neural import PathIntegrator
+from hybridmap.neural.band import BandMotion
 from hybridmap.neural.torus import shift_sheets
 
 
@@ -122,7 +123,7 @@ def test_there_is_no_position_beside_the_network():
 def test_sheets_stop_when_the_bands_do():
     integrator = PathIntegrator(NeuralConfig(band_drive=0.0))
     before = integrator.module_phases()
-    integrator.bands.step = lambda displacement: np.zeros((8, 3))
+    integrator.bands.step = lambda displacement: BandMotion(np.ones((8, 3), complex), np.ones((8, 3), complex))
     integrator.step((0.05, 0.0, 0.0), 0.1)
     assert integrator.module_phases() == pytest.approx(before, abs=1e-9)
 
