@@ -31,7 +31,7 @@ def mapped():
 
 
 def test_the_map_is_better_than_odometry(mapped):
-    mapper, updates, stream = mapped
+    mapper, _updates, stream = mapped
     stamps = np.array([node.stamp_ns for node in mapper.map.nodes])
     odometry = absolute_error(Trajectory(stamps, mapper.map.initial), stream.groundtruth)
     optimised = absolute_error(Trajectory(stamps, mapper.poses()), stream.groundtruth)
@@ -55,7 +55,7 @@ def test_every_node_says_why_and_every_edge_too(mapped):
 
 
 def test_the_correction_brings_odometry_onto_the_map(mapped):
-    mapper, updates, stream = mapped
+    mapper, _updates, stream = mapped
     last = [sample for sample in stream if isinstance(sample, SelfMotion)][-1]
     assert np.allclose(between(compose(mapper.pose_map_odom, last.pose_odom_robot), mapper.pose_map_robot), 0, atol=1e-6)
 
