@@ -49,7 +49,7 @@ class Example:
 
 
 def examples(scene: Scene, store: MapStore, points_of: Mapping[int, Array]) -> list[Example]:
-    """Some accepted closures, spread over the drive, and one that was refused after it had been measured.
+    """Some accepted closures, spread over the drive, and the refused one that would have bent the map most.
 
     Args:
         scene: the session.
@@ -59,7 +59,7 @@ def examples(scene: Scene, store: MapStore, points_of: Mapping[int, Array]) -> l
     fates = loops_by_fate(scene)
     accepted = fates["loops accepted"] or fates["accepted, no weight in the primary back-end"]
     chosen = spread(_telling(scene, accepted, _ACCEPTED_EXAMPLES), _ACCEPTED_EXAMPLES)
-    chosen += spread(_telling(scene, fates["loops rejected"], 1), 1)
+    chosen += sorted(fates["loops rejected"], key=lambda edge: -_contradiction_m(scene, edge))[:1]
     return [_example(scene, store, edge, points_of) for edge in chosen]
 
 
@@ -83,6 +83,14 @@ def _telling(scene: Scene, edges: Sequence[Edge], least: int) -> list[Edge]:
         better = [edge for edge in kept if test(edge)]
         kept = better if len(better) >= least else kept
     return kept
+
+
+def _contradiction_m(scene: Scene, edge: Edge) -> float:
+    """How far the measured pose is from where the final map has the node, m; less than nothing where none was measured."""
+    if edge.relative is None:
+        return -1.0
+    off = between(edge.relative.delta, between(scene.nodes[edge.source], scene.nodes[edge.target]))
+    return float(np.hypot(off[0], off[1]))
 
 
 def _example(scene: Scene, store: MapStore, edge: Edge, points_of: Mapping[int, Array]) -> Example:
@@ -115,6 +123,7 @@ def _facts(scene: Scene, edge: Edge) -> tuple[tuple[str, str], ...]:
         ]
         drift = between(edge.relative.delta, between(nodes[edge.source].pose_odom, nodes[edge.target].pose_odom))
         rows.append((f"{ODOMETRY} disagrees by", f"{np.hypot(drift[0], drift[1]):.3f} m, {np.degrees(abs(drift[2])):.2f}°"))
+        rows.append(("final map disagrees by", f"{_contradiction_m(scene, edge):.3f} m"))
     rows += [(name.replace("_", " "), f"{value:.4g}") for name, value in edge.scores.items()]
     return tuple(rows)
 

@@ -43,7 +43,7 @@ class Scene:
     Attributes:
         source: what was mapped.
         primary: the back-end that is judged.
-        backends: `odometry`, then every back-end with a solution, the primary first.
+        backends: `odometry`, then every back-end that followed the drive or has a solution, the primary first.
         truth: true trajectory, if known.
         estimates: name -> trajectory, each aligned to the truth by itself; also `<backend>_online`.
         pairs: name -> estimate and truth at common stamps, both in the page's frame; empty without a truth.
@@ -87,8 +87,8 @@ def load_scene(folder: SessionFolder, store: MapStore) -> Scene:
     }
     solutions = store.solutions()
     primary = store.primary
-    others = [name for name in solutions if name not in (primary, ODOMETRY)]
-    backends = (ODOMETRY, *(name for name in (primary, *others) if name in solutions and name != ODOMETRY))
+    followed = [name for name in (*solutions, *store.online_backends()) if name != ODOMETRY]
+    backends = tuple(dict.fromkeys((ODOMETRY, *(name for name in followed if name == primary), *followed)))
     experiences = store.map()
     place = alignments.get(primary, alignments.get(ODOMETRY, IDENTITY))
     figures = folder.read_metrics()

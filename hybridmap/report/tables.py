@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 from hybridmap.metrics import Metric
 
+_FIRST = ("ate", "relation")
+
 
 @dataclass(frozen=True, slots=True)
 class Row:
@@ -20,14 +22,17 @@ class Row:
 
 
 def by_backend(metrics: Sequence[Metric], backends: Sequence[str]) -> list[Row]:
-    """A row a measure that at least one of the back-ends has, a cell a back-end; the last column's words explain it."""
+    """A row a measure that at least one of the back-ends has, a cell a back-end.
+
+    Errors come first, the rest as it came; the words are those of the last back-end that has the measure.
+    """
     measures: dict[str, dict[str, Metric]] = {}
     for metric in metrics:
         measure, _, stage = metric.name.partition("/")
         if stage in backends:
             measures.setdefault(measure, {})[stage] = metric
     rows = []
-    for measure, found in measures.items():
+    for measure, found in sorted(measures.items(), key=lambda item: not item[0].startswith(_FIRST)):
         last = next(found[name] for name in reversed(backends) if name in found)
         cells = tuple(shown(found[name]) if name in found else "" for name in backends)
         rows.append(Row(measure, unit(last), last.description, cells))

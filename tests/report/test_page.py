@@ -1,0 +1,133 @@
+"""The page of a session: complete, self-contained, the same each time, and usable when little is known."""
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from hybridmap.errors import StoreError
+from hybridmap.metrics import Metric
+from hybridmap.report import write_report
+from hybridmap.store import MapStore, SessionFolder
+from tests.store.sessions import ring_map, write_session
+
+VOID = {"meta", "img", "br", "link"}
+
+
+class Page(HTMLParser):
+    """Tags that are open, sources of pictures, and headings."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.sources: list[str] = []
+        self.links: list[str] = []
+        self.tags: set[str] = set()
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        if tag not in VOID:
+            self.open.append(tag)
+        self.sources += [value or "" for name, value in attrs if name == "src"]
+        self.links += [value or "" for name, value in attrs if name == "href"]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> SessionFolder:
+    folder = write_session(tmp_path_factory.mktemp("page") / "session", ring_map(1.5))
+    folder.write_metrics(
+        {"graph_hash": "abc123", "primary_backend": "gtsam-lm", "backends": ["gtsam-lm"], "remarks": ["3 frames <lost>"]},
+        [
+            Metric("nodes", 60.0, "1", "experiences"),
+            Metric("ate_rmse/odometry", 0.4321, "m", "absolute trajectory error"),
+            Metric("ate_rmse/gtsam-lm", 0.01, "m", "absolute trajectory error", bar=0.2, passed=True),
+        ],
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(session: SessionFolder) -> Page:
+    assert write_report(session) == session.report
+    return Page(session.report.read_text())
+
+
+def test_needs_nothing_beside_it(session: SessionFolder, page: Page) -> None:
+    assert page.open == []
+    assert page.sources
+    assert all(source.startswith(("data:image/svg+xml;base64,", "data:image/jpeg;base64,")) for source in page.sources)
+    assert page.links == []
+    assert not page.tags & {"script", "link", "iframe", "object"}
+    assert not re.search(r"url\(|@import", session.report.read_text())
+
+
+def test_shows_every_part(page: Page) -> None:
+    for part in ("circle", "Map and trajectories", "its loops", "Error over time", "Loop closures", "Figures", "Configuration"):
+        assert part in page.text
+    assert "backends:\n  names: [gtsam-lm]" in page.text
+    assert "abc123" in page.text
+    assert "3 frames <lost>" in page.text
+    assert "43.2 cm" in page.text
+    assert "0.01 ✓" in page.text
+    assert "not accepted" in page.text
+    assert "too few inliers" in page.text
+    assert sum(source.startswith("data:image/jpeg") for source in page.sources) == 2 * 4
+
+
+def test_same_session_same_page(session: SessionFolder, page: Page) -> None:
+    first = session.report.read_bytes()
+    assert page.text
+    assert write_report(session).read_bytes() == first
+
+
+def test_shows_the_largest_correction(tmp_path: Path) -> None:
+    folder = write_session(tmp_path / "session", ring_map(1.2))
+    before = ring_map(1.2).initial[:30]
+    with MapStore.open(folder.path) as store:
+        assert store.info("largest_correction") is None
+    put_info(
+        folder,
+        {"stamp_ns": 30_000_000_000, "node": 29, "shift_m": 0.5, "before": before.tolist(), "after": (before * 1.1).tolist()},
+    )
+    text = Page(write_report(folder).read_text()).text
+    assert "30 s after the start" in text
+    assert "by 50 cm" in text
+
+
+def put_info(folder: SessionFolder, correction: dict) -> None:
+    import json
+    import sqlite3
+
+    with sqlite3.connect(folder.map_db) as connection:
+        connection.execute("INSERT INTO info VALUES ('largest_correction', ?)", (json.dumps(correction),))
+    connection.close()
+
+
+@pytest.mark.parametrize("known", [{"loops": False}, {"laps": 0.1}], ids=["no loops", "few nodes"])
+def test_little_to_show(tmp_path: Path, known: dict) -> None:
+    laps = known.pop("laps", 1.1)
+    folder = write_session(tmp_path / "session", ring_map(laps, **known), keyframes=False)
+    folder.groundtruth.unlink()
+    page = Page(write_report(folder).read_text())
+    assert page.open == []
+    assert "No ground truth is known" in page.text
+    assert "Loop closures, looked at" not in page.text
+
+
+def test_without_any_solution(tmp_path: Path) -> None:
+    folder = write_session(tmp_path / "session", ring_map(1.1), solve=False)
+    assert Page(write_report(folder).read_text()).open == []
+
+
+def test_refuses_a_folder_without_a_session(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="no session"):
+        write_report(SessionFolder(tmp_path))

@@ -1,0 +1,127 @@
+"""What the page's parts compute: alignment, errors over time, fates of loops, what a keyframe shows from above."""
+
+import numpy as np
+import pytest
+
+from hybridmap.geometry import compose, transform_points
+from hybridmap.metrics import Metric
+from hybridmap.report import tables
+from hybridmap.report.closures import examples, spread
+from hybridmap.report.error_figure import ErrorSeries, error_series, over_intervals
+from hybridmap.report.map_figure import loops_by_fate
+from hybridmap.report.outline import outline, outlines, raster
+from hybridmap.report.scene import Scene, load_scene
+from hybridmap.store import MapStore, SessionFolder
+from hybridmap.trajectory import Trajectory
+from tests.store.sessions import RIG, keyframe_of, ring_map, truth_at, write_session
+
+MOVED = np.array([3.0, -2.0, 0.7])
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> SessionFolder:
+    """A session whose ground truth is told in another frame."""
+    folder = write_session(tmp_path_factory.mktemp("parts") / "session", ring_map(1.5))
+    stamps = np.arange(0, 60 * 10**9, 10**8)
+    folder.write_groundtruth(Trajectory(stamps, compose(MOVED, truth_at(stamps))))
+    return folder
+
+
+@pytest.fixture
+def scene(session: SessionFolder) -> Scene:
+    with MapStore.open(session.path) as store:
+        return load_scene(session, store)
+
+
+def test_everything_is_brought_to_the_frame_of_the_truth(scene: Scene) -> None:
+    stamps = np.array([node.stamp_ns for node in scene.experiences.nodes])
+    np.testing.assert_allclose(scene.nodes[:, :2], compose(MOVED, truth_at(stamps))[:, :2], atol=2e-3)
+    assert scene.backends == ("odometry", "gtsam-lm")
+    assert scene.primary == "gtsam-lm"
+
+
+def test_errors_are_those_of_the_aligned_trajectories(scene: Scene) -> None:
+    series = error_series(scene)
+    assert series["gtsam-lm"].position_m.max() < 0.01
+    rmse = float(np.sqrt(np.mean(series["odometry"].position_m ** 2)))
+    offset = scene.pairs["odometry"].estimate - scene.pairs["odometry"].reference
+    assert rmse == pytest.approx(np.sqrt(np.mean(np.sum(offset[:, :2] ** 2, axis=1))))
+    assert rmse > 0.1
+    assert series["odometry"].time_s[0] == 0.0
+
+
+def test_intervals_keep_the_root_mean_square() -> None:
+    time = np.linspace(0.0, 10.0, 4000)
+    series = ErrorSeries(time, np.where(time < 5, 3.0, 4.0), np.ones(4000))
+    drawn = over_intervals(series, 10)
+    assert len(drawn.time_s) == 10
+    np.testing.assert_allclose(drawn.position_m, [3.0] * 5 + [4.0] * 5, rtol=1e-2)
+    assert over_intervals(drawn, 10) is drawn
+
+
+def test_every_loop_has_one_fate(scene: Scene) -> None:
+    counts = {fate: len(edges) for fate, edges in loops_by_fate(scene).items()}
+    assert counts["loops accepted"] == 20
+    assert counts["loops rejected"] == 20
+    assert sum(counts.values()) == 40
+
+
+def test_examples_are_spread_and_end_with_a_refused_one(session: SessionFolder, scene: Scene) -> None:
+    with MapStore.open(session.path) as store:
+        found = examples(scene, store, outlines(store, len(scene.nodes)))
+    assert [example.accepted for example in found] == [True, True, True, False]
+    assert len({example.title for example in found}) == 4
+    assert all(example.overlay and example.profiles and len(example.photos) == 2 for example in found)
+    assert ("time apart", "40.0 s") in found[0].facts
+
+
+def test_spread_takes_the_middles() -> None:
+    assert spread(list(range(9)), 3) == [1, 4, 7]  # type: ignore[arg-type]
+    assert spread([1, 2], 3) == [1, 2]  # type: ignore[list-item]
+
+
+def test_outline_of_a_scan_is_the_room() -> None:
+    pose = truth_at(np.array([7 * 10**9]))[0]
+    points = transform_points(pose, outline({"ranges_m": keyframe_of(0, pose[None])["ranges_m"]}, RIG))
+    walls = np.minimum(np.abs(np.abs(points[:, 0]) - 5.0), np.abs(np.abs(points[:, 1] - 2.0) - 5.0))
+    assert len(points) > 150
+    assert walls.max() < 1e-4
+
+
+def test_outline_of_depth_is_the_wall_ahead() -> None:
+    depth = np.full((24, 32), 2000, np.uint16)
+    depth[:, :4] = 0
+    points = outline({"depth_mm": depth}, RIG)
+    np.testing.assert_allclose(points[:, 0], 2.1)
+    assert points[:, 1].max() == pytest.approx(2.0 * (16 - 4) / 30)
+    assert outline({}, RIG).shape == (0, 2)
+
+
+def test_raster_is_dark_where_something_was_seen() -> None:
+    room = raster({0: np.array([[0.0, 0.0], [2.0, 1.0]])}, np.array([[10.0, 5.0, 0.0]]))
+    assert room is not None
+    left, right, bottom, top = room.extent
+    rows, columns = np.nonzero(room.grey)
+    x = left + (columns + 0.5) / room.grey.shape[1] * (right - left)
+    y = bottom + (rows + 0.5) / room.grey.shape[0] * (top - bottom)
+    np.testing.assert_allclose(sorted(zip(x, y, strict=True)), [(10, 5), (12, 6)], atol=0.03)
+    assert raster({}, np.zeros((1, 3))) is None
+
+
+def test_tables_put_back_ends_side_by_side() -> None:
+    metrics = [
+        Metric("chi2/gtsam-lm", 146.08, "1", "chi2"),
+        Metric("ate_rmse/odometry", 1.5, "m", "error"),
+        Metric("ate_rmse/gtsam-lm", float("nan"), "m", "error"),
+        Metric("cpu_s/matching", 12.0, "s", "time"),
+    ]
+    rows = tables.by_backend(metrics, ("odometry", "gtsam-lm"))
+    assert [(row.measure, row.cells) for row in rows] == [("ate_rmse", ("1.5", "–")), ("chi2", ("", "146.1"))]
+    assert [row.measure for row in tables.of_session(metrics, ("odometry", "gtsam-lm"))] == ["cpu_s/matching"]
+
+
+@pytest.mark.parametrize(
+    ("value", "said"), [(0.004, ("0.4", "cm")), (0.28, ("28", "cm")), (6.5, ("6.5", "m")), (227.4, ("227", "m"))]
+)
+def test_lengths_are_said_as_people_say_them(value: float, said: tuple[str, str]) -> None:
+    assert tables.length(value) == said
