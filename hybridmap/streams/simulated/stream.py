@@ -47,11 +47,11 @@ class SimulatedStream:
         self._world: World = build_world(config.world)
         self._report = StreamReport()
         truth = drive(self._world.legs, DriveLimits(config.speed_m_s, config.turn_rate_rad_s), 1.0 / config.odometry_rate_hz)
-        if config.duration_s is not None:
-            truth = truth[: max(3, int(config.duration_s * config.odometry_rate_hz) + 1)]
-        stamps = _stamps_ns(len(truth), config.odometry_rate_hz)
-        self._truth = Trajectory(stamps, np.column_stack([truth[:, :2], as_transmitted(truth[:, 2])]))
-        self._odometry = wheel_odometry(truth, config.wheels, self._generators()[_WHEELS])
+        odometry = wheel_odometry(truth, config.wheels, self._generators()[_WHEELS])
+        count = len(truth) if config.duration_s is None else max(3, int(config.duration_s * config.odometry_rate_hz) + 1)
+        stamps = _stamps_ns(len(truth), config.odometry_rate_hz)[:count]
+        self._truth = Trajectory(stamps, np.column_stack([truth[:, :2], as_transmitted(truth[:, 2])])[:count])
+        self._odometry = Trajectory(stamps, odometry[:count])
 
     @property
     def name(self) -> str:
@@ -76,7 +76,7 @@ class SimulatedStream:
     @property
     def odometry(self) -> Trajectory:
         """What the wheels report: poses of `base_link` in `odom`."""
-        return Trajectory(self._truth.stamps_ns, self._odometry)
+        return self._odometry
 
     @property
     def expected_observations(self) -> int:
@@ -93,7 +93,7 @@ class SimulatedStream:
         self._report = StreamReport()
         observations = self._observations()
         waiting = next(observations, None)
-        for stamp, pose in zip(self._truth.stamps_ns, self._odometry, strict=True):
+        for stamp, pose in zip(self._odometry.stamps_ns, self._odometry.poses, strict=True):
             while waiting is not None and waiting.stamp_ns < stamp:
                 yield waiting
                 waiting = next(observations, None)
