@@ -9,6 +9,8 @@ import typer
 
 from hybridmap.cli.show import emit
 
+_SHOWN = ("nodes", "loops_accepted", "travel", "duration", "largest_correction", "ate_rmse", "ate_rmse_online", "drift", "chi2")
+
 
 def demo(
     out: Annotated[Path, typer.Option(help="The session folder itself.")] = Path("hybridmap-demo"),
@@ -23,7 +25,7 @@ def demo(
 
     chosen = choose(f"sim:{world}", None, {"seed": seed})
     head, metrics = map_and_report(chosen.stream, chosen.config, out, overwrite=overwrite)
-    shown = [metric for metric in metrics if metric.name.startswith(("ate_rmse", "nodes", "loop", "travel", "chi2/"))]
-    emit(head, metrics if as_json else shown, as_json=as_json, title=f"{world}, simulated")
+    shown = [metric for metric in metrics if metric.name.partition("/")[0] in _SHOWN]
+    emit(head, metrics if as_json else shown, as_json=as_json, title=f"simulated {world}")
     if not as_json:
         typer.echo(f"page: {out / 'report.html'}")

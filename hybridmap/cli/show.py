@@ -6,9 +6,12 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from hybridmap.metrics import Metric, to_json
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
 class Advance(Protocol):
@@ -19,21 +22,61 @@ class Advance(Protocol):
 
 
 def emit(head: dict[str, Any], metrics: Iterable[Metric], *, as_json: bool, title: str = "") -> None:
-    """Print one JSON object, or a table with units, on standard output."""
+    """Print one JSON object, or tables with units, on standard output: one of plain figures, one by back-end."""
     rows = list(metrics)
     if as_json:
         sys.stdout.write(to_json(head, rows) + "\n")
         return
     from rich.console import Console
+
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    columns = [str(name) for name in ("odometry", *head.get("backends", ()))]
+    columns = [name for name in dict.fromkeys(columns) if any(_stage(row) == name for row in rows)]
+    plain = [row for row in rows if _stage(row) not in columns]
+    if plain:
+        console.print(_plain_table(plain, title))
+    if columns:
+        console.print(_table_by_backend([row for row in rows if row not in plain], columns, "" if plain else title))
+
+
+def _stage(row: Metric) -> str:
+    return row.name.partition("/")[2]
+
+
+def _value(row: Metric | None) -> str:
+    if row is None:
+        return ""
+    verdict = "" if row.passed is None else " ✓" if row.passed else " ✗"
+    return f"{row.value:.4g}{verdict}"
+
+
+def _plain_table(rows: list[Metric], title: str) -> Table:
     from rich.table import Table
 
     table = Table(title=title or None, title_justify="left")
-    for column, justify in (("figure", "left"), ("value", "right"), ("unit", "left"), ("meaning", "left")):
-        table.add_column(column, justify=justify)  # type: ignore[arg-type]
+    table.add_column("figure", no_wrap=True)
+    table.add_column("value", justify="right", no_wrap=True)
+    table.add_column("unit")
+    table.add_column("meaning")
     for row in rows:
-        verdict = "" if row.passed is None else " ✓" if row.passed else " ✗"
-        table.add_row(row.name, f"{row.value:.6g}{verdict}", row.unit, row.description)
-    Console().print(table)
+        table.add_row(row.name, _value(row), row.unit, row.description)
+    return table
+
+
+def _table_by_backend(rows: list[Metric], columns: list[str], title: str) -> Table:
+    from rich.table import Table
+
+    table = Table(title=title or None, title_justify="left")
+    table.add_column("figure", no_wrap=True)
+    table.add_column("unit")
+    for column in columns:
+        table.add_column(column, justify="right", no_wrap=True)
+    by_name = {row.name: row for row in rows}
+    for measure in dict.fromkeys(row.name.partition("/")[0] for row in rows):
+        cells = [by_name.get(f"{measure}/{column}") for column in columns]
+        unit = next(cell.unit for cell in cells if cell is not None)
+        table.add_row(measure, unit, *(_value(cell) for cell in cells))
+    return table
 
 
 @contextmanager
