@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
@@ -72,24 +74,27 @@ class PlaceAttractor:
         Around the origin the code is the sheet itself. A place one wrap away is carried by other cells, as real place cells
         remap; `near_m` (2,) says which repetition the bump is in.
         """
-        size = self._side**2
-        rates = self.activity.reshape(-1)
-        index = np.arange(self._side)
-        tile = np.round((np.asarray(near_m) / self.cell_m - index[:, None]) / self._side).astype(np.int64)
-        code = np.zeros(size)
-        for tx in np.unique(tile[:, 0]).tolist():
-            for ty in np.unique(tile[:, 1]).tolist():
-                cells = np.flatnonzero(np.outer(tile[:, 0] == tx, tile[:, 1] == ty))
-                code[self._remapping(tx, ty)[cells]] += rates[cells]
-        return np.asarray(code / np.linalg.norm(code), dtype=np.float32)
+        code = np.zeros(self._side**2)
+        columns = self._repetitions(float(near_m[1]))
+        for tx, rows in self._repetitions(float(near_m[0])):
+            for ty, cols in columns:
+                code[self._remapping(tx, ty)[rows, cols]] += self.activity[rows, cols]
+        return np.asarray(code / math.sqrt(float(code @ code)), dtype=np.float32)
+
+    def _repetitions(self, near_m: float) -> list[tuple[int, slice]]:
+        """The repetitions of the sheet that the cells nearest to a coordinate along an axis are in, each with its cells."""
+        half = self._side // 2
+        first = math.ceil(near_m / self.cell_m) - half
+        tile, cell = divmod(first, self._side)
+        return [(tile, slice(cell, None)), (tile + 1, slice(None, cell))][: 2 if cell else 1]
 
     def _remapping(self, tx: int, ty: int) -> NDArray[np.int64]:
-        """Which cell (N * N,) stands for each cell of the sheet in its repetition (tx, ty); the same in every run."""
+        """Which cell stands for each cell (N, N) of the sheet in its repetition (tx, ty); the same in every run."""
         if (tx, ty) not in self._remappings:
             size = self._side**2
             seed = [abs(tx), abs(ty), int(tx < 0), int(ty < 0)]
             drawn = np.arange(size) if tx == ty == 0 else np.random.default_rng(seed).permutation(size)
-            self._remappings[tx, ty] = drawn
+            self._remappings[tx, ty] = drawn.reshape(self._side, self._side)
         return self._remappings[tx, ty]
 
     @staticmethod

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridmap.config.neural import NeuralConfig
+from hybridmap.errors import StreamError
 from hybridmap.geometry import Array
 from hybridmap.neural.attractor import PlaceAttractor
 from hybridmap.neural.band import BandRings
@@ -54,8 +55,13 @@ class PathIntegrator:
             delta_robot: (3,) pose of the robot now in the frame of the robot at the last step, m and rad (`geometry.between`
                 of two odometry poses). Its chord is turned to the mid-point heading, so a gain on the turn bends the path.
             dt_s: seconds since the last step; the sheets' time constant is one step, so their dynamics do not need it.
+
+        Raises:
+            StreamError: the displacement is not finite.
         """
         dx, dy, dyaw = (float(value) for value in np.asarray(delta_robot, dtype=np.float64))
+        if not math.isfinite(dx + dy + dyaw):
+            raise StreamError(f"self-motion: expected a finite displacement (dx, dy, dyaw), found ({dx}, {dy}, {dyaw})")
         if dx == 0.0 and dy == 0.0 and dyaw == 0.0:
             return
         config = self.config
@@ -83,7 +89,7 @@ class PathIntegrator:
 
         It is a function of the present activity alone: the same place gives the same code whenever it is visited.
         """
-        return self.attractor.code(self.decode().position_m)
+        return self.attractor.code(self.attractor.unwrapped_m(self._last_decoded_m))
 
     def decode(self) -> Decoded:
         """Decode the position from all sheets together, with how well the modules agree."""
@@ -111,10 +117,10 @@ class PathIntegrator:
         self.grid.activity = shift_sheets(self.grid.activity, shift[:, [0, 2]])
 
     def snapshot(self) -> dict[str, NDArray[np.generic]]:
-        """Return what a node stores so that `restore` puts the network back where it is now (about 8 kB).
+        """Return what a node stores so that `restore` puts the network back where it is now (some 8 kB).
 
-        Keys: `heading` (m,), `band_phases` (M, 3), `grid_phases` (M, 2), `attractor` (N, N), `place_code` (P,), and
-        `near_m` (2,): the decoded position, which says which repetition of the code is meant.
+        Keys: `heading` (m,), `band_phases` (M, 3), `grid_phases` (M, 2), `attractor` (N, N), and `near_m` (2,): the
+        decoded position, which says which repetition of the code is meant.
         """
         near = self.decode().position_m
         return {
@@ -122,7 +128,6 @@ class PathIntegrator:
             "band_phases": self.bands.phases(),
             "grid_phases": self.grid.phases(),
             "attractor": self.attractor.activity.astype(np.float32),
-            "place_code": self.place_code,
             "near_m": near.copy(),
         }
 

@@ -6,6 +6,7 @@ from neural_drives import arc, wander
 
 from hybridmap import geometry
 from hybridmap.config.neural import NeuralConfig
+from hybridmap.errors import StreamError
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.band import BandMotion
 from hybridmap.neural.torus import shift_sheets
@@ -143,6 +144,14 @@ def test_any_increment_is_composed_exactly(dx, dy, dyaw):
     integrator.step((dx, dy, dyaw), 0.1)
     expected = geometry.compose(start, (dx, dy, dyaw))
     assert geometry.between(expected, integrator.pose) == pytest.approx(np.zeros(3), abs=2e-5)
+
+
+def test_a_displacement_that_is_not_finite_is_refused():
+    integrator = PathIntegrator(NeuralConfig())
+    before = integrator.pose
+    with pytest.raises(StreamError, match="finite"):
+        integrator.step((np.nan, 0.0, 0.0), 0.1)
+    assert np.array_equal(integrator.pose, before)
 
 
 def test_velocities_are_integrated_by_the_midpoint():
