@@ -37,10 +37,14 @@ class RegistrationConfig(Section):
     """Normals of matched points may differ by this much."""
     depth_sigma: float = Field(default=0.003, gt=0)
     """Noise of depth: standard deviation in m at 1 m; it grows with the square of the distance."""
-    min_points: int = Field(default=150, ge=10)
+    min_points: int = Field(default=60, ge=10)
     """Fewest matched points."""
     min_inliers: float = Field(default=0.5, gt=0, le=1)
     """Least share of the points in common view that fit."""
+    keypoints: bool = True
+    """Matched keypoints join the depth: they hold the direction in which depth slides."""
+    keypoint_reach_m: float = Field(default=0.3, gt=0)
+    """Matched keypoints farther apart than this at the first guess are no matches."""
     correlation: float = Field(default=30.0, ge=1)
     """Neighbouring points err together: so many count as one in the covariance."""
     translation_floor_m: float = Field(default=0.002, gt=0)

@@ -10,9 +10,13 @@ from numpy.typing import NDArray
 from hybridmap.geometry import Array
 from hybridmap.streams.base import Camera
 from hybridmap.vision.rgbd.spatial import apply, inverse_rigid
+from hybridmap.vision.rgbd.stance import Stance
 
 MAX_JUMP = 0.05
-"""Neighbours whose depths differ by more than this share of the depth are not one surface."""
+MAX_BEND = 0.015
+MIN_SHARE = 0.6
+"""Neighbouring cells are one surface where inverse depth differs by less than a share, or bends by less than a share of itself;
+a cell is known where this share of its pixels is."""
 
 
 def reduced(camera: Camera, factor: int) -> Camera:
@@ -53,15 +57,15 @@ class Surface:
 
     Attributes:
         grid: where it comes from.
-        T_base_camera: (4, 4) pose of the camera as it was at that keyframe.
-        T_camera_base: its inverse.
+        stance: how the camera was held at that keyframe.
+        T_camera_base: (4, 4) inverse of its pose.
         points, normals: (N, 3) valid points in `base_link`, m.
         sigma_m: (N,) their noise.
         number: (R, C) int32, index of a cell's point; -1 for none.
     """
 
     grid: DepthGrid
-    T_base_camera: Array
+    stance: Stance
     T_camera_base: Array
     points: Array
     normals: Array
@@ -79,24 +83,24 @@ def make_grid(depth_m: NDArray[np.float32], camera: Camera, cell_px: int, depth_
         depth_sigma: noise of one pixel at 1 m, m; it grows with the square of the distance.
     """
     coarse = reduced(camera, cell_px)
-    depth, known = _cell_depth(depth_m, coarse.height_px, coarse.width_px, cell_px)
+    cells = _average(depth_m, coarse.height_px, coarse.width_px, cell_px)
+    depth = 1.0 / cells.inverse
     u = (np.arange(coarse.width_px) - coarse.cx_px) / coarse.fx_px
     v = (np.arange(coarse.height_px) - coarse.cy_px) / coarse.fy_px
     rays = np.stack(np.broadcast_arrays(u[None, :], v[:, None], 1.0), axis=-1)
     points = rays * depth[..., None]
-    normals, flat = _normals(points, depth, known)
     sigma = 0.001 + 0.5 * depth_sigma * depth**2
-    return DepthGrid(coarse, points, normals, flat, sigma)
+    return DepthGrid(coarse, points, _normals(points), _on_one_surface(cells), sigma)
 
 
-def place(grid: DepthGrid, T_base_camera: Array) -> Surface:
+def place(grid: DepthGrid, stance: Stance) -> Surface:
     """Put a grid into the robot's frame, with the camera as it was at that keyframe."""
-    valid = grid.valid
+    valid, T_base_camera = grid.valid, stance.T_base_camera
     number = np.full(valid.shape, -1, dtype=np.int32)
     number[valid] = np.arange(int(valid.sum()), dtype=np.int32)
     return Surface(
         grid,
-        T_base_camera,
+        stance,
         inverse_rigid(T_base_camera),
         apply(T_base_camera, grid.points[valid]),
         grid.normals[valid] @ T_base_camera[:3, :3].T,
@@ -105,36 +109,55 @@ def place(grid: DepthGrid, T_base_camera: Array) -> Surface:
     )
 
 
-def _cell_depth(depth_m: NDArray[np.float32], rows: int, columns: int, cell_px: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Mean of the valid depths of each cell; known where most pixels are valid and lie on one surface."""
+@dataclass(frozen=True, slots=True)
+class _Cells:
+    """Cells of a depth image: mean inverse depth (R, C), its spread within the cell, and where most pixels are valid."""
+
+    inverse: Array
+    spread: Array
+    known: NDArray[np.bool_]
+
+
+def _average(depth_m: NDArray[np.float32], rows: int, columns: int, cell_px: int) -> _Cells:
+    """Average *inverse* depth: on a plane it is linear over the image, however grazing the view."""
     import cv2
 
     cut = np.ascontiguousarray(depth_m[: rows * cell_px, : columns * cell_px])
-    stack = cv2.merge([cut, cut * cut, (cut > 0).astype(np.float32)])
-    mean, square, share = np.moveaxis(
-        cv2.resize(stack, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float64), -1, 0
-    )
-    safe = np.maximum(share, 1e-6)
-    depth = mean / safe
-    spread = np.sqrt(np.maximum(square / safe - depth**2, 0.0))
-    known = (share > 0.6) & (spread < 0.5 * MAX_JUMP * depth)
-    return np.where(known, depth, 1.0), known
+    seen = cut > 0
+    inverse = np.divide(np.float32(1.0), cut, out=np.zeros_like(cut), where=seen)
+    stack = cv2.merge([inverse, inverse * inverse, seen.astype(np.float32)])
+    small = cv2.resize(stack, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float64)
+    share = np.maximum(small[..., 2], 1e-6)
+    mean = small[..., 0] / share
+    known = small[..., 2] > MIN_SHARE
+    spread = np.sqrt(np.maximum(small[..., 1] / share - mean**2, 0.0))
+    return _Cells(np.where(known, mean, 1.0), spread, known)
 
 
-def _normals(points: Array, depth: Array, known: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
+def _on_one_surface(cells: _Cells) -> NDArray[np.bool_]:
+    """Cells that no depth edge touches: their neighbours are near in depth, or in line with them (a grazing plane)."""
+    inverse, known = cells.inverse, cells.known
+    near = known & (cells.spread < 0.5 * MAX_JUMP * inverse)
+    straight = known.copy()
+    for axis in (0, 1):
+        before, after = np.roll(inverse, 1, axis), np.roll(inverse, -1, axis)
+        both = np.roll(known, 1, axis) & np.roll(known, -1, axis)
+        near &= both & (np.maximum(np.abs(before - inverse), np.abs(after - inverse)) < MAX_JUMP * inverse)
+        bend = both & (np.abs(before + after - 2.0 * inverse) < MAX_BEND * inverse)
+        straight &= bend & np.roll(bend, 1, axis) & np.roll(bend, -1, axis)
+    ok = near | straight
+    ok[[0, -1]] = False
+    ok[:, [0, -1]] = False
+    return ok
+
+
+def _normals(points: Array) -> Array:
+    """Unit normals (R, C, 3) towards the camera, from central differences."""
     across = np.zeros_like(points)
     down = np.zeros_like(points)
     across[:, 1:-1] = points[:, 2:] - points[:, :-2]
     down[1:-1] = points[2:] - points[:-2]
     normal = np.cross(down, across)
-    length = np.linalg.norm(normal, axis=-1)
-    normal /= np.maximum(length, 1e-12)[..., None]
-    towards = -np.sign(np.einsum("rcx,rcx->rc", normal, points))
-    jump = MAX_JUMP * 2.0 * depth
-    ok = known & (length > 1e-12)
-    ok[[0, -1]] = False
-    ok[:, [0, -1]] = False
-    for axis in (0, 1):
-        for step in (-1, 1):
-            ok &= np.roll(known, step, axis) & (np.abs(np.roll(depth, step, axis) - depth) < jump)
-    return normal * np.where(towards == 0, 1.0, towards)[..., None], ok
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1), 1e-12)[..., None]
+    away = np.einsum("rcx,rcx->rc", normal, points) > 0
+    return np.where(away[..., None], -normal, normal)

@@ -15,6 +15,7 @@ from hybridmap.config.rgbd import RegistrationConfig
 from hybridmap.geometry import Array, RelativePose
 from hybridmap.vision.rgbd.depth_grid import Surface
 from hybridmap.vision.rgbd.spatial import apply, from_planar, rotation_of, small_rotvec, to_floor
+from hybridmap.vision.rgbd.stance import LevelPair, Stance, level_pair
 
 PLANAR = np.array([0, 1, 5])
 OUT_OF_PLANE = np.array([2, 3, 4])
@@ -23,15 +24,16 @@ LOOSE = 1.0 / np.array([0.3, 0.3, np.deg2rad(10.0)]) ** 2
 
 
 @dataclass(frozen=True, slots=True)
-class FloorPrior:
-    """How firmly both robots stand on the same floor: standard deviations of dz (m) and of roll and pitch (rad)."""
+class _FloorPrior:
+    """How firmly both robots stand on the same floor: information of dz (m^-2) and of roll and pitch (rad^-2)."""
 
-    height_m: float
-    tilt_rad: float
+    information: Array
 
-
-LEVEL = FloorPrior(0.005, float(np.deg2rad(0.3)))
-MEASURED = FloorPrior(0.03, float(np.deg2rad(1.0)))
+    @classmethod
+    def of(cls, fixed: Stance, moving: Stance) -> _FloorPrior:
+        height = fixed.height_sigma_m**2 + moving.height_sigma_m**2
+        tilt = fixed.tilt_sigma_rad**2 + moving.tilt_sigma_rad**2
+        return cls(1.0 / np.array([height, tilt, tilt]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +55,9 @@ class Registration:
     """Outcome of a registration.
 
     Attributes:
-        T_fixed_moving: (4, 4) between the bases.
-        relative: planar part, with the covariance that the data alone give (the prior is taken out).
+        T_fixed_moving: (4, 4) between the bases as their stances had them.
+        level: the same between levelled bases.
+        relative: planar part of it, with the covariance that the data alone give (the prior is taken out).
         points: matched points.
         inliers: share of the points in common view that fit.
         residual_m: root mean square point-to-plane distance of the inliers.
@@ -63,6 +66,7 @@ class Registration:
     """
 
     T_fixed_moving: Array
+    level: LevelPair
     relative: RelativePose
     points: int
     inliers: float
@@ -88,7 +92,6 @@ def register(
     moving: Surface,
     start: Array,
     prior: RelativePose | None,
-    floor: FloorPrior,
     config: RegistrationConfig,
     pairs: PointPairs | None = None,
 ) -> Registration | None:
@@ -98,7 +101,6 @@ def register(
         fixed, moving: surfaces in their own bases.
         start: (4, 4) first guess of the moving base in the fixed one.
         prior: planar prior (wheel odometry) of the solve; taken out of the result's covariance.
-        floor: how firmly both stand on one floor.
         config: settings.
         pairs: keypoints that join the solve.
 
@@ -106,6 +108,7 @@ def register(
         None where too few points match.
     """
     T = start.copy()
+    floor = _FloorPrior.of(fixed.stance, moving.stance)
     for _ in range(config.iterations):
         pairing = _pair(fixed, moving, T, config)
         if len(pairing.residual) < config.min_points:
@@ -121,7 +124,7 @@ def register(
 
 
 def _summarise(
-    fixed: Surface, moving: Surface, T: Array, floor: FloorPrior, config: RegistrationConfig, pairs: PointPairs | None
+    fixed: Surface, moving: Surface, T: Array, floor: _FloorPrior, config: RegistrationConfig, pairs: PointPairs | None
 ) -> Registration | None:
     pairing = _pair(fixed, moving, T, config)
     if len(pairing.residual) < config.min_points:
@@ -132,10 +135,12 @@ def _summarise(
     if pairs is not None:
         H_pairs, _ = _pair_terms(pairs, T)
         H = H + H_pairs
-    flat = to_floor(T)
+    flat, level = to_floor(T), level_pair(T, fixed.stance, moving.stance)
+    arm = moving.stance.T_base_camera[2, 3] * T[:3, 2]
     return Registration(
         T,
-        RelativePose(flat.delta, _planar_covariance(H, flat.delta[2], floor)),
+        level,
+        RelativePose(level.delta, _planar_covariance(H, arm, level.delta[2], floor)),
         len(pairing.residual),
         len(pairing.residual) / max(pairing.in_view, 1),
         float(np.sqrt(np.mean(pairing.residual**2))),
@@ -200,13 +205,12 @@ def _pair_terms(pairs: PointPairs, T: Array) -> tuple[Array, Array]:
     return np.einsum("kij,kil->jl", J, WJ), -np.einsum("kij,ki->j", WJ, error)
 
 
-def _prior_terms(T: Array, prior: RelativePose | None, floor: FloorPrior) -> tuple[Array, Array]:
+def _prior_terms(T: Array, prior: RelativePose | None, floor: _FloorPrior) -> tuple[Array, Array]:
     flat = to_floor(T)
     tilt = small_rotvec(T[:3, :3] @ from_planar(flat.delta)[:3, :3].T)
     H, b = np.zeros((6, 6)), np.zeros(6)
-    out = np.array([1.0 / floor.height_m**2, 1.0 / floor.tilt_rad**2, 1.0 / floor.tilt_rad**2])
-    H[OUT_OF_PLANE, OUT_OF_PLANE] = out
-    b[OUT_OF_PLANE] = -out * np.array([flat.height_m, tilt[0], tilt[1]])
+    H[OUT_OF_PLANE, OUT_OF_PLANE] = floor.information
+    b[OUT_OF_PLANE] = -floor.information * np.array([flat.height_m, tilt[0], tilt[1]])
     if prior is not None:
         cos, sin = np.cos(prior.delta[2]), np.sin(prior.delta[2])
         axes = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -218,10 +222,16 @@ def _prior_terms(T: Array, prior: RelativePose | None, floor: FloorPrior) -> tup
     return H, b
 
 
-def _planar_covariance(H: Array, yaw: float, floor: FloorPrior) -> Array:
-    """Covariance of x, y, yaw in the moving frame: height and tilt are marginalised under their prior."""
-    full = H.copy()
-    full[OUT_OF_PLANE, OUT_OF_PLANE] += [1.0 / floor.height_m**2, 1.0 / floor.tilt_rad**2, 1.0 / floor.tilt_rad**2]
+def _planar_covariance(H: Array, arm: Array, yaw: float, floor: _FloorPrior) -> Array:
+    """Covariance of x, y, yaw in the moving frame: height and tilt are marginalised under their prior.
+
+    The point whose position counts is the one at the camera's height (`arm` above the origin): bases are levelled
+    afterwards, and a tilt turns about the camera.
+    """
+    about = np.eye(6)
+    about[:3, 3:] = [[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]]
+    full = about.T @ H @ about
+    full[OUT_OF_PLANE, OUT_OF_PLANE] += floor.information
     full[PLANAR, PLANAR] += LOOSE
     covariance = np.linalg.inv(full)[np.ix_(PLANAR, PLANAR)]
     cos, sin = np.cos(yaw), np.sin(yaw)

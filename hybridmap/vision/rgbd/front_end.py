@@ -53,7 +53,7 @@ class RgbdFrontEnd:
         )
         self._keyframes: list[Keyframe] = []
         keys = itertools.count()
-        self._tracker = Tracker(self._keyframes, rgbd.registration, keys.__next__)
+        self._tracker = Tracker(self._keyframes, rgbd, self._camera, keys.__next__)
         verifier = Verifier(self._camera, rgbd.pnp, rgbd.features, rgbd.registration, seed)
         self._posture = Posture(rgbd.tilt, camera.T_base_camera, verifier.solver, rgbd.features.ratio)
         self._closer = LoopCloser(self._keyframes, matching, rgbd, verifier, self._yaw_of_shift, keys.__next__)
@@ -88,10 +88,10 @@ class RgbdFrontEnd:
             self._image.grey, self._image.depth_m, self._camera, rgbd.features.count, rgbd.features.fast_threshold
         )
         grid = make_grid(self._image.depth_m, self._camera, rgbd.registration.grid_px, rgbd.registration.depth_sigma)
-        stance = self._posture.stance(grid, features)
+        stance = self._posture.stance(grid, features, self._keyframes[-1] if self._keyframes else None)
         color, depth = packed_images(self._frame)
-        surface = place(grid, stance.T_base_camera)
-        self._keyframes.append(Keyframe(view.profile, features, surface, stance.measured, color, depth))
+        surface = place(grid, stance)
+        self._keyframes.append(Keyframe(view.profile, features, surface, color, depth))
         self._closer.add_node(view.profile)
 
     def track(self, node: int, odometry: RelativePose | None) -> list[Proposal]:
@@ -114,7 +114,7 @@ class RgbdFrontEnd:
             "profile": kept.profile,
             "color": color,
             "depth_mm": depth_mm,
-            "T_base_camera": kept.surface.T_base_camera,
+            "T_base_camera": kept.surface.stance.T_base_camera,
         }
 
     def _yaw_of_shift(self, shift: int) -> float:

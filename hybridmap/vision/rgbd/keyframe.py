@@ -31,16 +31,19 @@ class Keyframe:
     """A node's frame: profile, features, surface, and the images, packed without loss.
 
     Attributes:
-        tilt_measured: the camera's tilt was measured at this keyframe and not taken from the mounting.
         color_png, depth_png: PNG files; depth in whole millimetres.
     """
 
     profile: Profile
     features: Features
     surface: Surface
-    tilt_measured: bool
     color_png: NDArray[np.uint8]
     depth_png: NDArray[np.uint8]
+
+    @property
+    def held(self) -> bool:
+        """The camera's tilt was measured at this keyframe and not taken from the mounting."""
+        return self.surface.stance.held
 
     def images(self) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
         """Colour (H, W, 3) uint8 RGB and depth (H, W) uint16 mm, as they came."""

@@ -12,17 +12,16 @@ from hybridmap.config.rgbd import FeaturesConfig, PnpConfig, RegistrationConfig
 from hybridmap.geometry import Array, RelativePose, between, wrap_angle
 from hybridmap.streams.base import Camera
 from hybridmap.vision.rgbd.depth_registration import (
-    LEVEL,
-    MEASURED,
-    PointPairs,
     Registration,
     register,
     with_floor,
 )
-from hybridmap.vision.rgbd.features import match
+from hybridmap.vision.rgbd.features import Correspondences, match
 from hybridmap.vision.rgbd.keyframe import Keyframe
+from hybridmap.vision.rgbd.pairs import point_pairs
 from hybridmap.vision.rgbd.pnp_solver import PnpSolver
-from hybridmap.vision.rgbd.spatial import FloorPose, apply, from_planar, inverse_rigid, to_floor
+from hybridmap.vision.rgbd.spatial import FloorPose, from_planar, inverse_rigid, to_floor
+from hybridmap.vision.rgbd.stance import level_pair
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,22 +60,23 @@ class Verifier:
         if backward is None or len(backward.inliers) < self._pnp.min_inliers:
             return Verification(None, f"only {scores['inliers_reverse']:.0f} features agree in reverse", scores)
         T = _between_bases(forward.T_image_points, source, target)
-        flat, reverse = to_floor(T), to_floor(_between_bases(inverse_rigid(backward.T_image_points), source, target))
-        refusal = self._implausible(flat, reverse, source.tilt_measured or target.tilt_measured, scores)
+        T_reverse = _between_bases(inverse_rigid(backward.T_image_points), source, target)
+        flat, reverse = _flat(T, source, target), _flat(T_reverse, source, target)
+        refusal = self._implausible(flat, reverse, source.held or target.held, scores)
         if refusal is not None:
             return Verification(None, refusal, scores)
         both = np.intersect1d(forward.inliers, backward.inliers)
         return self._refined(source, target, flat, pairs.first[both], pairs.second[both], scores)
 
-    def _implausible(self, flat: FloorPose, reverse: FloorPose, tilt_measured: bool, scores: dict[str, float]) -> str | None:
+    def _implausible(self, flat: FloorPose, reverse: FloorPose, held: bool, scores: dict[str, float]) -> str | None:
         """Why the two poses cannot be right, or None."""
         gap = between(flat.delta, reverse.delta)
         apart_m, apart_deg = float(np.hypot(gap[0], gap[1])), float(np.rad2deg(abs(gap[2])))
         tilt_deg = float(np.rad2deg(flat.tilt_rad))
         scores |= {"height_m": flat.height_m, "tilt_deg": tilt_deg, "reverse_m": apart_m, "reverse_deg": apart_deg}
-        if abs(flat.height_m) > self._pnp.max_height_m * (3.0 if tilt_measured else 1.0):
+        if abs(flat.height_m) > self._pnp.max_height_m * (3.0 if held else 1.0):
             return f"off the floor by {abs(flat.height_m):.2f} m"
-        if tilt_deg > self._pnp.max_tilt_deg * (2.0 if tilt_measured else 1.0):
+        if tilt_deg > self._pnp.max_tilt_deg * (2.0 if held else 1.0):
             return f"tilted by {tilt_deg:.1f} deg"
         if apart_m > self._pnp.agree_m or apart_deg > self._pnp.agree_deg:
             return f"the two directions differ by {apart_m:.2f} m, {apart_deg:.1f} deg"
@@ -91,13 +91,12 @@ class Verifier:
         second: NDArray[np.int64],
         scores: dict[str, float],
     ) -> Verification:
-        pairs = self._point_pairs(source, target, first, second)
+        pairs = point_pairs(source, target, Correspondences(first, second), self._focal_px, self._registration.depth_sigma)
         rough = RelativePose(flat.delta, np.diag([0.1, 0.1, np.deg2rad(3.0)]) ** 2)
         fit: Registration | None = None
         if self._pnp.refine:
-            floor = MEASURED if source.tilt_measured or target.tilt_measured else LEVEL
             start = from_planar(flat.delta)
-            fit = register(source.surface, target.surface, start, rough, floor, self._registration, pairs)
+            fit = register(source.surface, target.surface, start, rough, self._registration, pairs)
         if fit is None:
             sigma = 0.05 / np.sqrt(max(len(first), 1) / 12.0)
             loose = RelativePose(flat.delta, np.diag([sigma, sigma, np.deg2rad(1.0)]) ** 2)
@@ -115,40 +114,14 @@ class Verifier:
     def _floors(self) -> tuple[float, float]:
         return self._pnp.translation_floor_m, self._pnp.rotation_floor_deg
 
-    def _point_pairs(
-        self, source: Keyframe, target: Keyframe, first: NDArray[np.int64], second: NDArray[np.int64]
-    ) -> PointPairs | None:
-        """Keypoints with depth in both, each with the information of a pixel sideways and of depth along its ray."""
-        return point_pairs(source, target, first, second, self._focal_px, self._registration.depth_sigma)
 
-
-def point_pairs(
-    fixed: Keyframe,
-    moving: Keyframe,
-    of_fixed: NDArray[np.int64],
-    of_moving: NDArray[np.int64],
-    focal_px: float,
-    depth_sigma: float,
-) -> PointPairs | None:
-    """Pair up keypoints that have depth in both keyframes; None where fewer than three have.
-
-    Each carries the information of one pixel (1 sigma) sideways and of its depth along the ray.
-    """
-    a, b = fixed.features.points[of_fixed], moving.features.points[of_moving]
-    known = np.isfinite(a[:, 0]) & np.isfinite(b[:, 0])
-    if known.sum() < 3:
-        return None
-    a, b = a[known], b[known]
-    rotation = fixed.surface.T_base_camera[:3, :3]
-    ray = (a / np.linalg.norm(a, axis=1, keepdims=True)) @ rotation.T
-    z = a[:, 2]
-    along = 1.0 / (2.0 * (0.005 + depth_sigma * z**2) ** 2)
-    across = 1.0 / (2.0 * (z / focal_px) ** 2)
-    outer = np.einsum("ki,kj->kij", ray, ray)
-    information = across[:, None, None] * np.eye(3) + (along - across)[:, None, None] * outer
-    return PointPairs(apply(fixed.surface.T_base_camera, a), apply(moving.surface.T_base_camera, b), information)
+def _flat(T_source_target: Array, source: Keyframe, target: Keyframe) -> FloorPose:
+    """Planar pose between the levelled bases; height and tilt as the stances had them."""
+    raw = to_floor(T_source_target)
+    level = level_pair(T_source_target, source.surface.stance, target.surface.stance)
+    return FloorPose(level.delta, raw.height_m, raw.tilt_rad)
 
 
 def _between_bases(T_source_target_cameras: Array, source: Keyframe, target: Keyframe) -> Array:
     """From the optical frames to the bases: pose (4, 4) of the target's base in the source's."""
-    return np.asarray(source.surface.T_base_camera @ T_source_target_cameras @ target.surface.T_camera_base)
+    return np.asarray(source.surface.stance.T_base_camera @ T_source_target_cameras @ target.surface.T_camera_base)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -11,9 +10,11 @@ import numpy as np
 from hybridmap.geometry import Array
 from hybridmap.vision.rgbd.depth_grid import DepthGrid
 from hybridmap.vision.rgbd.features import Features, match
+from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp_solver import PnpSolver
-from hybridmap.vision.rgbd.spatial import inverse_rigid
-from hybridmap.vision.rgbd.tilt import camera_on, find_floor, vertical_of_structure
+from hybridmap.vision.rgbd.spatial import inverse_rigid, rotation_of
+from hybridmap.vision.rgbd.stance import Stance, camera_on
+from hybridmap.vision.rgbd.tilt import find_floor, vertical_of_structure
 
 AGREE_TILT_RAD = float(np.deg2rad(2.0))
 AGREE_HEIGHT_M = 0.06
@@ -24,24 +25,14 @@ LATER_TOLERANCE_M = 0.12
 REMEMBERED_FLOORS = 15
 MIN_FLOORS = 3
 MIN_FLOOR_CELLS = 40
+MOUNTED = (float(np.deg2rad(0.2)), 0.004)
+ON_FLOOR = (float(np.deg2rad(0.5)), 0.02)
+CARRIED = (float(np.deg2rad(3.0)), 0.06)
+"""Standard deviations of tilt (rad) and height (m): as mounted on a robot, measured on the floor, carried over."""
+NODS_DEG = (0.0, 8.0, -8.0, 16.0, -16.0, 24.0, -24.0, 32.0, -32.0)
+"""Where the features do not tell, the head may have nodded by one of these."""
 MIN_FOLLOWED = 15
 """Features that must agree before the camera's turn since the last keyframe is believed."""
-
-
-@dataclass(frozen=True, slots=True)
-class Stance:
-    """Pose (4, 4) of the camera in the base at one keyframe, and whether it was measured there."""
-
-    T_base_camera: Array
-    measured: bool
-
-
-@dataclass(frozen=True, slots=True)
-class _Last:
-    """The keyframe before: its features and its camera's pose."""
-
-    features: Features
-    T_base_camera: Array
 
 
 class Posture:
@@ -49,26 +40,25 @@ class Posture:
 
     def __init__(self, mode: Literal["auto", "level", "floor"], T_base_camera: Array, solver: PnpSolver, ratio: float) -> None:
         self._mounting = T_base_camera
+        self._as_mounted = Stance(T_base_camera, *MOUNTED, False)
         self._held = mode == "floor"
         self._watching = mode == "auto"
         self._solver = solver
         self._ratio = ratio
-        self._last: _Last | None = None
         self._heights: deque[float] = deque(maxlen=REMEMBERED_FLOORS)
 
-    def stance(self, grid: DepthGrid, features: Features) -> Stance:
-        """The camera's pose at the next keyframe."""
+    def stance(self, grid: DepthGrid, features: Features, last: Keyframe | None) -> Stance:
+        """How the camera is held at the keyframe after `last`."""
         if not self._held and not self._watching:
-            return Stance(self._mounting, False)
+            return self._as_mounted
         found = self._on_floor(grid)
         if self._watching and found is not None and self._contradicts(found):
             self._held, self._watching = True, False
         if not self._held:
-            return Stance(self._mounting, False)
+            return self._as_mounted
         if found is None:
-            found = self._carried(grid, features)
-        self._last = _Last(features, found)
-        return Stance(found, True)
+            return Stance(self._carried(grid, features, last), *CARRIED, True)
+        return Stance(found, *ON_FLOOR, True)
 
     def _on_floor(self, grid: DepthGrid) -> Array | None:
         up, mounted_m = self._mounting[2, :3], float(self._mounting[2, 3])
@@ -86,17 +76,22 @@ class Posture:
         tilted = np.arccos(np.clip(cosine, -1.0, 1.0)) > AGREE_TILT_RAD
         return bool(tilted or abs(T_base_camera[2, 3] - self._mounting[2, 3]) > AGREE_HEIGHT_M)
 
-    def _carried(self, grid: DepthGrid, features: Features) -> Array:
+    def _carried(self, grid: DepthGrid, features: Features, last: Keyframe | None) -> Array:
         """No floor in view: the last posture, turned by what the features say, then set upright by walls and tables."""
-        guess = self._mounting if self._last is None else self._followed(self._last, features)
-        up = vertical_of_structure(grid.normals[grid.valid], guess[2, :3])
+        before = self._mounting if last is None else last.surface.stance.T_base_camera
+        followed = None if last is None else self._followed(last, features)
+        guess = before if followed is None else followed
+        nods = (0.0,) if followed is not None else NODS_DEG
+        guesses = np.stack([rotation_of(np.array([np.deg2rad(nod), 0.0, 0.0])) @ guess[2, :3] for nod in nods])
+        up = vertical_of_structure(grid.normals[grid.valid], guesses)
         usual = float(np.median(self._heights)) if self._heights else float(self._mounting[2, 3])
         height = np.clip(guess[2, 3], usual - LATER_TOLERANCE_M, usual + LATER_TOLERANCE_M)
         return camera_on(up, float(height), self._mounting)
 
-    def _followed(self, last: _Last, features: Features) -> Array:
+    def _followed(self, last: Keyframe, features: Features) -> Array | None:
+        """The camera's pose by its turn since the last keyframe, where enough features agree on it."""
         pairs = match(last.features, features, self._ratio)
         pose = self._solver.solve(last.features, features, pairs.first, pairs.second)
         if pose is None or len(pose.inliers) < MIN_FOLLOWED:
-            return last.T_base_camera
-        return np.asarray(last.T_base_camera @ inverse_rigid(pose.T_image_points))
+            return None
+        return np.asarray(last.surface.stance.T_base_camera @ inverse_rigid(pose.T_image_points))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridmap.geometry import Array
 from hybridmap.vision.rgbd.depth_grid import DepthGrid
@@ -65,49 +66,36 @@ def find_floor(grid: DepthGrid, up_nominal: Array, height_nominal_m: float, tole
     return Floor(up, height, int(on.sum()))
 
 
-def vertical_of_structure(normals: Array, up_guess: Array) -> Array:
-    """Vertical (3,) of an indoor scene near a guess: walls stand upright, floors, tables and ceilings lie flat.
+def vertical_of_structure(normals: Array, guesses: Array) -> Array:
+    """Vertical (3,) of an indoor scene near one of some guesses: walls stand upright, floors, tables and ceilings lie flat.
 
-    Least squares over the normals that belong to either (re-chosen a few times), with the guess as a weak prior.
+    From each guess least squares over the normals that belong to either (re-chosen a few times), with the guess as a weak
+    prior; of the outcomes the one that most normals agree with, less what the guess lies farther off the first one.
 
     Args:
         normals: (N, 3) unit normals in the optical frame.
-        up_guess: (3,) unit vector.
+        guesses: (G, 3) unit vectors, the likeliest first.
     """
-    up = up_guess
+    outcomes = [_settle(normals, guess) for guess in guesses]
+    support = [float(np.mean(_structured(normals, up, 5.0))) + 0.5 * float(up @ guesses[0]) for up in outcomes]
+    return outcomes[int(np.argmax(support))]
+
+
+def _structured(normals: Array, up: Array, limit_deg: float) -> NDArray[np.bool_]:
+    cosine = np.abs(normals @ up)
+    return np.asarray((cosine < np.sin(np.deg2rad(limit_deg))) | (cosine > np.cos(np.deg2rad(limit_deg))))
+
+
+def _settle(normals: Array, guess: Array) -> Array:
+    up = guess
+    prior = (0.05 * len(normals) + 1.0) * np.outer(guess, guess)
     for limit_deg in (15.0, 10.0, 7.0, 5.0, 5.0):
-        cosine = np.abs(normals @ up)
-        upright = normals[cosine < np.sin(np.deg2rad(limit_deg))]
-        flat = normals[cosine > np.cos(np.deg2rad(limit_deg))]
-        prior = 0.05 * len(normals) + 1.0
-        scatter = upright.T @ upright - flat.T @ flat - prior * np.outer(up_guess, up_guess)
-        _, vectors = np.linalg.eigh(scatter)
-        up = vectors[:, 0] * (1.0 if vectors[:, 0] @ up_guess > 0 else -1.0)
+        kept = normals[_structured(normals, up, limit_deg)]
+        lies_flat = np.abs(kept @ up) > 0.5
+        upright, flat = kept[~lies_flat], kept[lies_flat]
+        _, vectors = np.linalg.eigh(upright.T @ upright - flat.T @ flat - prior)
+        up = vectors[:, 0] * (1.0 if vectors[:, 0] @ guess > 0 else -1.0)
     return np.asarray(up)
-
-
-def camera_on(up: Array, height_m: float, T_base_camera_nominal: Array) -> Array:
-    """Pose (4, 4) of the camera in a level base: nominal place and heading of the optical axis, given tilt and height.
-
-    A camera that looks straight up or down has no heading of its axis; there the image's right-hand axis takes its place.
-    """
-    nominal = T_base_camera_nominal[:3, :3]
-    axis = 2 if abs(nominal[2, 2]) < 0.9 else 0
-    out = np.eye(4)
-    level = _level_axes(up, axis)
-    heading = np.arctan2(nominal[1, axis], nominal[0, axis])
-    cos, sin = np.cos(heading), np.sin(heading)
-    out[:3, :3] = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ level
-    out[:2, 3] = T_base_camera_nominal[:2, 3]
-    out[2, 3] = height_m
-    return out
-
-
-def _level_axes(up: Array, axis: int) -> Array:
-    forward = -up[axis] * up
-    forward[axis] += 1.0
-    forward /= np.linalg.norm(forward)
-    return np.stack([forward, np.cross(up, forward), up])
 
 
 def _fit_plane(points: Array, weight: Array, up_before: Array) -> tuple[Array, float]:

@@ -2,28 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
-from hybridmap.config.rgbd import RegistrationConfig
+from hybridmap.config.rgbd import RgbdConfig
 from hybridmap.geometry import Array, RelativePose, between, compose, compose_relative, log
+from hybridmap.streams.base import Camera
 from hybridmap.vision.base import Proposal, Verdict
-from hybridmap.vision.rgbd.depth_registration import LEVEL, MEASURED, Registration, register, with_floor
+from hybridmap.vision.rgbd.depth_grid import place
+from hybridmap.vision.rgbd.depth_registration import PointPairs, Registration, register, with_floor
+from hybridmap.vision.rgbd.features import match
 from hybridmap.vision.rgbd.keyframe import Keyframe
+from hybridmap.vision.rgbd.pairs import near, point_pairs
 from hybridmap.vision.rgbd.spatial import from_planar
+from hybridmap.vision.rgbd.stance import Stance
 
 SURE_INLIERS = 0.8
 SURE_SIGMA_M = 0.03
 """A registration may overrule odometry only when it fits this well and is this sure in every direction."""
+STRAIGHTENED_RAD = float(np.deg2rad(0.4))
+STRAIGHTENED_M = 0.01
+"""What a registration adds to the uncertainty of a posture that it hands on."""
 
 
 class Tracker:
     """Registers node k to nodes k-1, k-2, ...; keeps the odometry between consecutive nodes."""
 
-    def __init__(self, keyframes: Sequence[Keyframe], config: RegistrationConfig, new_key: Callable[[], int]) -> None:
+    def __init__(self, keyframes: list[Keyframe], config: RgbdConfig, camera: Camera, new_key: Callable[[], int]) -> None:
         self._keyframes = keyframes
-        self._config = config
+        self._config = config.registration
+        self._ratio = config.features.ratio
+        self._focal_px = 0.5 * (camera.fx_px + camera.fy_px)
         self._new_key = new_key
         self._steps: list[RelativePose] = []
         self._refined: list[Array] = []
@@ -49,9 +60,18 @@ class Tracker:
             prior = compose_relative(prior, step)
             start = compose(start, refined)
         fixed, moving = self._keyframes[node - back], self._keyframes[node]
-        floor = MEASURED if fixed.tilt_measured or moving.tilt_measured else LEVEL
-        fit = register(fixed.surface, moving.surface, from_planar(start), prior, floor, self._config)
-        return self._judge(node - back, node, fit, prior)
+        guess = from_planar(start)
+        pairs = self._pairs(fixed, moving, guess) if self._config.keypoints else None
+        fit = register(fixed.surface, moving.surface, guess, prior, self._config, pairs)
+        proposal = self._judge(node - back, node, fit, prior)
+        if back == 1 and fit is not None and proposal.verdict is Verdict.ACCEPTED:
+            self._keyframes[node] = _straightened(fixed, moving, fit)
+        return proposal
+
+    def _pairs(self, fixed: Keyframe, moving: Keyframe, guess: Array) -> PointPairs | None:
+        matches = match(fixed.features, moving.features, self._ratio)
+        pairs = point_pairs(fixed, moving, matches, self._focal_px, self._config.depth_sigma)
+        return None if pairs is None else near(pairs, guess, self._config.keypoint_reach_m)
 
     def _judge(self, source: int, target: int, fit: Registration | None, prior: RelativePose) -> Proposal:
         key = self._new_key()
@@ -79,3 +99,13 @@ class Tracker:
             verdict, reason = Verdict.ACCEPTED, "depth overrules odometry" if far else "depth registered"
         overrules = far and sure and verdict is Verdict.ACCEPTED
         return Proposal(key, "registration", source, target, verdict, reason, relative, scores, overrules)
+
+
+def _straightened(fixed: Keyframe, moving: Keyframe, fit: Registration) -> Keyframe:
+    """The moving keyframe with the posture that its surer neighbour gives it; itself if it is as sure."""
+    before, of = fixed.surface.stance, moving.surface.stance
+    if before.tilt_sigma_rad + STRAIGHTENED_RAD >= of.tilt_sigma_rad:
+        return moving
+    tilt, height = np.hypot(before.tilt_sigma_rad, STRAIGHTENED_RAD), np.hypot(before.height_sigma_m, STRAIGHTENED_M)
+    stance = Stance(fit.level.T_base_camera_moving, float(tilt), float(height), of.held)
+    return replace(moving, surface=place(moving.surface.grid, stance))

@@ -1,0 +1,190 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rgbd_room import camera, render, textures
+
+from hybridmap.config.rgbd import RgbdClosingConfig, RgbdConfig
+from hybridmap.config.vision import VisionConfig
+from hybridmap.errors import ConfigError, StreamError
+from hybridmap.geometry import RelativePose, between, compose
+from hybridmap.streams.base import LaserScan, Rig
+from hybridmap.vision import create_front_end
+from hybridmap.vision.base import Belief, Verdict
+from hybridmap.vision.rgbd.front_end import RgbdFrontEnd
+
+VIEW = camera(width=240)
+LAPS, PER_LAP = 2, 14
+
+
+def lap_poses():
+    """Two laps on an ellipse in the room, nearly the same poses in both."""
+    rng = np.random.default_rng(3)
+    t = np.linspace(0.0, 2.0 * np.pi * LAPS, LAPS * PER_LAP, endpoint=False)
+    x, y = -0.7 + 0.9 * np.sin(t), -0.5 + 0.6 * np.cos(t)
+    poses = np.stack([x, y, np.arctan2(-0.6 * np.sin(t), 0.9 * np.cos(t))], axis=1)
+    poses[PER_LAP:] += rng.normal(scale=[0.03, 0.03, 0.02], size=(PER_LAP, 3))
+    return poses
+
+
+def drive(config, poses, bias=0.0, frames=None):
+    """Run the front-end over poses with biased odometry; returns it, every proposal by key, and odometry poses."""
+    rng = np.random.default_rng(8)
+    front_end = RgbdFrontEnd(config, VIEW, seed=0)
+    odometry = [np.zeros(3)]
+    proposals = {}
+    frames = frames or [render(VIEW, p, stamp_ns=i * 10**9, noise=0.002, rng=rng) for i, p in enumerate(poses)]
+    for node, frame in enumerate(frames):
+        relative = None
+        if node:
+            step = between(poses[node - 1], poses[node]) * [1.02, 1.0, 1.0] + [0.0, 0.0, bias]
+            relative = RelativePose(step, np.diag([0.02, 0.02, np.deg2rad(1.5)]) ** 2)
+            odometry.append(compose(odometry[-1], step))
+        front_end.add_node(node, front_end.observe(frame, np.zeros(3)))
+        found = front_end.track(node, relative) + front_end.close(node, belief_of(odometry))
+        proposals |= {p.key: p for p in found}
+    return front_end, proposals, np.array(odometry)
+
+
+def belief_of(poses):
+    poses = np.array(poses)
+    steps = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
+    return Belief(
+        poses, np.arange(float(len(poses))), np.cumsum(steps), lambda _: np.tile(np.eye(3) * 0.01, (len(poses), 1, 1))
+    )
+
+
+@pytest.fixture(scope="module")
+def poses():
+    return lap_poses()
+
+
+@pytest.fixture(scope="module")
+def frames(poses):
+    rng = np.random.default_rng(8)
+    return [render(VIEW, p, stamp_ns=i * 10**9, noise=0.002, rng=rng) for i, p in enumerate(poses)]
+
+
+@pytest.fixture(scope="module")
+def driven(poses, frames):
+    return drive(VisionConfig(), poses, np.deg2rad(0.5), frames)
+
+
+def errors(proposals, poses):
+    gaps = [between(between(poses[p.source], poses[p.target]), p.relative.delta) for p in proposals]
+    return np.array([[np.hypot(g[0], g[1]), abs(np.rad2deg(g[2]))] for g in gaps])
+
+
+def test_consecutive_nodes_are_registered_better_than_odometry(driven, poses):
+    accepted = [p for p in driven[1].values() if p.kind == "registration" and p.verdict is Verdict.ACCEPTED]
+    assert len(accepted) > 1.6 * len(poses)
+    assert all(p.source in (p.target - 1, p.target - 2) for p in accepted)
+    found = errors(accepted, poses)
+    assert np.median(found[:, 0]) < 0.004
+    assert np.median(found[:, 1]) < 0.1
+
+
+def test_the_second_lap_closes_on_the_first_and_only_rightly(driven, poses):
+    loops = [p for p in driven[1].values() if p.kind == "loop"]
+    accepted = [p for p in loops if p.verdict is Verdict.ACCEPTED]
+    assert len({p.source for p in accepted}) > 0.6 * PER_LAP
+    assert all(p.source > p.target for p in accepted)
+    found = errors(accepted, poses)
+    assert found[:, 0].max() < 0.05
+    assert found[:, 1].max() < 1.0
+    assert {"profile_G", "inliers", "inliers_reverse", "depth_inliers"} <= set(accepted[0].scores)
+
+
+def test_every_refusal_has_a_reason(driven):
+    rejected = [p for p in driven[1].values() if p.verdict is not Verdict.ACCEPTED]
+    assert all(p.reason for p in rejected)
+
+
+def test_same_input_same_proposals(driven, poses, frames):
+    _, again, _ = drive(VisionConfig(), poses, np.deg2rad(0.5), frames)
+    assert again.keys() == driven[1].keys()
+    for key, proposal in driven[1].items():
+        assert again[key].reason == proposal.reason
+        if proposal.relative is not None:
+            assert np.array_equal(again[key].relative.delta, proposal.relative.delta)
+            assert np.array_equal(again[key].relative.covariance, proposal.relative.covariance)
+
+
+def test_a_lone_closure_waits_and_is_given_up(poses, frames):
+    closing = RgbdClosingConfig(pending_nodes=2, repropose_m=0.0)
+    config = VisionConfig(rgbd=RgbdConfig(closing=closing))
+    there = PER_LAP + 1
+    kept = [*range(there), there, 3, 4, 5]  # one revisit, then views too young to close on
+    front_end, proposals, odometry = drive(config, poses[kept[: there + 1]], 0.0, [frames[i] for i in kept[: there + 1]])
+    loops = [p for p in proposals.values() if p.kind == "loop" and p.relative is not None]
+    lone = [p for p in loops if len({q.source for q in loops}) == 1]
+    assert all(p.verdict is Verdict.PENDING for p in lone)
+    settled = front_end.finish(belief_of(odometry))
+    assert all(p.verdict is Verdict.REJECTED for p in settled if p.key in {q.key for q in lone})
+    assert front_end.finish(belief_of(odometry)) == []
+
+
+def test_another_place_is_refused(poses, frames):
+    """The same poses in a room with other walls: the gate is open, features must say no."""
+    other = [
+        render(VIEW, p, textures(99), (i + PER_LAP) * 10**9, noise=0.002, rng=np.random.default_rng(i))
+        for i, p in enumerate(poses[:6])
+    ]
+    seen = frames[:PER_LAP] + other
+    _, proposals, _ = drive(VisionConfig(), np.concatenate([poses[:PER_LAP], poses[:6]]), 0.0, seen)
+    loops = [p for p in proposals.values() if p.kind == "loop"]
+    assert loops
+    assert not any(p.verdict is Verdict.ACCEPTED for p in loops)
+
+
+@pytest.mark.parametrize("mode", ["literal", "ratio", "signed", "plain", "four-band"])
+def test_seed_modes_close_by_the_shift_alone(mode, poses, frames):
+    config = VisionConfig(rgbd=RgbdConfig(matching=mode, verify="none"))
+    _, proposals, _ = drive(config, poses, 0.0, frames)
+    loops = [p for p in proposals.values() if p.kind == "loop"]
+    assert loops
+    assert all(p.relative.delta[:2] == pytest.approx([0.0, 0.0]) for p in loops)
+    assert np.sqrt(np.diag(loops[0].relative.covariance)) == pytest.approx([0.7, 0.7, np.deg2rad(6.0)])
+    if mode in ("plain", "four-band"):
+        assert np.median(errors(loops, poses)[:, 1]) < 4.0
+
+
+def test_keyframe_is_what_came_in(driven, frames):
+    kept = driven[0].keyframe(5)
+    assert np.array_equal(kept["color"], frames[5].color)
+    assert np.array_equal(kept["depth_mm"], np.rint(frames[5].depth_m * 1000).astype(np.uint16))
+    assert kept["T_base_camera"] == pytest.approx(VIEW.T_base_camera)
+    assert kept["profile"].shape == (8, 64)
+
+
+def test_wide_images_are_reduced(poses):
+    wide = camera(width=480)
+    front_end = RgbdFrontEnd(VisionConfig(), wide, seed=0)
+    odometry = between(poses[0], poses[1])
+    for node in range(2):
+        front_end.add_node(node, front_end.observe(render(wide, poses[node]), np.zeros(3)))
+    found = front_end.track(1, RelativePose(odometry + 0.02, np.diag([0.03, 0.03, 0.03]) ** 2))
+    assert found[0].relative.delta == pytest.approx(odometry, abs=5e-3)
+    assert front_end.keyframe(0)["color"].shape == (360, 480, 3)
+
+
+def test_wrong_frames_are_refused():
+    front_end = RgbdFrontEnd(VisionConfig(), VIEW, seed=0)
+    with pytest.raises(StreamError, match="found LaserScan"):
+        front_end.observe(LaserScan(0, np.zeros(3, np.float32)), np.zeros(3))
+    frame = render(VIEW, np.zeros(3))
+    with pytest.raises(StreamError, match="depth"):
+        front_end.observe(replace(frame, depth_m=frame.depth_m[::2, ::2]), np.zeros(3))
+
+
+def test_the_sensor_chooses_the_front_end():
+    assert isinstance(create_front_end(VisionConfig(), Rig(camera=VIEW), 0), RgbdFrontEnd)
+    assert create_front_end(VisionConfig(), Rig(), 0) is None
+    assert create_front_end(VisionConfig(sensor="none"), Rig(camera=VIEW), 0) is None
+    with pytest.raises((ConfigError, StreamError), match="laser"):
+        create_front_end(VisionConfig(sensor="laser"), Rig(camera=VIEW), 0)
+
+
+def test_weights_of_the_profiles_must_sum_to_one():
+    with pytest.raises(ValueError, match="must be 1"):
+        VisionConfig.model_validate({"matching": {"mu_r": 0.7, "mu_d": 0.5}})

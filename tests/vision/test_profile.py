@@ -1,0 +1,73 @@
+import numpy as np
+import pytest
+
+from hybridmap.vision.profile import image_profile, laser_profile, normalised
+
+RNG = np.random.default_rng(5)
+
+
+def frame(height=48, width=128):
+    grey = RNG.integers(0, 255, (height, width), dtype=np.uint8)
+    depth = RNG.uniform(0.5, 4.0, (height, width)).astype(np.float32)
+    return grey, depth
+
+
+def test_intensity_band_is_the_column_sum():
+    grey, depth = frame()
+    profile = image_profile(grey, depth, width=64)
+    sums = grey.astype(float).sum(axis=0).reshape(64, 2).sum(axis=1)
+    assert profile.shape == (2, 64)
+    assert profile.dtype == np.float32
+    assert np.allclose(profile[0], (sums - sums.mean()) / sums.std(), atol=1e-4)
+
+
+def test_depth_band_is_the_mean_of_valid_pixels_only():
+    grey, depth = frame()
+    depth[RNG.random(depth.shape) < 0.5] = 0.0
+    profile = image_profile(grey, depth, width=64)
+    pairs = depth.reshape(48, 64, 2).transpose(1, 0, 2).reshape(64, -1).astype(float)
+    means = pairs.sum(axis=1) / (pairs > 0).sum(axis=1)
+    assert np.allclose(profile[1], (means - means.mean()) / means.std(), atol=1e-3)
+
+
+def test_columns_without_depth_say_nothing():
+    grey, depth = frame()
+    depth[:, :32] = 0.0
+    profile = image_profile(grey, depth, width=64)
+    assert np.allclose(profile[1, :16], 0.0, atol=1e-4)
+    assert np.isfinite(image_profile(grey, np.zeros_like(depth), width=64)).all()
+
+
+def test_four_bands_cover_the_rows_top_first():
+    grey, depth = frame()
+    profile = image_profile(grey, depth, width=64, bands=4)
+    assert profile.shape == (8, 64)
+    top = image_profile(grey[:12], depth[:12], width=64)
+    assert np.allclose(profile[[0, 4]], top, atol=1e-4)
+
+
+def test_z_profile_ignores_exposure():
+    grey, depth = frame()
+    brighter = (0.5 * grey.astype(float) + 60.0).round().astype(np.uint8)
+    assert np.allclose(image_profile(grey, depth, 64)[0], image_profile(brighter, depth, 64)[0], atol=0.05)
+
+
+def test_normalisations():
+    bands = RNG.uniform(1.0, 5.0, (3, 64))
+    z = normalised(bands, "z")
+    assert np.allclose(z.mean(axis=1), 0.0)
+    assert np.allclose(z.std(axis=1), 1.0)
+    assert np.allclose(normalised(bands, "mean").mean(axis=1), 1.0)
+    assert np.allclose(normalised(np.full((1, 8), 3.0), "z"), 0.0)
+
+
+def test_laser_profile_resamples_by_bearing_and_skips_invalid():
+    bearings = np.linspace(-np.pi / 2, np.pi / 2, 256)
+    ranges = (3.0 + np.sin(2.0 * bearings)).astype(np.float32)
+    whole = laser_profile(ranges, bearings, 64)
+    assert whole.shape == (1, 64)
+    assert np.allclose(laser_profile(ranges[::-1], bearings[::-1], 64), whole, atol=1e-5)
+    holes = ranges.copy()
+    holes[1::2] = np.nan
+    assert np.abs(laser_profile(holes, bearings, 64) - whole).max() < 0.2
+    assert np.argmax(whole) == pytest.approx(48, abs=1)  # sin(2 b) peaks at b = pi / 4
