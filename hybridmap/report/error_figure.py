@@ -59,27 +59,32 @@ def error_figure(scene: Scene) -> str | None:
     series = error_series(scene)
     if not series:
         return None
-    styles = style.line_styles(scene.backends)
     with style.figure(style.PAGE_WIDTH_IN, 5.0) as picture:
         position, heading = picture.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-        for name, errors in series.items():
-            looks = dict(styles[name.removesuffix(ONLINE)])
-            if name.endswith(ONLINE) and scene.truth is not None:
-                looks |= {"linewidth": 0.8, "alpha": 0.6, "zorder": 3, "linestyle": "solid"}
-            label = name.replace(ONLINE, ", as believed at the time")
-            drawn = over_intervals(errors, _INTERVALS)
-            position.plot(drawn.time_s, np.maximum(drawn.position_m, _FLOOR_M), label=label, **looks)
-            heading.plot(drawn.time_s, np.maximum(drawn.heading_deg, _FLOOR_DEG), **looks)
+        draw_errors(position, scene, heading=False)
+        draw_errors(heading, scene, heading=True)
         _mark_loops(scene, position)
-        against = "ground truth" if scene.truth is not None else "final map"
-        for axes, what in ((position, "position error (m)"), (heading, "heading error (deg)")):
-            axes.set_yscale("log")
-            axes.yaxis.set_major_formatter("{x:g}")
-            axes.set_ylabel(what)
-            axes.grid(True, linewidth=0.5)
-        heading.set_xlabel(f"time since the start (s); errors against the {against}")
-        picture.legend(loc="outside upper left", ncols=5)
+        position.set_xlabel("")
+        picture.legend(*position.get_legend_handles_labels(), loc="outside upper left", ncols=5)
         return style.svg_uri(picture)
+
+
+def draw_errors(axes: Any, scene: Scene, *, heading: bool) -> None:
+    """Draw the position error, m, or the heading error, deg, of every back-end over time."""
+    styles = style.line_styles(scene.backends)
+    for name, errors in error_series(scene).items():
+        looks = dict(styles[name.removesuffix(ONLINE)])
+        if name.endswith(ONLINE) and scene.truth is not None:
+            looks |= {"linewidth": 0.8, "alpha": 0.6, "zorder": 3, "linestyle": "solid"}
+        drawn = over_intervals(errors, _INTERVALS)
+        error = np.maximum(drawn.heading_deg, _FLOOR_DEG) if heading else np.maximum(drawn.position_m, _FLOOR_M)
+        axes.plot(drawn.time_s, error, label=name.replace(ONLINE, ", as believed at the time"), **looks)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.set_ylabel("heading error (deg)" if heading else "position error (m)")
+    against = "ground truth" if scene.truth is not None else "final map"
+    axes.set_xlabel(f"time since the start (s); errors against the {against}")
+    axes.grid(True, linewidth=0.5)
 
 
 def _series(since_start_ns: Any, estimate: Array, reference: Array) -> ErrorSeries:

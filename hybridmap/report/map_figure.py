@@ -18,22 +18,26 @@ def trajectories_figure(scene: Scene, building: Raster | None) -> str:
     shown = [scene.estimates[name].poses for name in scene.backends if name in scene.estimates]
     shown += [scene.truth.poses] if scene.truth is not None else []
     with style.figure(*_size(np.concatenate(shown)[:, :2], building)) as picture:
-        axes = picture.add_subplot()
-        style.draw_building(axes, building)
-        if scene.truth is not None:
-            poses = style.thinned(scene.truth.poses)
-            axes.plot(poses[:, 0], poses[:, 1], color=style.TRUTH, linewidth=3.2, alpha=0.28, label="ground truth", zorder=3)
-        styles = style.line_styles(scene.backends)
-        for name in scene.backends:
-            if name in scene.estimates:
-                poses = style.thinned(scene.estimates[name].poses)
-                label = f"{name} (primary)" if name == scene.primary else name
-                axes.plot(poses[:, 0], poses[:, 1], label=label, **styles[name])
-        start = scene.estimates.get(scene.primary, scene.estimates["odometry"]).poses[0]
-        axes.plot(*start[:2], marker="o", markersize=7, color="white", markeredgecolor="black", zorder=8, label="start")
-        style.metric_axes(axes)
+        draw_trajectories(picture.add_subplot(), scene, building)
         picture.legend(loc="outside upper left", ncols=6)
         return style.svg_uri(picture)
+
+
+def draw_trajectories(axes: Any, scene: Scene, building: Raster | None) -> None:
+    """Draw every back-end's trajectory over the truth and the building."""
+    style.draw_building(axes, building)
+    if scene.truth is not None:
+        poses = style.thinned(scene.truth.poses)
+        axes.plot(poses[:, 0], poses[:, 1], color=style.TRUTH, linewidth=3.2, alpha=0.28, label="ground truth", zorder=3)
+    styles = style.line_styles(scene.backends)
+    for name in scene.backends:
+        if name in scene.estimates:
+            poses = style.thinned(scene.estimates[name].poses)
+            label = f"{name} (primary)" if name == scene.primary else name
+            axes.plot(poses[:, 0], poses[:, 1], label=label, **styles[name])
+    start = scene.estimates.get(scene.primary, scene.estimates["odometry"]).poses[0]
+    axes.plot(*start[:2], marker="o", markersize=7, color="white", markeredgecolor="black", zorder=8, label="start")
+    style.metric_axes(axes)
 
 
 def graph_figure(scene: Scene, building: Raster | None) -> str:

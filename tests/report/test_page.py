@@ -90,7 +90,7 @@ def test_same_session_same_page(session: SessionFolder, page: Page) -> None:
 
 
 def test_shows_the_largest_correction(tmp_path: Path) -> None:
-    folder = write_session(tmp_path / "session", ring_map(1.2))
+    folder = write_session(tmp_path / "session", ring_map(1.2), keyframes=False)
     before = ring_map(1.2).initial[:30]
     with MapStore.open(folder.path) as store:
         assert store.info("largest_correction") is None
@@ -124,7 +124,7 @@ def test_little_to_show(tmp_path: Path, known: dict) -> None:
 
 
 def test_without_any_solution(tmp_path: Path) -> None:
-    folder = write_session(tmp_path / "session", ring_map(1.1), solve=False)
+    folder = write_session(tmp_path / "session", ring_map(1.1), solve=False, keyframes=False)
     assert Page(write_report(folder).read_text()).open == []
 
 
