@@ -55,6 +55,8 @@ class CameraConfig(Section):
     """Standard deviation of depth at 0.4 m, m."""
     depth_noise_per_m: float = Field(default=0.0019, ge=0)
     """Growth of that standard deviation with the square of the distance beyond 0.4 m, 1/m."""
+    depth_noise_width_px: float = Field(default=1.0, ge=0)
+    """Pixels (one sigma) over which the noise of depth is alike, as matching windows make it; 0: each pixel its own."""
     hole_fraction: float = Field(default=0.01, ge=0, lt=1)
     """Share of the image that patches without depth cover, on average."""
     exposure_change: float = Field(default=0.12, ge=0, lt=1)

@@ -94,7 +94,7 @@ class CameraModel:
         config = self._config
         z = np.where(hits.hit, hits.length, np.float32(99.0))
         sigma = config.depth_noise_m + config.depth_noise_per_m * (z - 0.4) ** 2
-        noisy = z + sigma.astype(np.float32) * rng.standard_normal(z.shape, dtype=np.float32)
+        noisy = z + sigma.astype(np.float32) * self._noise(z.shape, rng)
         lost = (
             ~hits.hit
             | ~self._scene.in_depth[hits.surface]
@@ -104,6 +104,16 @@ class CameraModel:
         lost |= (noisy < config.range_min_m) | (noisy > config.range_max_m)
         millimetres = np.where(lost, 0.0, np.rint(noisy.astype(np.float64) * _MM_PER_M))
         return (millimetres / _MM_PER_M).astype(np.float32)
+
+    def _noise(self, shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float32]:
+        """Noise (H, W) of unit deviation, alike in neighbouring pixels because they share most of a matching window."""
+        white = rng.standard_normal(shape, dtype=np.float32)
+        width = self._config.depth_noise_width_px
+        if width <= 0.0:
+            return white
+        kernel = cv2.getGaussianKernel(2 * int(np.ceil(3.0 * width)) + 1, width, cv2.CV_32F)
+        kernel /= np.linalg.norm(kernel)
+        return np.asarray(cv2.sepFilter2D(white, -1, kernel, kernel), dtype=np.float32)
 
     def _shadow(self, z: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bool_]:
         """Pixels beside a jump in depth, where the projected pattern does not reach or is torn."""
