@@ -21,10 +21,16 @@ _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _ADVICE = {
     "not indexed": "the bag has no index; run `rosbag reindex` on it",
     "index looks damaged": "the bag is cut off or was not closed; run `rosbag reindex` on it or record again",
-    "file magic is invalid": "not a bag of format 2.0, or damaged; convert it with `rosbag` tools or record again",
+    "file magic is invalid": "not a bag of a format that can be read, or damaged; convert it or record again",
     "end magic": "the file is cut off or was not closed; recover it with `mcap recover`",
     "footer": "the file is cut off or was not closed; recover it with `mcap recover`",
     "malformed": "the database is cut off or damaged",
+    "files are missing": "the folder is incomplete",
+    "yaml": "metadata.yaml is damaged; run `ros2 bag reindex` on the folder",
+    "metadata": "metadata.yaml is damaged; run `ros2 bag reindex` on the folder",
+    "profile": "an mcap file of another kind than a ROS 2 recording",
+    "not supported": "convert the bag",
+    "permission denied": "the file may not be read by this user",
 }
 
 
@@ -73,6 +79,7 @@ class BagFile:
             raise StreamError(f"{path}: no such file or folder")
         if path.is_file() and path.stat().st_size == 0:
             raise StreamError(f"{path}: the file is empty")
+        _check_databases(path)
         self._stores: dict[str, Any] = {}
         self._definitions: dict[str, Any] = {}
         with self._reader() as reader:
@@ -95,7 +102,7 @@ class BagFile:
         if not wanted:
             return
         with self._reader() as reader:
-            connections = [c for c in reader.connections if c.topic in wanted and c.msgcount]
+            connections = [c for c in reader.connections if c.topic in wanted]
             messages = reader.messages(connections=connections) if connections else iter(())
             while True:
                 try:
@@ -162,7 +169,7 @@ class BagFile:
         return self._stores[msgtype]
 
     def _damaged(self, error: Exception) -> StreamError:
-        found = " ".join(str(part) for part in error.args) or type(error).__name__
+        found = " ".join(_plain(part) for part in error.args) or type(error).__name__
         advice = next((text for sign, text in _ADVICE.items() if sign in found.lower()), "the file is cut off or damaged")
         return StreamError(f"{self.path}: cannot be read as a bag ({found.rstrip('.')}): {advice}")
 
@@ -171,6 +178,24 @@ class BagFile:
             f"{self.path}: {message.topic}: message {message.number + 1} ({len(message.data)} bytes) "
             f"is no valid {self._types[message.topic]}; the bag is damaged"
         )
+
+
+def _plain(part: object) -> str:
+    """What an error says, on one line, without the quotes of a nested one."""
+    return " ".join(str(part).replace("('", "").replace("',)", "").split())
+
+
+def _check_databases(path: Path) -> None:
+    """Refuse a `.db3` file that is shorter than its own header says: SQLite itself may not notice."""
+    for file in sorted(path.glob("*.db3")) if path.is_dir() else [path] if path.suffix == ".db3" else []:
+        with file.open("rb") as opened:
+            header = opened.read(100)
+        if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):
+            raise StreamError(f"{file}: no SQLite database, or damaged; expected a ROS 2 recording")
+        page_bytes, pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
+        expected = (65536 if page_bytes == 1 else page_bytes) * pages
+        if file.stat().st_size < expected:
+            raise StreamError(f"{file}: the database is cut off: found {file.stat().st_size} bytes, expected {expected}")
 
 
 def _embedded_store(definition: Any, msgtype: str) -> Any | None:

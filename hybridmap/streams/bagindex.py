@@ -74,12 +74,14 @@ class BagIndex:
     """What the first pass learnt.
 
     Attributes:
+        counts: topic -> messages read.
         stamps_ns: topic -> header stamps in the order of the recording.
         first: topic -> its first message, decoded.
         odometry: topic -> its poses.
         transforms: the transform tree; `tf_tracks` the moving transforms in it, by (parent, child).
     """
 
+    counts: dict[str, int] = field(default_factory=dict)
     stamps_ns: dict[str, list[int]] = field(default_factory=dict)
     first: dict[str, Any] = field(default_factory=dict)
     odometry: dict[str, PoseTrack] = field(default_factory=dict)
@@ -106,6 +108,7 @@ def build_index(bag: BagFile, names: Iterable[str], odom_frame: str) -> BagIndex
     types = {topic.name: topic.msgtype for topic in bag.topics}
     wanted = sorted(set(names))
     for message in bag.raw(wanted):
+        index.counts[message.topic] = message.number + 1
         if types[message.topic] in TRANSFORM:
             _take_transforms(index, bag, message, clean_frame(odom_frame))
             continue

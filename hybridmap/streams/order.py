@@ -26,9 +26,14 @@ def sorted_order(stamps_ns: Stamps, what: str) -> NDArray[np.intp]:
         what: file and topic, for the error.
 
     Raises:
-        StreamError: a stamp goes back behind more than the one message before it.
+        StreamError: a stamp goes back behind more than the one message before it, or all stamps are one.
     """
     if len(stamps_ns) > 2:
+        if stamps_ns.min() == stamps_ns.max():
+            raise StreamError(
+                f"{what}: all {len(stamps_ns)} messages carry the stamp {format_stamp(int(stamps_ns[0]))} s; "
+                "expected header stamps that tell when each was taken"
+            )
         newest = np.maximum.accumulate(stamps_ns)[:-2]
         late = np.flatnonzero(stamps_ns[2:] < newest)
         if len(late):
@@ -99,6 +104,27 @@ class Window:
         low = -(2**62) if self.start_s is None else first_ns + round(self.start_s * NS_PER_S)
         high = 2**62 if self.end_s is None else first_ns + round(self.end_s * NS_PER_S)
         return low, high
+
+
+def check_overlap(motion_ns: Stamps, observation_ns: Stamps, what: str) -> None:
+    """Refuse observations that share no time with the self-motion, give or take a second.
+
+    Raises:
+        StreamError: naming both spans.
+    """
+    if not len(motion_ns) or not len(observation_ns):
+        return
+    if observation_ns[-1] < motion_ns[0] - NS_PER_S or observation_ns[0] > motion_ns[-1] + NS_PER_S:
+        spans = [
+            f"{format_stamp(int(stamps[0]))} to {format_stamp(int(stamps[-1]))} s" for stamps in (motion_ns, observation_ns)
+        ]
+        raise StreamError(
+            f"{what}: odometry runs from {spans[0]}, scans or frames from {spans[1]}; expected one clock and a common time"
+        )
+
+
+def _span(stamps_ns: Stamps) -> str:
+    return f"{format_stamp(int(stamps_ns[0]))} to {format_stamp(int(stamps_ns[-1]))} s"
 
 
 def merge(*sources: Iterable[Sample]) -> Iterator[Sample]:

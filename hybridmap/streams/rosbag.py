@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from hybridmap.config.root import Config
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array
-from hybridmap.streams.bagfile import BagFile
+from hybridmap.streams.bagfile import BagFile, RawMessage
 from hybridmap.streams.bagindex import PoseTrack, build_index
 from hybridmap.streams.bagsensors import MessageKey, SensorPlan, plan_frames, plan_scans
 from hybridmap.streams.base import LaserScan, RgbdFrame, Sample, SelfMotion, StreamReport
 from hybridmap.streams.mounting import clean_frame, planar
-from hybridmap.streams.order import Window, merge
+from hybridmap.streams.order import Window, check_overlap, merge
 from hybridmap.streams.topics import CAMERA_INFO, IMAGE, ODOMETRY, SCAN, TRANSFORM, select
 from hybridmap.trajectory import Trajectory
 
@@ -43,7 +46,8 @@ class BagStream:
         self._index = build_index(
             self._bag, (topic.name for topic in self._bag.topics if topic.msgtype in _READ), self._sensors.odom_frame
         )
-        self.selection = select(self._bag.topics, self._sensors, self._index.frame_of, str(path))
+        topics = [replace(topic, count=self._index.counts.get(topic.name, 0)) for topic in self._bag.topics]
+        self.selection = select(topics, self._sensors, self._index.frame_of, str(path))
         self.remarks = list(self.selection.remarks)
         track, what = self._self_motion()
         self._base_frame = self._choose_base(track)
@@ -52,6 +56,8 @@ class BagStream:
         self._plan_made = self._plan()
         self._planned, self.rig, self.losses = self._plan_made.planned, self._plan_made.rig, self._plan_made.losses
         self.remarks += self._plan_made.remarks
+        observation_ns = np.array([planned.stamp_ns for planned in self._planned], dtype=np.int64)
+        check_overlap(self._motion_ns, observation_ns, str(path))
         self._apply(window or Window())
         self.report = StreamReport()
 
@@ -102,6 +108,7 @@ class BagStream:
         for message in self._bag.raw(sorted({topic for topic, _ in needed})):
             key = (message.topic, message.number)
             if key in needed:
+                self._check_unchanged(message)
                 waiting[key] = message
             while planned is not None and all(key in waiting for key in planned.needs):
                 parts = tuple(self._bag.decode(waiting.pop(key)) for key in planned.needs)
@@ -110,6 +117,10 @@ class BagStream:
             if planned is None:
                 return
         raise StreamError(f"{self._bag.path}: holds fewer messages than at the first reading; was it changed meanwhile?")
+
+    def _check_unchanged(self, message: RawMessage) -> None:
+        if self._bag.stamp_ns(message) != self._index.stamps_ns[message.topic][message.number]:
+            raise StreamError(f"{self._bag.path}: {message.topic}: other messages than at the first reading; was it changed?")
 
     def _self_motion(self) -> tuple[PoseTrack, str]:
         chosen = self.selection

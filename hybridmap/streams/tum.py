@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from hybridmap.streams.cameras import (
     pinhole,
 )
 from hybridmap.streams.mounting import invert, matrix, planar
-from hybridmap.streams.order import Window, merge, pair_nearest, sorted_order
+from hybridmap.streams.order import Window, check_overlap, merge, pair_nearest, sorted_order
 from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
 
 
@@ -60,6 +61,10 @@ class TumStream:
         for path in (path for pair in self._pairs for path in (pair.color, pair.depth)):
             if not path.is_file():
                 raise StreamError(f"{path}: no such picture, though the folder's lists name it")
+        for _ in islice(self._frames(), 1):  # sizes and kinds that contradict each other show at once
+            pass
+        frame_ns = np.array([pair.stamp_ns for pair in self._pairs], dtype=np.int64)
+        check_overlap(self._odometry.stamps_ns, frame_ns, str(folder))
         self.rig = Rig(camera=pinhole(self._calibration, self._T_base_camera) if self._pairs else None)
         self.groundtruth = self._read_groundtruth()
         self._apply(window or Window())
