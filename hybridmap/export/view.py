@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import yaml
+
+from hybridmap.backends import Solution, create, names
+from hybridmap.config import Config
 from hybridmap.errors import ExportError
 from hybridmap.geometry import Array
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.store import MapStore, SessionFolder, trajectory_of
 from hybridmap.trajectory import Trajectory
+
+log = logging.getLogger(__name__)
 
 ODOMETRY = "odometry"
 
@@ -51,13 +58,22 @@ class SessionView:
         """(N, 3) pose of each node in `map` by the chosen back-end (the chain's for odometry), m and rad."""
         if self.backend == ODOMETRY:
             return self.experiences.initial
-        return self.store.solutions()[self.backend].poses
+        return self.solution.poses
+
+    @cached_property
+    def solution(self) -> Solution:
+        """The back-end's result: the session's, else solved now from the graph in the map file."""
+        stored = self.store.solutions().get(self.backend)
+        if stored is not None:
+            return stored
+        log.warning("%s: no result of %s in it, solving its graph now", self.store.path, self.backend)
+        config = Config.from_tree(yaml.safe_load(self.store.config_yaml) or {}, str(self.store.path))
+        return create(self.backend, config.backends).solve(self.experiences)
 
     @cached_property
     def rejected(self) -> frozenset[int]:
         """Numbers of the loop edges that the back-end gave no weight."""
-        solution = self.store.solutions().get(self.backend)
-        return frozenset() if solution is None else frozenset(solution.report.rejected_edge_ids)
+        return frozenset() if self.backend == ODOMETRY else frozenset(self.solution.report.rejected_edge_ids)
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -69,18 +85,19 @@ class SessionView:
 def open_view(folder: Path, backend: str | None, options: ExportOptions) -> SessionView:
     """Open a session as a back-end sees it; without a name, as the primary one does. Close its `store` after use.
 
+    A back-end that was not part of the run (or whose run was killed) gets the graph as the map file has it.
+
     Raises:
         StoreError: no session there.
-        ExportError: the session has no result of that back-end, or no node.
+        ExportError: there is no such back-end, or the map holds no node.
     """
     SessionFolder(folder).require()
     store = MapStore.open(folder)
     try:
-        known = [ODOMETRY, *(name for name in store.solutions() if name != ODOMETRY)]
         chosen = backend or store.primary
-        if chosen not in known:
-            hint = "the run did not finish; " if len(known) == 1 else ""
-            raise ExportError(f"{folder}: no result of back-end {chosen!r}; {hint}--backend can be: {', '.join(known)}")
+        known = names()
+        if chosen not in known and chosen not in store.solutions():
+            raise ExportError(f"{folder}: no result of back-end {chosen!r}; --backend can be: {', '.join(known)}")
         view = SessionView(store, chosen, options)
         if len(view.experiences) == 0:
             raise ExportError(f"{folder}: the map holds no node")
