@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -122,14 +123,18 @@ class GraphBackend(ABC):
     def solve(self, graph: PoseGraph | SupportsPoseGraph) -> Solution:
         """See `Backend.solve`."""
         frozen = graph if isinstance(graph, PoseGraph) else graph.pose_graph()
+        return self._timed(frozen, lambda: self._solve_whole(frozen))
+
+    def _timed(self, graph: PoseGraph, work: Callable[[], Outcome]) -> Solution:
+        """Check a whole graph, run a solver on it, check what comes out."""
         started = time.process_time()
-        frozen.validate()
-        require_connected(frozen)
+        graph.validate()
+        require_connected(graph)
         try:
-            outcome = self._solve_whole(frozen)
+            outcome = work()
         except RuntimeError as error:  # gtsam raises nothing more specific
             raise BackendError(f"{self._name}: the solver gave up: {_first_line(error)}") from error
-        return self._solution(frozen, frozen.initial, self._checked(frozen, frozen.initial, outcome), started)
+        return self._solution(graph, graph.initial, self._checked(graph, graph.initial, outcome), started)
 
     @abstractmethod
     def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
@@ -172,8 +177,10 @@ class GraphBackend(ABC):
         if not np.isfinite(outcome.poses).all():
             message = "poses were not finite; kept those before"
             return Outcome(start, SolveStatus.DIVERGED, message, outcome.iterations, outcome.weights)
-        moved = between(outcome.poses[0], outcome.poses)
-        poses = compose(graph.initial[0], moved) if np.any(outcome.poses[0] != graph.initial[0]) else outcome.poses
+        if np.array_equal(outcome.poses[0], graph.initial[0]):
+            return outcome
+        poses = compose(graph.initial[0], between(outcome.poses[0], outcome.poses))
+        poses[0] = graph.initial[0]
         return replace(outcome, poses=poses)
 
     def _solution(self, graph: PoseGraph, start: Array, outcome: Outcome, started: float) -> Solution:

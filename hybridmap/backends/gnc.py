@@ -6,6 +6,7 @@ quantised so that noise models are shared, and loops of weight zero left out of 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_law
 
-from hybridmap.backends.base import SolveStatus
+from hybridmap.backends.base import Solution, SolveStatus
 from hybridmap.backends.batch import run
 from hybridmap.backends.factors import NoiseModels, anchor, factors, poses_of, values
 from hybridmap.backends.following import GraphBackend, Outcome, prefix
@@ -144,16 +145,34 @@ class GncBackend(GraphBackend):
     def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
         return cauchy(graph, start, self._config)
 
+    def finish(self, graph: PoseGraph) -> Solution:
+        """See `Backend.finish`: as `solve`, with the map at the end of the drive as one more start."""
+        self.update(graph)
+        return self._timed(graph, lambda: self._best(graph, self._poses))
+
     def _solve_whole(self, graph: PoseGraph) -> Outcome:
+        return self._best(graph, None)
+
+    def _best(self, graph: PoseGraph, driven: Array | None) -> Outcome:
+        """Run the configured starts; the lowest truncated cost wins, and one that keeps every loop ends the search."""
         config, limit = self._config.gnc, self._config.max_iterations
-        results = []
-        if config.start in ("auto", "batch"):
-            results.append(graduate(graph, graph.initial, config, limit))
-        if config.start in ("auto", "grow"):
-            results.append(grow(graph, config, limit))
-        best = min(results, key=lambda result: result.cost)
+        starts: dict[str, Callable[[], _Result]] = {}
+        if driven is not None:
+            starts["driven"] = lambda: graduate(graph, driven, config, limit)
+        starts["cauchy"] = lambda: graduate(graph, cauchy(graph, graph.initial, self._config).poses, config, limit)
+        starts["batch"] = lambda: graduate(graph, graph.initial, config, limit)
+        starts["grow"] = lambda: grow(graph, config, limit)
+        wanted = starts if config.start == "auto" else {config.start: starts[config.start]}
+        best, best_name = None, ""
+        for name, attempt in wanted.items():
+            result = attempt()
+            if best is None or result.cost < best.cost:
+                best, best_name = result, name
+            if np.all(best.weights > 0.5):
+                break
+        assert best is not None
         loops = graph.edge_ids[graph.is_loop].tolist()
         weights = dict(zip(loops, best.weights.tolist(), strict=True))
         lost = int(np.sum(best.weights < 0.5))
-        message = f"gnc: {lost} of {len(loops)} loops rejected"
+        message = f"gnc: {lost} of {len(loops)} loops rejected (start: {best_name})"
         return Outcome(best.poses, SolveStatus.CONVERGED, message, best.rounds, weights)

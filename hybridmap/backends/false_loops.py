@@ -1,0 +1,76 @@
+"""False loop closures put into a graph on purpose, to see what a back-end survives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.errors import GraphError
+from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+
+_RUN = 5  # aliased loops that come one after the other and agree with each other
+
+
+def inject(graph: PoseGraph, share: float, mode: Literal["random", "aliased"], rng: np.random.Generator) -> PoseGraph:
+    """Append false loops until they are `share` of all loops; their `edge_ids` follow the last one.
+
+    Args:
+        graph: a graph with true loops, whose measurements and information the false ones copy.
+        share: of false loops among all loops afterwards, 0 <= share < 1.
+        mode: `random` joins two random nodes; `aliased` takes a run of neighbouring true loops and moves all of its
+            old ends by one and the same number of nodes, as a second corridor like the first would.
+        rng: the only source of chance.
+
+    Raises:
+        GraphError: no loop to copy, or a share outside [0, 1).
+    """
+    true = np.flatnonzero(graph.is_loop)
+    if len(true) == 0 or not 0.0 <= share < 1.0:
+        raise GraphError(f"graph: cannot inject a share of {share} false loops into {len(true)} loops; expected 0 <= share < 1")
+    count = round(len(true) * share / (1.0 - share))
+    copied, ends = _random_pairs(graph, true, count, rng) if mode == "random" else _aliased_pairs(graph, true, count, rng)
+    last = int(graph.edge_ids[-1]) if graph.n_edges else -1
+    entered = None if graph.entered is None else np.concatenate([graph.entered, ends.max(axis=1, initial=0)])
+    return replace(
+        graph,
+        sources=np.concatenate([graph.sources, ends[:, 0]]),
+        targets=np.concatenate([graph.targets, ends[:, 1]]),
+        deltas=np.concatenate([graph.deltas, graph.deltas[copied]]),
+        information=np.concatenate([graph.information, graph.information[copied]]),
+        kinds=np.concatenate([graph.kinds, np.full(count, EdgeKind.LOOP, dtype=np.int8)]),
+        edge_ids=np.concatenate([graph.edge_ids, last + 1 + np.arange(count)]),
+        entered=entered,
+    )
+
+
+def _random_pairs(
+    graph: PoseGraph, true: NDArray[np.int64], count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    source = rng.integers(0, graph.n_nodes, count)
+    target = (source + rng.integers(2, max(graph.n_nodes - 1, 3), count)) % graph.n_nodes
+    return rng.choice(true, count), np.column_stack([source, target])
+
+
+def _aliased_pairs(
+    graph: PoseGraph, true: NDArray[np.int64], count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    newest = np.maximum(graph.sources[true], graph.targets[true])
+    in_order = true[np.argsort(newest, kind="stable")]
+    copied: list[int] = []
+    ends: list[tuple[int, int]] = []
+    while len(ends) < count:
+        first = int(rng.integers(0, len(in_order)))
+        moved = int(rng.integers(10, max(graph.n_nodes - 10, 11)))
+        for edge in in_order[first : first + _RUN].tolist():
+            source, target = int(graph.sources[edge]), int(graph.targets[edge])
+            if source < target:
+                source = (source + moved) % graph.n_nodes
+            else:
+                target = (target + moved) % graph.n_nodes
+            if abs(source - target) > 1 and len(ends) < count:
+                copied.append(edge)
+                ends.append((source, target))
+    return np.array(copied, dtype=np.int64), np.array(ends, dtype=np.int64).reshape(-1, 2)

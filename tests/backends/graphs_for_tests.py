@@ -1,0 +1,44 @@
+"""Small pose graphs with a known truth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybridmap.geometry import between, compose, exp
+from hybridmap.graph.connectivity import chain
+from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+
+SIGMA = np.array([0.03, 0.02, 0.01])
+
+
+def laps(rng, nodes=60, per_lap=20, noise=1.0, every=1):
+    """A robot that drives round and round; node k sees node k - per_lap again. Returns the graph and the true poses."""
+    truth = [np.zeros(3)]
+    for _ in range(nodes - 1):
+        truth.append(compose(truth[-1], [0.5, 0.05, 2 * np.pi / per_lap]))
+    truth = np.array(truth)
+    pairs = [(k - 1, k, EdgeKind.ODOMETRY) for k in range(1, nodes)]
+    pairs += [(k, k - per_lap, EdgeKind.LOOP) for k in range(per_lap, nodes, every)]
+    pairs.sort(key=lambda p: (max(p[:2]), p[2]))
+    return graph_of(truth, pairs, rng, noise), truth
+
+
+def graph_of(truth, pairs, rng, noise=1.0):
+    """Measure pairs (source, target, kind) of true poses with noise; `initial` is the chain."""
+    sources, targets = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
+    count = len(pairs)
+    twists = rng.normal(size=(count, 3)) * SIGMA * noise
+    deltas = compose(between(truth[sources], truth[targets]), exp(twists))
+    mixing = np.array([[1.0, 0.3, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]])
+    information = mixing.T @ np.diag(SIGMA**-2.0) @ mixing
+    return chain(
+        PoseGraph(
+            initial=truth.copy(),
+            sources=sources.astype(np.int64),
+            targets=targets.astype(np.int64),
+            deltas=deltas,
+            information=np.repeat(information[None], count, axis=0),
+            kinds=np.array([p[2] for p in pairs], dtype=np.int8),
+            edge_ids=np.arange(count, dtype=np.int64),
+        )
+    )
