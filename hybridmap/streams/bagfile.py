@@ -9,6 +9,7 @@ import struct
 from collections.abc import Collection, Iterator
 from contextlib import closing
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -159,13 +160,8 @@ class BagFile:
 
     def _store(self, msgtype: str) -> Any:
         if msgtype not in self._stores:
-            from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-            fallback = get_typestore(Stores.ROS1_NOETIC if self.is_ros1 else Stores.ROS2_HUMBLE)
-            for name in _TF_TYPES:
-                if name not in fallback.fielddefs:
-                    fallback.register(get_types_from_msg(_TF_DEFINITION, name))
-            self._stores[msgtype] = _embedded_store(self._definitions[msgtype], msgtype) or fallback
+            embedded = _embedded_store(self._definitions[msgtype], msgtype)
+            self._stores[msgtype] = embedded if embedded is not None else _standard_store(self.is_ros1)
         return self._stores[msgtype]
 
     def _damaged(self, error: Exception) -> StreamError:
@@ -198,6 +194,19 @@ def _check_databases(path: Path) -> None:
             raise StreamError(f"{file}: the database is cut off: found {file.stat().st_size} bytes, expected {expected}")
 
 
+@cache
+def _standard_store(is_ros1: bool) -> Any:
+    """Type store of the standard messages, for bags without definitions."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    for name in _TF_TYPES:
+        if name not in store.fielddefs:
+            store.register(get_types_from_msg(_TF_DEFINITION, name))
+    return store
+
+
+@cache  # parsing a definition takes tens of milliseconds, and every bag of a robot carries the same ones
 def _embedded_store(definition: Any, msgtype: str) -> Any | None:
     """Type store of the definition that the bag carries; None where it carries none that can be used."""
     from rosbags.interfaces import MessageDefinitionFormat

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +19,17 @@ KINDS = ("bag", "mcap", "db3")
 NS = 1_000_000_000
 
 
+@cache
+def _types(ros1: bool) -> tuple[Any, SimpleNamespace]:
+    """The type store, and its messages by their short names."""
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    if ros1:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    packages = ("nav_msgs", "sensor_msgs", "geometry_msgs", "tf2_msgs", "builtin_interfaces")
+    named = {name.split("/")[-1]: cls for name, cls in store.types.items() if name.split("/")[0] in packages}
+    return store, SimpleNamespace(**named, Header=store.types["std_msgs/msg/Header"])
+
+
 @dataclass
 class Recording:
     """Messages in the order of recording; `bag_ns` counts on by itself, for header stamps are another matter."""
@@ -26,13 +38,7 @@ class Recording:
     messages: list[tuple[str, str, Any]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
-        if self.ros1:
-            self.store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
-        packages = ("nav_msgs", "sensor_msgs", "geometry_msgs", "tf2_msgs", "builtin_interfaces")
-        types = {name: cls for name, cls in self.store.types.items() if name.split("/")[0] in packages}
-        self.t = SimpleNamespace(**{name.split("/")[-1]: cls for name, cls in types.items()})
-        self.t.Header = self.store.types["std_msgs/msg/Header"]
+        self.store, self.t = _types(self.ros1)
 
     def header(self, stamp_ns: int, frame: str) -> Any:
         time = self.t.Time(sec=stamp_ns // NS, nanosec=stamp_ns % NS)
