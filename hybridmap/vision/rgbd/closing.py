@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -77,7 +78,10 @@ class LoopCloser:
         out: list[Proposal] = []
         if self._rounds_left > 0 and self._closing.repropose_m > 0 and self._config.verify != "none":
             self._rounds_left -= 1
+            closed = Counter(h.source for h in self._hypotheses if h.proposal.verdict is Verdict.ACCEPTED)
             for node in range(len(self._keyframes)):
+                if closed[node] >= self._closing.accept:
+                    continue
                 near = self._nearest_untried(node, belief)
                 if near:
                     out += self._try_candidates(node, near, belief)
@@ -121,15 +125,14 @@ class LoopCloser:
         out: list[Proposal] = []
         entered = 0
         for target, scores in ranked.items():
+            if entered == self._closing.accept:
+                break
             self._tried.add((node, target))
             found = self._verifier.verify(self._keyframes[node], self._keyframes[target])
             scores = {**scores, **found.scores}
             proposal = Proposal(self._new_key(), "loop", node, target, Verdict.REJECTED, found.reason, found.relative, scores)
             if found.relative is None:
                 out.append(proposal)
-                continue
-            if entered == self._closing.accept:
-                out.append(replace(proposal, reason="two better edges entered for this node"))
                 continue
             hypothesis = _Hypothesis(replace(proposal, verdict=Verdict.PENDING, reason="waits for support"), found.relative)
             raised = self._raise(hypothesis, belief)
