@@ -131,13 +131,16 @@ def _try_to_open(found: Inspection, source: str | Path, config: Config) -> None:
 
 
 def _gaps(part: Part) -> list[str]:
-    gap = part.longest_gap_s
-    usual = 1.0 / part.rate_hz if part.rate_hz > 0 else 0.0
-    if gap < max(_LONG_GAP_S, 5.0 * usual):
+    """A line on the longest time without a message, where it is long and far from usual."""
+    if len(part.stamps_ns) < 2:
         return []
-    at = int(np.argmax(np.diff(np.sort(part.stamps_ns))))
-    after_s = (int(np.sort(part.stamps_ns)[at]) - int(part.stamps_ns.min())) / NS_PER_S
-    return [f"{part.name}: nothing for {gap:.2f} s, {after_s:.1f} s after its beginning"]
+    stamps = np.sort(part.stamps_ns)
+    steps = np.diff(stamps) / NS_PER_S
+    longest = int(np.argmax(steps))
+    if steps[longest] < max(_LONG_GAP_S, 5.0 * float(np.median(steps))):
+        return []
+    after_s = int(stamps[longest] - stamps[0]) / NS_PER_S
+    return [f"{part.name}: nothing for {steps[longest]:.2f} s, {after_s:.1f} s after its beginning"]
 
 
 def _bag_parts(path: Path, problems: list[str]) -> list[Part]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sqlite3
+
 import cv2
 import numpy as np
 import pytest
@@ -411,3 +413,12 @@ def test_recordings_give_what_their_readme_says(data_dir, source, motions, scans
     assert samples[0].stamp_ns == round(first_s * NS)
     assert samples[-1].stamp_ns == round(last_s * NS)
     assert stream.expected_observations == scans
+
+
+def test_a_database_without_message_definitions(tmp_path):
+    """As ROS 2 wrote them up to Humble: the types are the standard ones."""
+    path = laser_drive().write(tmp_path / "a.db3")
+    with sqlite3.connect(path) as database:
+        database.execute("DROP TABLE message_definitions")
+        database.execute("DROP TABLE schema")
+    assert len(list(open_stream(path, Config()))) == 12
