@@ -1,0 +1,94 @@
+"""The documents: every example of the walk-through is run, every command and link that is named exists."""
+
+import doctest
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+COMMAND = (sys.executable, "-c", "from hybridmap.cli import main; main()")
+MATCHES = doctest.OutputChecker()
+FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+
+
+def blocks(page: Path) -> list[tuple[str, str]]:
+    return re.findall(r"^```(\w+)\n(.*?)^```$", page.read_text(), re.DOTALL | re.MULTILINE)
+
+
+def run(*command: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=120)
+
+
+def check(shown: str, said: str, what: str) -> None:
+    assert MATCHES.check_output(shown, said, FLAGS), f"{what}\nshown:\n{shown}\nsaid:\n{said}"
+
+
+def run_console(text: str, folder: Path) -> None:
+    for part in re.split(r"^\$ ", text, flags=re.MULTILINE)[1:]:
+        line, _, shown = part.partition("\n")
+        program, *arguments = shlex.split(line)
+        assert program == "hybridmap", line
+        done = run(*COMMAND, *arguments, cwd=folder)
+        if shown.startswith("hybridmap: error:"):
+            assert (done.returncode, done.stdout) == (2, ""), line
+            check(shown, done.stderr, line)
+        else:
+            assert done.returncode == 0, f"{line}\n{done.stderr}"
+            if shown.strip():
+                check(shown, done.stdout, line)
+
+
+def test_walk_through_does_what_it_shows(tmp_path: Path) -> None:
+    said = ""
+    for language, text in blocks(ROOT / "docs" / "walk-through.md"):
+        if language == "console":
+            run_console(text, tmp_path)
+        elif language == "python":
+            done = run(sys.executable, "-c", text, cwd=tmp_path)
+            assert done.returncode == 0, f"{text}\n{done.stderr}"
+            said = done.stdout
+        else:
+            check(text, said, "output of the block before")
+    assert (tmp_path / "session" / "report.html").is_file()
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
+        assert target.startswith("https://") or (page.parent / target).exists(), target
+
+
+def test_every_command_that_is_named_exists() -> None:
+    help_text = run(*COMMAND, "--help", cwd=ROOT).stdout
+    there = set(re.findall(r"^  ([a-z]\w*) ", help_text.split("Commands:")[1], re.MULTILINE))
+    named = {
+        name for page in PAGES for name in re.findall(r"\bhybridmap ([a-z]\w*)\b(?=[^\n`]*(?:--|`|[A-Z]))", page.read_text())
+    }
+    assert named - there == set()
+    assert there - named == set(), "a command that no page names"
+
+
+def test_every_place_that_the_paper_page_names_exists() -> None:
+    text = (ROOT / "docs" / "paper.md").read_text() + (ROOT / "docs" / "architecture.md").read_text()
+    places = re.findall(r"`([\w/]+\.py): ([\w.]+)`", text)
+    assert len(places) > 20
+    for file, name in places:
+        source = (ROOT / "hybridmap" / file).read_text()
+        for part in name.split("."):
+            assert re.search(rf"\b(class|def) {part}\b|\b{part}\b\s*[:=]", source), f"{file}: {name}"
+
+
+def test_every_table_and_column_of_the_map_file_is_described() -> None:
+    from hybridmap.store.schema import TABLES
+
+    text = (ROOT / "docs" / "formats.md").read_text()
+    for table, columns in re.findall(r"CREATE TABLE (\w+) \((.*?)\)(?: WITHOUT ROWID)?;", TABLES, re.DOTALL):
+        assert f"| `{table}` |" in text
+        for column in re.findall(r"(?:^|,)\s*([a-z]\w*) [A-Z]", columns):
+            assert f"`{column}`" in text, f"{table}.{column}"
