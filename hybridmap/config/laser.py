@@ -33,6 +33,8 @@ class RegistrationConfig(Section):
     """Largest point-to-line residual of an inlier, m."""
     sigma_m: float = Field(default=0.03, gt=0)
     """Standard deviation of a point's residual at least, m."""
+    spurious: float = Field(default=0.04, ge=0, lt=1)
+    """Share of the inliers whose information along any direction is not believed: normals err by some 10 degrees."""
     correlation: float = Field(default=6.0, ge=1)
     """Points that share one independent piece of information: neighbours on a wall err together."""
 
@@ -101,10 +103,12 @@ class ProbeConfig(Section):
     """Least share of the probe's points that lie near the target."""
     fit_min: float = Field(default=0.7, gt=0, le=1)
     """Least share of inliers among them."""
-    violation_max: float = Field(default=0.08, ge=0, le=1)
+    violation_max: float = Field(default=0.15, ge=0, le=1)
     """Largest share of points of one submap in the free space of the other, either way."""
     loosest_max_m: float = Field(default=0.3, gt=0)
     """Largest standard deviation of the registration in any direction: a bare corridor is refused, m."""
+    ambiguity_max: float = Field(default=0.9, gt=0, le=1)
+    """Largest share of the likelihood that is left after a shift along the direction that the walls hold least."""
     floor_m: float = Field(default=0.03, gt=0)
     """Standard deviation of a loop edge at least, m."""
     floor_deg: float = Field(default=0.4, gt=0)
@@ -153,9 +157,34 @@ class RevisitConfig(Section):
     """Half-width of the grid of starts, m."""
     search_deg: float = Field(default=4.5, gt=0)
     """Half-width of the grid of starts, degrees."""
+    ambiguous_m: float = Field(default=1.5, gt=0)
+    """Standard deviation along a direction in which a registration is ambiguous, m."""
     floor_m: float = Field(default=0.02, gt=0)
     """Standard deviation of such an edge at least, m."""
     floor_deg: float = Field(default=0.3, gt=0)
+    """The same, degrees."""
+
+
+class RetraceConfig(Section):
+    """Registration of every scan to the final map."""
+
+    enabled: bool = True
+    """Whether it is done."""
+    block_nodes: int = Field(default=8, ge=1)
+    """Consecutive nodes whose scans share one local map."""
+    radius_m: float = Field(default=6.0, gt=0)
+    """Nodes of the local map lie this near its middle, m."""
+    map_nodes: int = Field(default=60, ge=1)
+    """Most nodes of a local map, the nearest."""
+    prior_m: float = Field(default=0.02, gt=0)
+    """Standard deviation of the position that the wheels give between two nodes, m."""
+    prior_deg: float = Field(default=6.0, gt=0)
+    """Standard deviation of the heading that the wheels give between two nodes, degrees."""
+    inliers_min: float = Field(default=0.6, gt=0, le=1)
+    """Least share of inliers of a scan that is believed."""
+    off_max_m: float = Field(default=0.3, gt=0)
+    """Largest correction that is believed, m."""
+    off_max_deg: float = Field(default=17.0, gt=0)
     """The same, degrees."""
 
 
@@ -174,3 +203,5 @@ class LaserConfig(Section):
     """When hypotheses become edges."""
     revisits: RevisitConfig = RevisitConfig()
     """Re-proposal at the end."""
+    retrace: RetraceConfig = RetraceConfig()
+    """Every scan to the final map."""

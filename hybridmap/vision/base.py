@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,3 +112,26 @@ class FrontEnd(Protocol):
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
         """What the map file keeps of a node's frame: `profile`, and `ranges_m`, or `color` and `depth_mm` (compact dtypes)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Retraced:
+    """Where the robot was at frames between nodes, measured on the final map.
+
+    Attributes:
+        stamps_ns: (S,) int64 of the frames, increasing.
+        nodes: (S,) int64, the node that the robot had made last.
+        deltas: (S, 3) pose of the robot in the frame of that node, m and rad.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    nodes: NDArray[np.int64]
+    deltas: Array
+
+
+@runtime_checkable
+class RetracingFrontEnd(FrontEnd, Protocol):
+    """A front-end that can also say, once the map is final, where the robot was between nodes."""
+
+    def retrace(self, belief: Belief) -> Retraced:
+        """Measure every frame on the final map; called once, after the last `finish`."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,21 +11,18 @@ from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, Array, RelativePose, compose
 from hybridmap.streams.base import Laser, LaserScan, Observation
-from hybridmap.vision.base import Belief, Proposal, Verdict, View
+from hybridmap.vision.base import Belief, Proposal, Retraced, Verdict, View
 from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan
 from hybridmap.vision.laser.clusters import Commitment, Settled
 from hybridmap.vision.laser.hypotheses import Hypothesis, Prober
+from hybridmap.vision.laser.retrace import Retracer, SeenScan
 from hybridmap.vision.laser.revisits import Reviser
 from hybridmap.vision.laser.submap import Atlas
 from hybridmap.vision.laser.tracking import Step, Tracker
+from hybridmap.vision.profile import laser_profile
 
-
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    """A scan with the integrator's motion from the last node."""
-
-    scan: LaserScan
-    motion: Array
+MOST_BETWEEN = 30
+"""Scans between two nodes that a weak registration is retried with, at most."""
 
 
 class LaserFrontEnd:
@@ -43,9 +39,11 @@ class LaserFrontEnd:
         self._reviser = Reviser(self._config, self._atlas, laser)
         self._commitment = Commitment(self._config.commitment, self._atlas.travel_m.__getitem__, self._atlas.chain.__getitem__)
         self._profiles: list[NDArray[np.float32]] = []
-        self._seen: list[_Seen] = []
+        self._retracer = Retracer(self._config, self._atlas, self._cloud)
+        self._scans: list[SeenScan] = []
+        self._steps: list[Array] = []
+        self._between: list[SeenScan] = []
         self._node: tuple[int, Cloud, LaserScan] | None = None
-        self._between: list[_Seen] = []
         self._last_probe_m = 0.0
         self._keys = 0
 
@@ -59,13 +57,17 @@ class LaserFrontEnd:
             raise StreamError(f"laser: expected a LaserScan, found {type(frame).__name__}")
         if frame.ranges_m.shape != self._laser.bearings_rad.shape:
             raise StreamError(f"laser: expected {len(self._laser.bearings_rad)} ranges, found {frame.ranges_m.shape}")
-        self._seen.append(_Seen(frame, np.array(delta_node_robot, dtype=np.float64)))
-        return View(frame.stamp_ns, _profile(frame.ranges_m, self._config.scan.profile_width), -1, False)
+        self._scans.append(SeenScan(frame, len(self._profiles) - 1, np.array(delta_node_robot, dtype=np.float64)))
+        profile = laser_profile(frame.ranges_m, self._laser.bearings_rad, self._config.scan.profile_width)
+        return View(frame.stamp_ns, profile, -1, False)
 
     def add_node(self, node: int, view: View) -> None:
         """Make a node of the scan observed last."""
-        seen = self._seen.pop()
-        self._between, self._seen = self._seen, []
+        seen = self._scans.pop()
+        self._between = [s for s in self._scans[-MOST_BETWEEN:] if s.node == node - 1 and node > 0]
+        if node > 0:
+            self._steps.append(seen.motion)
+        self._scans.append(SeenScan(seen.scan, node, IDENTITY))
         self._profiles.append(view.profile)
         self._node = (node, self._cloud(seen.scan), seen.scan)
 
@@ -105,6 +107,11 @@ class LaserFrontEnd:
             out.append(_loop(self._next_key(), hypothesis, verdict, hypothesis.refusal or "near on the optimised map"))
         return out
 
+    def retrace(self, belief: Belief) -> Retraced:
+        """Register every scan to the final map."""
+        scans = [s for s in self._scans if s.node >= 0] if self._config.retrace.enabled else []
+        return self._retracer.retrace(scans, np.array(self._steps), belief.poses_map_node)
+
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
         """Profile and ranges of a node's scan."""
         return {"profile": self._profiles[node], "ranges_m": self._atlas.ranges[node]}
@@ -140,15 +147,3 @@ def _loop(key: int, hypothesis: Hypothesis, verdict: Verdict, reason: str) -> Pr
 def _settled(settled: Settled) -> Proposal:
     verdict = Verdict.ACCEPTED if settled.accepted else Verdict.REJECTED
     return _loop(settled.key, settled.hypothesis, verdict, settled.reason)
-
-
-def _profile(ranges_m: NDArray[np.float32], width: int) -> NDArray[np.float32]:
-    """Ranges resampled to bearing columns, z-normalised; (1, width) float32."""
-    edges = np.linspace(0, len(ranges_m), width + 1).round().astype(np.int64)
-    valid = np.isfinite(ranges_m)
-    total = np.concatenate([[0.0], np.cumsum(np.where(valid, ranges_m, 0.0))])
-    count = np.concatenate([[0], np.cumsum(valid)])
-    columns = np.diff(count[edges])
-    mean = np.diff(total[edges]) / np.maximum(columns, 1)
-    mean = np.where(columns > 0, mean, mean[columns > 0].mean() if (columns > 0).any() else 0.0)
-    return np.asarray(((mean - mean.mean()) / max(float(mean.std()), 1e-6))[None], dtype=np.float32)

@@ -10,14 +10,11 @@ from hybridmap.config.laser import LaserConfig
 from hybridmap.geometry import Array, RelativePose, between, inverse, invert_relative, wrap_angle
 from hybridmap.streams.base import Laser
 from hybridmap.vision.base import Belief
-from hybridmap.vision.laser.likelihood import score_starts
-from hybridmap.vision.laser.registration import Alignment, align
+from hybridmap.vision.laser.registration import Alignment, align, second_mode
+from hybridmap.vision.laser.search import STEP_DEG, STEP_M, search, spaced, square
 from hybridmap.vision.laser.submap import Atlas, Submap, Target
-from hybridmap.vision.laser.tracking import spaced
 from hybridmap.vision.laser.visibility import violation
 
-START_STEP_M = 0.3
-START_STEP_DEG = 2.0
 REGISTERED_POINTS = 400
 
 
@@ -117,8 +114,7 @@ class Prober:
     def _modes(self, gate: _Gate, probe: Submap) -> list[_Mode]:
         """Separated maxima of the likelihood over the part of the gate that this target answers for."""
         c, atlas = self._config.probes, self._atlas
-        side = spaced(c.window_m, START_STEP_M)
-        offsets = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+        offsets = square(c.window_m, 2.0 * STEP_M)
         inside = (np.hypot(offsets[:, 0], offsets[:, 1]) <= c.window_m) & (
             np.hypot(*(offsets - gate.expected[:2]).T) <= gate.radius_m
         )
@@ -127,14 +123,11 @@ class Prober:
             return []
         travel = atlas.travel_m[gate.anchor]
         nodes = atlas.along(travel - c.target_half_m, travel + c.target_half_m)
-        target = atlas.target(gate.anchor, nodes, c.window_m + START_STEP_M)
-        headings = gate.expected[2] + np.deg2rad(spaced(np.rad2deg(gate.heading_rad), START_STEP_DEG))
+        target = atlas.target(gate.anchor, nodes, c.window_m + STEP_M)
+        headings = gate.expected[2] + np.deg2rad(spaced(np.rad2deg(gate.heading_rad), 2.0 * STEP_DEG))
         points = probe.cloud.thinned(c.points).points
-        scores = score_starts(target.coarse, points, np.zeros(2), headings, offsets)
-        return [
-            _Mode(gate, target, np.array([*offsets[t], headings[h]]), score)
-            for h, t, score in _peaks(scores, headings, offsets, c.modes_per_target)
-        ]
+        starts = search(target.wide, target.sharp, points, offsets, headings, c.modes_per_target)
+        return [_Mode(gate, target, start.pose, start.score) for start in starts]
 
     def _verify(self, mode: _Mode, probe: Submap) -> Hypothesis:
         c = self._config.probes
@@ -151,6 +144,7 @@ class Prober:
         }
         covariance = alignment.covariance(0, self._config.registration, c.floor_m, np.deg2rad(c.floor_deg))
         scores["loosest_m"] = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1]))
+        scores["ambiguity"] = second_mode(mode.target.fine, cloud, alignment)
         refusal = self._refusal(mode, alignment, scores)
         if not refusal:
             refusal = self._free_space(mode.target.submap, probe, pose, scores)
@@ -171,6 +165,10 @@ class Prober:
             return f"{off_m:.2f} m, {np.rad2deg(off_rad):.1f} deg from the expected pose: outside the gate"
         if scores["loosest_m"] > c.loosest_max_m:
             return f"free along one direction: {scores['loosest_m']:.2f} m > {c.loosest_max_m} m"
+        if scores["ambiguity"] > c.ambiguity_max:
+            return (
+                f"ambiguity {scores['ambiguity']:.2f} > {c.ambiguity_max}: lies as well elsewhere along its weakest direction"
+            )
         return ""
 
     def _free_space(self, target: Submap, probe: Submap, pose: Array, scores: dict[str, float]) -> str:
@@ -181,20 +179,6 @@ class Prober:
         if scores["violation"] > c.violation_max:
             return f"free space violated by {scores['violation']:.2f} > {c.violation_max}"
         return ""
-
-
-def _peaks(scores: Array, headings: Array, offsets: Array, count: int) -> list[tuple[int, int, float]]:
-    """The best separated maxima of (H, T) scores."""
-    left, out = scores.copy(), []
-    for _ in range(count):
-        h, t = np.unravel_index(int(np.argmax(left)), left.shape)
-        if left[h, t] <= 0.0:
-            break
-        out.append((int(h), int(t), float(left[h, t])))
-        near_h = np.abs(wrap_angle(headings - headings[h])) < np.deg2rad(12.0)
-        near_t = np.hypot(*(offsets - offsets[t]).T) < 0.8
-        left[np.ix_(near_h, near_t)] = 0.0
-    return out
 
 
 def _distinct(found: list[Hypothesis]) -> list[Hypothesis]:

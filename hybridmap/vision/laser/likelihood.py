@@ -73,6 +73,33 @@ def build_field(cloud: Cloud, cell_m: float, reach_m: float, sigma_m: float, sea
     )
 
 
+def score_poses(field: LikelihoodField, points: Array, poses: Array) -> Array:
+    """Mean likelihood (N,) in [0, 1] of points (P, 2) in a moving frame at each of N poses (N, 3)."""
+    cos, sin = np.cos(poses[:, 2])[:, None], np.sin(poses[:, 2])[:, None]
+    x = poses[:, :1] + cos * points[:, 0] - sin * points[:, 1]
+    y = poses[:, 1:2] + sin * points[:, 0] + cos * points[:, 1]
+    hits = field.likelihood.take(field.cells(x, y)).sum(axis=1, dtype=np.uint32)
+    return np.asarray(hits / (255.0 * max(len(points), 1)))
+
+
+def ambiguity(field: LikelihoodField, points: Array, direction: Array, apart_m: float = 0.4, reach_m: float = 3.0) -> float:
+    """How well points that lie right would also lie when shifted along a direction: the second mode's share of the likelihood.
+
+    Args:
+        field: the target.
+        points: (P, 2) in the target's frame, registered.
+        direction: (2,) unit vector.
+        apart_m: least shift of a second mode.
+        reach_m: largest shift looked at.
+    """
+    side = np.arange(apart_m, reach_m, 0.1)
+    shifts = np.concatenate([[0.0, -0.1, 0.1, -0.2, 0.2], -side, side])
+    x = points[:, 0] + shifts[:, None] * direction[0]
+    y = points[:, 1] + shifts[:, None] * direction[1]
+    mean = field.likelihood.take(field.cells(x, y)).sum(axis=1, dtype=np.uint32)
+    return float(mean[5:].max() / max(float(mean[:5].max()), 1.0))
+
+
 def _disc(reach: int, cell_m: float) -> tuple[NDArray[np.int64], Array]:
     """Cell offsets (O, 2) within reach and their length (O,) m, the longest first."""
     side = np.arange(-reach, reach + 1)

@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 from hybridmap.config.laser import RegistrationConfig
 from hybridmap.geometry import Array, between, compose
 from hybridmap.vision.laser.cloud import Cloud
-from hybridmap.vision.laser.likelihood import LikelihoodField
+from hybridmap.vision.laser.likelihood import LikelihoodField, ambiguity
 
 CONVERGED = 2e-4
+WEAKEST_INFORMATION = (1.0, 1.0, 4.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """Where the moving frame is expected in the target's: pose (3,) and information (3,) of x, y, yaw in the moving frame."""
+    """Where the moving frame is expected: pose (3,), or (K, 3) one a start, with information (3,) of x, y, yaw."""
 
     pose: Array
     information: Array
@@ -34,6 +35,7 @@ class Alignment:
         inliers: (K,) share of points whose residual is small.
         fit: (K,) share of inliers among the points that have a partner.
         rms_m: (K,) of the inliers' residuals.
+        points: how many were registered.
     """
 
     poses: Array
@@ -42,14 +44,41 @@ class Alignment:
     inliers: Array
     fit: Array
     rms_m: Array
+    points: int
 
     def covariance(self, k: int, config: RegistrationConfig, floor_m: float, floor_rad: float) -> Array:
         """Covariance (3, 3) of registration k in the moving frame: loose along a bare corridor, never below the floors."""
         variance = max(config.sigma_m, float(self.rms_m[k])) ** 2 * config.correlation
-        weakest = np.diag([1.0, 1.0, 4.0])
-        covariance = np.linalg.inv(self.hessian[k] / variance + weakest)
+        trusted = self._without_spurious(k, config.spurious)
+        covariance = np.linalg.inv(trusted / variance + np.diag(WEAKEST_INFORMATION))
         floor = np.diag([floor_m**2, floor_m**2, floor_rad**2])
         return np.asarray(0.5 * (covariance + covariance.T) + floor)
+
+    def weakest_direction(self, k: int) -> Array:
+        """Unit vector (2,) in the moving frame along which the walls hold registration k least, whatever the heading."""
+        return np.asarray(np.linalg.eigh(self._translation(k))[1][:, 0])
+
+    def _translation(self, k: int) -> Array:
+        """Hessian of the translation alone (2, 2), the heading eliminated."""
+        h = self.hessian[k]
+        return np.asarray(h[:2, :2] - np.outer(h[:2, 2], h[2, :2]) / max(float(h[2, 2]), 1e-9))
+
+    def _without_spurious(self, k: int, share: float) -> Array:
+        """The Hessian less what `share` of the points would give: normals err, so a bare wall seems to hold along itself."""
+        out = self.hessian[k].copy()
+        value, vector = np.linalg.eigh(self._translation(k))
+        lost = np.minimum(value, share * self.points * float(self.inliers[k]))
+        out[:2, :2] -= (vector * lost) @ vector.T
+        return np.asarray(out)
+
+
+def second_mode(field: LikelihoodField, cloud: Cloud, alignment: Alignment, k: int = 0) -> float:
+    """Share of registration k's likelihood that the cloud keeps when it is shifted along its weakest direction."""
+    pose = alignment.poses[k]
+    weakest = alignment.weakest_direction(k)
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    direction = np.array([cos * weakest[0] - sin * weakest[1], sin * weakest[0] + cos * weakest[1]])
+    return ambiguity(field, cloud.moved(pose).points, direction)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,8 +120,8 @@ def align(
 
 
 def _partners(field: LikelihoodField, cloud: Cloud, poses: Array) -> _Partners:
-    px, py = cloud.points[:, 0], cloud.points[:, 1]
-    mx, my = cloud.normals[:, 0], cloud.normals[:, 1]
+    px, py = cloud.points[..., 0], cloud.points[..., 1]
+    mx, my = cloud.normals[..., 0], cloud.normals[..., 1]
     cos, sin = np.cos(poses[:, 2])[:, None], np.sin(poses[:, 2])[:, None]
     x = poses[:, :1] + cos * px - sin * py
     y = poses[:, 1:2] + sin * px + cos * py
@@ -137,4 +166,5 @@ def _judge(partners: _Partners, poses: Array, config: RegistrationConfig) -> Ali
         inliers=count / n,
         fit=count / np.maximum(near, 1),
         rms_m=np.sqrt((partners.residual**2 * inlier).sum(axis=1) / np.maximum(count, 1)),
+        points=n,
     )

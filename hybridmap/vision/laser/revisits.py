@@ -11,9 +11,9 @@ from hybridmap.streams.base import Laser
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.hypotheses import Hypothesis
 from hybridmap.vision.laser.likelihood import score_starts
-from hybridmap.vision.laser.registration import Prior, align
+from hybridmap.vision.laser.registration import Prior, align, second_mode
+from hybridmap.vision.laser.search import spaced, square
 from hybridmap.vision.laser.submap import Atlas, Submap
-from hybridmap.vision.laser.tracking import spaced
 from hybridmap.vision.laser.visibility import violation
 
 
@@ -69,19 +69,23 @@ class Reviser:
         target = self._atlas.target(other, self._submap(other, c.target_half_m), 0.5)
         probe = self._atlas.submap(node, self._submap(node, c.probe_half_m))
         expected = between(poses[other], poses[node])
-        side = spaced(c.search_m, 0.15)
-        offsets = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+        offsets = square(c.search_m, 0.15)
         headings = expected[2] + np.deg2rad(spaced(c.search_deg, 1.5))
-        scores = score_starts(target.coarse, probe.cloud.thinned(100).points, expected[:2], headings, offsets)
+        scores = score_starts(target.sharp, probe.cloud.thinned(100).points, expected[:2], headings, offsets)
         h, t = np.unravel_index(int(np.argmax(scores)), scores.shape)
         start = np.array([*(expected[:2] + offsets[t]), headings[h]])
         prior = Prior(expected, 1.0 / np.array([1.0, 1.0, 0.2]) ** 2)
         alignment = align(target.fine, probe.cloud.thinned(300), start[None], settings, prior)
         covariance = alignment.covariance(0, settings, c.floor_m, np.deg2rad(c.floor_deg))
         pose = alignment.poses[0]
+        doubt = second_mode(target.fine, probe.cloud, alignment)
+        if doubt > self._config.probes.ambiguity_max:
+            weakest = alignment.weakest_direction(0)
+            covariance[:2, :2] += c.ambiguous_m**2 * np.outer(weakest, weakest)
         figures = {
             "near": float(alignment.near[0]),
             "fit": float(alignment.fit[0]),
+            "ambiguity": doubt,
             "off_m": float(np.hypot(*(pose - expected)[:2])),
             "off_deg": float(np.rad2deg(abs(wrap_angle(pose[2] - expected[2])))),
         }

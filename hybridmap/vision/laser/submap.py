@@ -14,9 +14,8 @@ from hybridmap.geometry import Array, between
 from hybridmap.vision.laser.cloud import Cloud, merged
 from hybridmap.vision.laser.likelihood import LikelihoodField, build_field
 
-COARSE_CELL_M = 0.1
-COARSE_REACH_M = 0.5
-COARSE_SIGMA_M = 0.2
+WIDE = (0.2, 0.8, 0.4)
+SHARP = (0.1, 0.5, 0.2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,10 +42,11 @@ class Submap:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A submap with its fields: a coarse one to score starts on, a fine one to register to."""
+    """A submap with its fields: a wide and a sharp one to score starts on, a fine one to register to."""
 
     submap: Submap
-    coarse: LikelihoodField
+    wide: LikelihoodField
+    sharp: LikelihoodField
     fine: LikelihoodField
 
 
@@ -95,7 +95,8 @@ class Atlas:
         submap, settings = self.submap(anchor, nodes), self._config.registration
         target = Target(
             submap,
-            build_field(submap.cloud, COARSE_CELL_M, COARSE_REACH_M, COARSE_SIGMA_M, search_m),
+            build_field(submap.cloud, *WIDE, search_m),
+            build_field(submap.cloud, *SHARP, search_m),
             build_field(submap.cloud, self._config.scan.cell_m, settings.reach_m, settings.field_sigma_m),
         )
         self._targets[key] = target

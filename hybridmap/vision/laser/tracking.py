@@ -12,6 +12,7 @@ from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, 
 from hybridmap.vision.laser.cloud import Cloud, merged
 from hybridmap.vision.laser.likelihood import LikelihoodField, build_field, score_starts
 from hybridmap.vision.laser.registration import Alignment, Prior, align
+from hybridmap.vision.laser.search import spaced, square
 from hybridmap.vision.laser.submap import Atlas
 
 SCORED_POINTS = 90
@@ -83,8 +84,7 @@ class Tracker:
     ) -> Alignment:
         c = self._config.tracking
         headings = np.deg2rad(spaced(half_deg, 2.0))
-        side = spaced(half_m, 0.1)
-        offsets = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+        offsets = square(half_m, 0.1)
         scores = score_starts(field, cloud.thinned(SCORED_POINTS).points, expected[:2], expected[2] + headings, offsets)
         scores -= 0.05 * (headings[:, None] / np.deg2rad(prior_deg)) ** 2
         scores -= 0.05 * ((offsets / (2 * c.prior_m)) ** 2).sum(axis=1)[None]
@@ -126,9 +126,3 @@ class Tracker:
         wrong = inliers >= c.inliers_min and self._contradicts(pose, odometry.delta)
         reason = "contradicts the odometry" if wrong else "agrees with the odometry"
         return Step(RelativePose(pose, covariance), True, wrong, inliers, fit, f"inliers {inliers:.2f}, {reason}")
-
-
-def spaced(half: float, step: float) -> Array:
-    """Numbers from -half to half, at most `step` apart, 0 among them."""
-    count = int(np.ceil(half / step))
-    return np.linspace(-half, half, 2 * count + 1)

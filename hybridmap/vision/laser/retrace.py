@@ -1,0 +1,104 @@
+"""At the end every scan is registered to the final map: the way between nodes gets as good as the nodes are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.config.laser import LaserConfig
+from hybridmap.geometry import Array, between, compose, interpolate, wrap_angle
+from hybridmap.streams.base import LaserScan
+from hybridmap.vision.base import Retraced
+from hybridmap.vision.laser.cloud import Cloud, merged
+from hybridmap.vision.laser.likelihood import build_field
+from hybridmap.vision.laser.registration import Prior, align
+from hybridmap.vision.laser.submap import Atlas
+
+TURN_AS_TRAVEL_M = 0.3
+NOWHERE_M = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class SeenScan:
+    """A scan with the node that the robot had made last and the integrator's motion (3,) since then."""
+
+    scan: LaserScan
+    node: int
+    motion: Array
+
+
+class Retracer:
+    """Registers scans to the map, block of nodes by block."""
+
+    def __init__(self, config: LaserConfig, atlas: Atlas, cloud_of: Callable[[LaserScan], Cloud]) -> None:
+        self._config = config
+        self._atlas = atlas
+        self._cloud_of = cloud_of
+
+    def retrace(self, scans: Sequence[SeenScan], steps: Array, poses: Array) -> Retraced:
+        """Pose of the robot at every scan that could be registered, seen from the node it had made last.
+
+        Args:
+            scans: every scan since the first node, in order; that of a node has no motion.
+            steps: (N - 1, 3) the integrator's motion from each node to the next.
+            poses: (N, 3) of the nodes in the final map.
+        """
+        nodes = np.array([s.node for s in scans], dtype=np.int64)
+        motions = np.array([s.motion for s in scans]).reshape(-1, 3)
+        expected = _expected(nodes, motions, steps.reshape(-1, 3), poses)
+        found, good = expected.copy(), np.zeros(len(scans), dtype=bool)
+        size = self._config.retrace.block_nodes
+        for first in range(0, len(poses), size):
+            block = np.flatnonzero((nodes >= first) & (nodes < first + size))
+            if len(block):
+                clouds = [self._cloud_of(scans[int(i)].scan) for i in block]
+                found[block], good[block] = self._register(clouds, expected[block], poses[first : first + size], poses)
+        stamps = np.array([s.scan.stamp_ns for s in scans], dtype=np.int64)
+        return Retraced(stamps[good], nodes[good], between(poses[nodes[good]], found[good]))
+
+    def _register(self, clouds: list[Cloud], expected: Array, block: Array, poses: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Poses (K, 3) of a block's scans, and which of them are to be believed."""
+        c = self._config.retrace
+        distance = np.hypot(*(poses[:, :2] - block[:, :2].mean(axis=0)).T)
+        near = np.argsort(distance, kind="stable")[: c.map_nodes]
+        near = np.union1d(near[distance[near] < c.radius_m], np.argsort(distance, kind="stable")[:1])
+        cell, settings = self._config.scan.cell_m, self._config.registration
+        local = merged([self._atlas.clouds[i].moved(poses[i]) for i in near], cell)
+        field = build_field(local, cell, settings.reach_m, settings.field_sigma_m)
+        stack, counts = _stacked(clouds)
+        prior = Prior(expected, 1.0 / np.array([c.prior_m, c.prior_m, np.deg2rad(c.prior_deg)]) ** 2)
+        alignment = align(field, stack, expected, settings, prior)
+        inliers = alignment.inliers * stack.points.shape[1] / np.maximum(counts, 1)
+        off = between(expected, alignment.poses)
+        close = (np.hypot(off[:, 0], off[:, 1]) < c.off_max_m) & (np.abs(off[:, 2]) < np.deg2rad(c.off_max_deg))
+        return alignment.poses, np.asarray(close & (inliers >= c.inliers_min))
+
+
+def _stacked(clouds: list[Cloud]) -> tuple[Cloud, NDArray[np.int64]]:
+    """One cloud with arrays (K, P, 2), short ones filled with points far from every wall; and how many points are real."""
+    counts = np.array([len(c) for c in clouds], dtype=np.int64)
+    points = np.full((len(clouds), max(int(counts.max()), 1), 2), NOWHERE_M)
+    normals = np.zeros_like(points)
+    for k, cloud in enumerate(clouds):
+        points[k, : counts[k]], normals[k, : counts[k]] = cloud.points, cloud.normals
+    return Cloud(points, normals), counts
+
+
+def _expected(nodes: NDArray[np.int64], motions: Array, steps: Array, poses: Array) -> Array:
+    """Poses (S, 3) of the scans in the map: as the wheels have it from the node before and to the node after, blended."""
+    forward = compose(poses[nodes], motions)
+    inside = np.flatnonzero(nodes < len(poses) - 1)
+    if len(inside) == 0:
+        return forward
+    node, motion = nodes[inside], motions[inside]
+    backward = compose(poses[node + 1], between(steps[node], motion))
+    share = (_way(motion) / np.maximum(_way(steps[node]), 1e-6)).clip(0.0, 1.0)
+    forward[inside] = interpolate(forward[inside], backward, share)
+    return forward
+
+
+def _way(motion: Array) -> Array:
+    return np.asarray(np.hypot(motion[:, 0], motion[:, 1]) + TURN_AS_TRAVEL_M * np.abs(wrap_angle(motion[:, 2])))
