@@ -81,6 +81,8 @@ class SensorsConfig(Section):
     """Units of a 16 bit depth value per metre; None: 1000 in bags, camera.yaml in a TUM folder."""
     sync_tolerance_s: float = Field(default=0.02, ge=0)
     """Colour and depth belong together when their stamps differ by no more than this, s."""
+    latency_s: float = Field(default=0.0, ge=0)
+    """Live input: how long samples wait to be sorted by stamp, s; 0 for recordings, which are sorted by their reader."""
     range_min_m: float | None = Field(default=None, ge=0)
     """Laser returns nearer than this are dropped, m; None: the recording's limit alone."""
     range_max_m: float | None = Field(default=None, gt=0)

@@ -127,6 +127,40 @@ def _span(stamps_ns: Stamps) -> str:
     return f"{format_stamp(int(stamps_ns[0]))} to {format_stamp(int(stamps_ns[-1]))} s"
 
 
+def sort_key(sample: Sample) -> tuple[int, int]:
+    """Order of a stream: by stamp; at equal stamps motion, then scans, then frames."""
+    return sample.stamp_ns, _RANK[type(sample)]
+
+
+class ReorderBuffer:
+    """Sorts samples that arrive a little late, as a live robot's do; whatever comes in order passes at once at latency 0."""
+
+    def __init__(self, latency_s: float) -> None:
+        """Hold samples back until the newest stamp is `latency_s` ahead of theirs."""
+        self._latency_ns = round(latency_s * NS_PER_S)
+        self._newest_ns: int | None = None
+        self._heap: list[tuple[tuple[int, int], int, Sample]] = []
+        self._arrivals = 0
+
+    def push(self, sample: Sample) -> list[Sample]:
+        """Take in one sample; return those that have waited long enough, in order."""
+        heapq.heappush(self._heap, (sort_key(sample), self._arrivals, sample))
+        self._arrivals += 1
+        newest = sample.stamp_ns if self._newest_ns is None else max(self._newest_ns, sample.stamp_ns)
+        self._newest_ns = newest
+        return self._pop_until(newest - self._latency_ns)
+
+    def flush(self) -> list[Sample]:
+        """Everything that still waits, in order."""
+        return self._pop_until(self._newest_ns or 0)
+
+    def _pop_until(self, stamp_ns: int) -> list[Sample]:
+        ready = []
+        while self._heap and self._heap[0][0][0] <= stamp_ns:
+            ready.append(heapq.heappop(self._heap)[2])
+        return ready
+
+
 def merge(*sources: Iterable[Sample]) -> Iterator[Sample]:
     """One stream out of several sorted ones, by stamp; at equal stamps motion, then scans, then frames."""
-    return heapq.merge(*sources, key=lambda sample: (sample.stamp_ns, _RANK[type(sample)]))
+    return heapq.merge(*sources, key=sort_key)

@@ -55,7 +55,7 @@ class BagStream:
         self._motion_ns, self._motion_poses = track.sorted(what, carry)
         self._plan_made = self._plan()
         self._planned, self.rig, self.losses = self._plan_made.planned, self._plan_made.rig, self._plan_made.losses
-        self.remarks += self._plan_made.remarks
+        self.remarks += self._plan_made.remarks + self._lost_messages()
         observation_ns = np.array([planned.stamp_ns for planned in self._planned], dtype=np.int64)
         check_overlap(self._motion_ns, observation_ns, str(path))
         self._apply(window or Window())
@@ -138,6 +138,12 @@ class BagStream:
             )
         self.remarks.append(f"no Odometry topic: self-motion from the transform {tracks[0].parent} -> {tracks[0].child}")
         return tracks[0], f"{self._bag.path}: transform {tracks[0].parent} -> {tracks[0].child}"
+
+    def _lost_messages(self) -> list[str]:
+        """A line for every used topic that holds fewer messages than the bag says: a sign of damage."""
+        read, used = self._index.counts, frozenset(self.uses.values())
+        lost = [topic for topic in self._bag.topics if topic.name in used and read.get(topic.name, 0) < topic.count]
+        return [f"{topic.name}: {read.get(topic.name, 0)} messages of {topic.count} can be read" for topic in lost]
 
     def _choose_base(self, track: PoseTrack) -> str:
         """Frame that is mapped: the configured one, else the one that the odometry moves, else a usual name."""

@@ -13,6 +13,7 @@ import numpy as np
 from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, Array, between, compose, exp, interpolate
 from hybridmap.streams.base import Motion, Observation, Sample, SelfMotion, StreamReport, Velocity
+from hybridmap.streams.order import ReorderBuffer
 from hybridmap.trajectory import NS_PER_S, format_stamp
 
 
@@ -41,15 +42,20 @@ class Synchroniser:
     Every distinct stamp of self-motion gives one step without observation; every observation gives one step with it, at
     the odometry interpolated to its own stamp, as soon as odometry at or after it has come. Of odometry messages with one
     stamp the first counts; of velocities with one stamp the last, since each holds until the next.
+
+    A live robot's messages arrive out of order across topics: `latency_s` is how long samples wait to be sorted. The steps
+    are the same whatever the latency, as long as it covers the delay; a scan that comes behind it is dropped and counted.
     """
 
-    def __init__(self, max_hold_s: float = 1.0) -> None:
+    def __init__(self, max_hold_s: float = 1.0, latency_s: float = 0.0) -> None:
         """Start without any sample.
 
         Args:
+            latency_s: samples are held back until the newest stamp is this much ahead of theirs, s; 0 for sorted streams.
             max_hold_s: observations further behind the last odometry than this are dropped at the end, not held, s.
         """
         self.report = StreamReport()
+        self._arrived = ReorderBuffer(latency_s)
         self._max_hold_ns = round(max_hold_s * NS_PER_S)
         self._last: tuple[int, Array] | None = None  # newest self-motion: stamp, pose
         self._velocity: Velocity | None = None
@@ -63,21 +69,25 @@ class Synchroniser:
         Raises:
             StreamError: stamps go back, self-motion is not finite, or odometry and velocities are mixed.
         """
-        if isinstance(sample, SelfMotion | Velocity):
-            return self._push_motion(sample)
-        return self._push_observation(sample)
+        return [step for ready in self._arrived.push(sample) for step in self._take(ready)]
 
     def flush(self) -> list[Ready]:
-        """End of the stream: the observations still waiting, at the last pose."""
+        """End of the stream: the samples still held back, then the observations still waiting, at the last pose."""
+        steps = [step for ready in self._arrived.flush() for step in self._take(ready)]
         if self._last is None:
             self._drop("observations before odometry", len(self._waiting))
             self._waiting.clear()
-            return []
+            return steps
         stamp_ns, pose = self._last
         held = [sample for sample in self._waiting if sample.stamp_ns - stamp_ns <= self._max_hold_ns]
         self._drop("observations after odometry", len(self._waiting) - len(held))
         self._waiting.clear()
-        return [self._make(sample.stamp_ns, pose, sample) for sample in held]
+        return steps + [self._make(sample.stamp_ns, pose, sample) for sample in held]
+
+    def _take(self, sample: Sample) -> list[Ready]:
+        if isinstance(sample, SelfMotion | Velocity):
+            return self._push_motion(sample)
+        return self._push_observation(sample)
 
     def _push_motion(self, sample: Motion) -> list[Ready]:
         self._check_motion(sample)

@@ -154,12 +154,19 @@ def _select_images(chooser: _Chooser, chosen: Selection) -> None:
     chosen.depth = chooser.named("depth_topic", IMAGE) or chooser.best(
         IMAGE, _DEPTH_NAMES, remarks, keep=lambda name: _DEPTH.search(name) is not None
     )
+    colors = [t.name for t in chooser.of(IMAGE) if _NO_COLOR.search(t.name) is None and t.name != chosen.depth]
+    beside = [name for name in colors if chosen.depth is not None and _namespace(name) == _namespace(chosen.depth)]
     chosen.color = chooser.named("color_topic", IMAGE) or chooser.best(
-        IMAGE, _COLOR_NAMES, remarks, keep=lambda name: _NO_COLOR.search(name) is None and name != chosen.depth
+        IMAGE, _COLOR_NAMES, remarks, keep=lambda name: name in (beside or colors)
     )
     infos = [topic.name for topic in chooser.of(CAMERA_INFO)]
     chosen.color_info = chooser.named("camera_info_topic", CAMERA_INFO) or _info_of(chosen.color, infos, alone_is_enough=True)
     chosen.depth_info = chooser.named("depth_info_topic", CAMERA_INFO) or _info_of(chosen.depth, infos, alone_is_enough=False)
+
+
+def _namespace(topic: str) -> str:
+    """First part of a topic's name: the camera, as a rule."""
+    return topic.strip("/").split("/")[0]
 
 
 def _info_of(image: str | None, infos: Sequence[str], *, alone_is_enough: bool) -> str | None:

@@ -186,6 +186,15 @@ def test_topics_are_named_by_the_configuration(tmp_path):
     assert sum(isinstance(sample, LaserScan) for sample in samples) == 3
 
 
+def test_colour_is_taken_from_the_camera_that_gives_the_depth(tmp_path):
+    recording = rgbd_drive()
+    for i in range(9):
+        recording.image(100 * NS + i, color_pixels(), "rgb8", topic="/rear/color/image_raw")
+    stream = open_stream(recording.write(tmp_path / "a.mcap"), Config())
+    assert stream.selection.color == "/camera/color/image_raw"
+    assert stream.selection.depth == "/camera/aligned_depth_to_color/image_raw"
+
+
 def test_the_sensor_to_map_with_is_chosen_by_the_configuration(tmp_path):
     recording = rgbd_drive()
     recording.transform("base_link", "laser")
@@ -422,3 +431,13 @@ def test_a_database_without_message_definitions(tmp_path):
         database.execute("DROP TABLE message_definitions")
         database.execute("DROP TABLE schema")
     assert len(list(open_stream(path, Config()))) == 12
+
+
+def test_messages_that_are_lost_are_remarked_on(tmp_path):
+    folder = laser_drive().write(tmp_path / "a.db3", folder=True)
+    (file,) = folder.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        database.execute("DELETE FROM messages WHERE id = (SELECT max(id) FROM messages)")
+    stream = open_stream(folder, Config())
+    assert len(list(stream)) == 11
+    assert "/scan: 5 messages of 6 can be read" in stream.report.remarks

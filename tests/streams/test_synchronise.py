@@ -105,6 +105,21 @@ def test_displacements_add_up_and_stamps_never_go_back(motion_ms, scan_ms, seed)
     assert sum(step.dt_s for step in steps) == pytest.approx((stamps[-1] - stamps[0]) / 1e9)
 
 
+@given(st.permutations(list(range(24))), st.integers(0, 2**32 - 1))
+def test_late_samples_give_the_same_steps_as_sorted_ones(order, seed):
+    rng = np.random.default_rng(seed)
+    ordered = [_motion(10 * i, *rng.uniform(-1, 1, 3)) if i % 2 else _scan(10 * i) for i in range(24)]
+    delays = {id(sample): 10 * i + 5 * place for i, (sample, place) in enumerate(zip(ordered, order, strict=True))}
+    arriving = sorted(ordered, key=lambda sample: delays[id(sample)])
+    live, live_counts = _run(arriving, latency_s=0.24)
+    offline, offline_counts = _run(ordered)
+    assert live_counts == offline_counts
+    assert [step.stamp_ns for step in live] == [step.stamp_ns for step in offline]
+    for one, other in zip(live, offline, strict=True):
+        np.testing.assert_array_equal(one.delta_robot, other.delta_robot)
+        assert one.observation is other.observation
+
+
 def test_velocities_hold_until_the_next():
     steps, _ = _run([Velocity(0, 1.0, 0.0), Velocity(1000 * MS, 2.0, np.pi / 2), Velocity(2000 * MS, 0.0, 0.0)])
     np.testing.assert_allclose(steps[1].delta_robot, [1.0, 0.0, 0.0], atol=1e-12)
