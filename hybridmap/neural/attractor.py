@@ -28,15 +28,16 @@ class PlaceAttractor:
         wave = 2.0 * np.pi * np.arange(side // 2) / side
         angle = np.outer(wave, np.arange(side))
         gain = np.exp(-0.5 * (width_cells * wave) ** 2) * np.where(wave == 0, 1.0, 2.0) / side
-        self._wave = wave
-        self._kernel = np.concatenate([gain[:, None] * np.cos(angle), gain[:, None] * np.sin(angle)])
-        self._offsets = np.arange(side)[:, None] - np.arange(side)
+        self._wave = wave.astype(dtype)
+        self._kernel = np.concatenate([gain[:, None] * np.cos(angle), gain[:, None] * np.sin(angle)]).astype(dtype)
+        offset = np.arange(side)[:, None] - np.arange(side)
+        self._circulant = [(offset - whole) % side for whole in range(side)]
+        self._silent = np.zeros((side, side), dtype=dtype)
         self._phasors = np.exp(1j * angle[1])
-        self._dtype = np.dtype(dtype)
         self._remappings: dict[tuple[int, int], NDArray[np.int64]] = {}
         offset = (np.arange(side) + side // 2) % side - side // 2
         line = np.exp(-0.5 * (offset / width_cells) ** 2)
-        self.activity: NDArray[np.floating] = self._normalised(np.outer(line, line)).astype(dtype)
+        self.activity: NDArray[np.floating] = (np.outer(line, line) / line.sum() ** 2).astype(dtype)
 
     @property
     def extent_m(self) -> float:
@@ -46,12 +47,13 @@ class PlaceAttractor:
     def step(self, displacement_m: NDArray[np.float64]) -> None:
         """Move the bump by a displacement (2,) in the world, m, and let the cells compete once."""
         whole, residual = split_shift(displacement_m / self.cell_m)
-        phase = residual[:, None] * self._wave
-        kernels = (np.concatenate([np.cos(phase), np.sin(phase)], axis=1) @ self._kernel).astype(self._dtype, copy=False)
-        along_x, along_y = (kernels[axis].take(self._offsets - int(whole[axis]), mode="wrap") for axis in (0, 1))
-        spread = along_x @ self.activity @ along_y.T
-        np.maximum(spread, 0.0, out=spread)
-        self.activity = self._normalised(spread * spread)
+        phase = np.multiply.outer(residual.astype(self._wave.dtype), self._wave)
+        kernels = np.concatenate([np.cos(phase), np.sin(phase)], axis=1) @ self._kernel
+        along_x, along_y = (kernels[axis].take(self._circulant[int(whole[axis]) % self._side]) for axis in (0, 1))
+        spread = np.maximum(along_x @ self.activity @ along_y.T, self._silent)
+        spread *= spread
+        spread /= spread.sum()
+        self.activity = spread
 
     def settle(self, iterations: int = 10) -> None:
         """Let the cells compete without self-motion, until one bump is left."""
@@ -96,7 +98,3 @@ class PlaceAttractor:
             drawn = np.arange(size) if tx == ty == 0 else np.random.default_rng(seed).permutation(size)
             self._remappings[tx, ty] = drawn.reshape(self._side, self._side)
         return self._remappings[tx, ty]
-
-    @staticmethod
-    def _normalised(rates: NDArray[np.floating]) -> NDArray[np.floating]:
-        return np.asarray(rates / rates.sum())

@@ -15,11 +15,11 @@ class BandMotion:
     """What the band rings tell the grid sheets in a step, decoded from their rates before and after it.
 
     Attributes:
-        turns: (M, 3) unit phasors of how far each ring moved.
+        advance: (M, 3) how far each ring moved, cycles in [-0.5, 0.5].
         phasors: (M, 3) unit phasors of where it is now.
     """
 
-    turns: NDArray[np.complexfloating]
+    advance: NDArray[np.floating]
     phasors: NDArray[np.complexfloating]
 
 
@@ -56,7 +56,8 @@ class BandRings:
         self._weights = np.stack([np.cos(preferred), np.sin(preferred)], axis=1).astype(dtype)
         self._sharpness = -1.0 / (2.0 * (2.0 * np.pi * width) ** 2)
         self._complex = np.result_type(np.dtype(dtype), np.complex64)
-        self._tuning = np.ascontiguousarray(self._weights.T)
+        inside = 1.0 - 4.0 * float(np.finfo(self._weights.dtype).eps)  # keeps rounding out of arccos' way
+        self._tuning = np.ascontiguousarray(self._weights.T) * self._weights.dtype.type(inside)
         self.activity: NDArray[np.floating] = self.rates_at(np.zeros((len(spacings_m), 3)))
 
     def phasors(self) -> NDArray[np.complexfloating]:
@@ -76,16 +77,14 @@ class BandRings:
     def step(self, displacement_m: NDArray[np.float64]) -> BandMotion:
         """Move every ring by a displacement (2,) in the world, m; says what the rings tell the sheets."""
         before = self.phasors()
-        turn = np.exp(self._turn @ displacement_m)
-        self.activity = self._rates((before * turn).astype(self._complex, copy=False))
+        turn = np.exp(self._turn @ displacement_m).astype(self._complex, copy=False)
+        self.activity = self._rates(before * turn)
         after = self.phasors()
-        return BandMotion(after * before.conj(), after)
+        return BandMotion(np.angle(after * before.conj()) * (0.5 / np.pi), after)
 
     def _rates(self, phasors: NDArray[np.complexfloating]) -> NDArray[np.floating]:
         vector = np.ascontiguousarray(phasors).reshape(-1, 1).view(self._weights.dtype)
         offset = vector @ self._tuning
-        np.minimum(offset, 1.0, out=offset)
-        np.maximum(offset, -1.0, out=offset)
         np.arccos(offset, out=offset)
         offset *= offset
         offset *= self._sharpness

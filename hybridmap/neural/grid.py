@@ -14,15 +14,21 @@ Rectifier = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 
 def relu(drive: NDArray[np.floating]) -> NDArray[np.floating]:
     """The paper's rectifying linear f."""
-    return np.asarray(np.maximum(drive, 0.0))
+    return np.asarray(np.maximum(drive, np.zeros_like(drive)))
 
 
 def softplus(sharpness: float) -> Rectifier:
     """Return f(x) = log(1 + exp(beta x)) / beta, smooth and therefore free of pinning."""
 
     def f(drive: NDArray[np.floating]) -> NDArray[np.floating]:
-        beta = drive.dtype.type(sharpness)
-        return np.asarray(np.maximum(drive, 0.0) + np.log1p(np.exp(-beta * np.abs(drive))) / beta)
+        rest = np.abs(drive)
+        rest *= -sharpness
+        np.exp(rest, out=rest)
+        rest += 1.0
+        np.log(rest, out=rest)
+        rest *= 1.0 / sharpness
+        rest += np.maximum(drive, np.zeros_like(drive))
+        return np.asarray(rest)
 
     return f
 
@@ -77,49 +83,45 @@ class GridModules:
         self._gains = gains.astype(dtype)
         self._rectifier = rectifier
         self._centre = fourier_modes
-        self._input = self._input_weights(band_drive, side)
+        self._complex = np.result_type(self._gains.dtype, np.complex64)
+        self._stripes = self._stripe_weights(band_drive, side)
+        uniform = np.zeros((2 * fourier_modes + 1, fourier_modes + 1, 2), dtype=dtype)
+        uniform[fourier_modes, 0, 0] = side**2
+        self._uniform = uniform.reshape(-1)
         wave = 2.0 * np.pi * np.arange(side) / side
         seed = np.cos(wave[:, None]) + np.cos(wave) + np.cos(wave[:, None] + wave)
         self.activity: NDArray[np.floating] = np.repeat((1.0 + 0.3 * seed)[None], modules, axis=0).astype(dtype)
-        still = np.ones((modules, 3), dtype=self._input.dtype)
+        still, phasors = np.zeros((modules, 3)), np.ones((modules, 3), dtype=self._complex)
         for _ in range(300):
-            self.step(still, still)
+            self.step(still, phasors)
 
-    def step(self, band_turns: NDArray[np.complexfloating], band_phasors: NDArray[np.complexfloating]) -> None:
+    def step(self, band_advance: NDArray[np.floating], band_phasors: NDArray[np.complexfloating]) -> None:
         """Advance by one time constant.
 
         Args:
-            band_turns: (M, 3) unit phasors of how far each band ring moved in this step.
+            band_advance: (M, 3) how far each band ring moved in this step, cycles; two of the three fix the sheet's shift.
             band_phasors: (M, 3) unit phasors of where the band rings are after it.
         """
         modes = self.modes.forward(self.activity)
-        modes *= self.modes.shift(self._sheet_turns(band_turns))
+        modes *= self.modes.shift(band_advance[:, ::2])
         modes *= self._gains
         modes += self._band_input(band_phasors)
         self.activity = self._rectifier(self.modes.inverse(modes))
 
-    @staticmethod
-    def _sheet_turns(bands: NDArray[np.complexfloating]) -> NDArray[np.complexfloating]:
-        """The two shifts of each sheet as unit phasors (M, 2); `combine_bands` for phasors."""
-        misfit = bands[:, 1] * (bands[:, 0] * bands[:, 2]).conj()
-        share = np.exp(np.angle(misfit) * (1j / 3.0)).astype(bands.dtype)
-        return np.asarray(bands[:, ::2] * share[:, None])
-
     def _band_input(self, phasors: NDArray[np.complexfloating]) -> NDArray[np.complexfloating]:
         """Modes (M, 2K+1, K+1) of I_BC: uniform excitation and the stripes of the three bands."""
-        drive = np.empty((len(phasors), 5), dtype=self._input.dtype)
-        drive[:, 0] = 1.0
-        drive[:, 1:4] = phasors.conj()
-        drive[:, 4] = phasors[:, 0]
-        return np.asarray(drive @ self._input).reshape(len(phasors), *self._gains.shape)
+        drive = np.ascontiguousarray(phasors, dtype=self._complex).view(self._gains.dtype) @ self._stripes
+        drive += self._uniform
+        return np.asarray(drive.view(self._complex)).reshape(-1, *self._gains.shape)
 
-    def _input_weights(self, band_drive: float, side: int) -> NDArray[np.complexfloating]:
-        """Weights (5, modes) from uniform input, the three bands and the conjugate of the first to the sheet's modes."""
+    def _stripe_weights(self, band_drive: float, side: int) -> NDArray[np.floating]:
+        """Weights (6, 2 * modes) from the phasors of three bands to their stripes' modes, all as (real, imaginary)."""
         k, stripe = self._centre, 0.5 * band_drive * side**2
-        weights = np.zeros((5, 2 * k + 1, k + 1), dtype=np.result_type(self._gains.dtype, np.complex64))
-        weights[0, k, 0] = side**2
-        weights[1, k + 1, 0] = weights[2, k + 1, 1] = weights[3, k, 1] = weights[4, k - 1, 0] = stripe
-        return weights.reshape(5, -1)
+        weights = np.zeros((3, 2, 2 * k + 1, k + 1, 2))
+        for band, mode, sign in ((0, (k + 1, 0), -1.0), (0, (k - 1, 0), 1.0), (1, (k + 1, 1), -1.0), (2, (k, 1), -1.0)):
+            weights[band, 0][mode][0] = stripe
+            weights[band, 1][mode][1] = sign * stripe
+        return weights.reshape(6, -1).astype(self._gains.dtype)
 
     def band_phases(self) -> NDArray[np.float64]:
         """Return the phases (M, 3) of the first hexagonal modes of the activity, cycles in [-0.5, 0.5]."""

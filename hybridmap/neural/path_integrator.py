@@ -153,7 +153,7 @@ class PathIntegrator:
 
     def _translate_part(self, displacement_m: Array) -> None:
         motion = self.bands.step(displacement_m)
-        self.grid.step(motion.turns, motion.phasors)
+        self.grid.step(motion.advance, motion.phasors)
         self.attractor.step(displacement_m)
         self._moves += 1
         if self._moves % self.config.place.learning_period_steps == 0:

@@ -26,6 +26,8 @@ class LowModes:
         self._left = np.exp(-1j * angle_p).astype(complex_type)
         self._right = np.ascontiguousarray(np.exp(1j * angle_p).T).astype(complex_type)
         self._complex = complex_type
+        pairs = np.stack(np.meshgrid(self.first, self.second, indexing="ij")).reshape(2, -1)
+        self._angles = (-2.0 * np.pi * pairs).astype(dtype)
 
     def forward(self, sheets: NDArray[np.floating]) -> NDArray[np.complexfloating]:
         """Return the modes of sheets (M, N, N)."""
@@ -39,15 +41,13 @@ class LowModes:
             -1, self.side, self.side
         )
 
-    def shift(self, turns: NDArray[np.complexfloating]) -> NDArray[np.complexfloating]:
-        """Return the factors (M, 2K+1, K+1) that move sheets by shifts given as unit phasors exp(2 pi i shift), (M, 2)."""
-        count = len(self.second)
-        powers = np.empty((len(turns), 2, count), dtype=self._complex)
-        powers[:, :, 0] = 1.0
-        powers[:, :, 1:] = turns.conj()[:, :, None]
-        np.multiply.accumulate(powers, axis=2, out=powers)
-        first = np.concatenate([powers[:, 0, :0:-1].conj(), powers[:, 0]], axis=1)
-        return np.asarray(first[:, :, None] * powers[:, 1, None, :])
+    def shift(self, shift_cycles: NDArray[np.floating]) -> NDArray[np.complexfloating]:
+        """Return the factors (M, 2K+1, K+1) that move sheets by shifts (M, 2), cycles of the sheet."""
+        angle = shift_cycles.astype(self._angles.dtype) @ self._angles
+        factors = np.empty(angle.shape, dtype=self._complex)
+        np.cos(angle, out=factors.real)
+        np.sin(angle, out=factors.imag)
+        return factors.reshape(-1, len(self.first), len(self.second))
 
     def squared_wave_number(self) -> NDArray[np.int64]:
         """Return |k|^2 (2K+1, K+1) in the hexagonal metric: axes 120 degrees apart, first shell (1,0), (0,1), (1,1)."""

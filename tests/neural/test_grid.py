@@ -19,7 +19,7 @@ def turn(cycles):
 
 
 def advance(du, dv):
-    return turn(np.tile([du, du + dv, dv], (2, 1)))
+    return np.tile([du, du + dv, dv], (2, 1))
 
 
 def cycles_apart(a, b):
@@ -43,7 +43,7 @@ def test_one_hexagonal_bump_stands_still(rectifier):
     sheets = grid(rectifier)
     before = sheets.activity.copy()
     for _ in range(50):
-        sheets.step(turn(np.zeros((2, 3))), turn(np.zeros((2, 3))))
+        sheets.step(np.zeros((2, 3)), turn(np.zeros((2, 3))))
     assert sheets.activity == pytest.approx(before, abs=1e-9)
     assert before[0].argmax() == 0
     assert before[0] == pytest.approx(before[0].T)
@@ -77,7 +77,7 @@ def test_bands_drive_the_sheets_into_register():
     sheets, target = grid(), np.array([0.11, 0.05])
     phasors = turn(np.tile([target[0], target.sum(), target[1]], (2, 1)))
     for _ in range(300):
-        sheets.step(turn(np.zeros((2, 3))), phasors)
+        sheets.step(np.zeros((2, 3)), phasors)
     assert cycles_apart(sheets.phases(), target).max() < 5e-4
 
 

@@ -124,7 +124,7 @@ def test_there_is_no_position_beside_the_network():
 def test_sheets_stop_when_the_bands_do():
     integrator = PathIntegrator(NeuralConfig(band_drive=0.0))
     before = integrator.module_phases()
-    integrator.bands.step = lambda displacement: BandMotion(np.ones((8, 3), complex), np.ones((8, 3), complex))
+    integrator.bands.step = lambda displacement: BandMotion(np.zeros((8, 3)), np.ones((8, 3), complex))
     integrator.step((0.05, 0.0, 0.0), 0.1)
     assert integrator.module_phases() == pytest.approx(before, abs=1e-9)
 
