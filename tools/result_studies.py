@@ -1,0 +1,176 @@
+"""The studies behind `docs/results.md`: commands, the figures that are taken from them, and the bars they are held against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure of a command's `--json`; `PRIMARY` in its name stands for the session's primary back-end."""
+
+    name: str
+    bar: float | None = None
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command.
+
+    Attributes:
+        command: as one would type it; `$HYBRIDMAP_DATA` is the folder of recordings.
+        figures: taken from its `--json`.
+        wall_bar_s: its wall time is a figure, held against this.
+        holds: what is shown by the command's success; without it a failing command is an error.
+        same_graph: the graph must be that of the steps before.
+    """
+
+    command: str
+    figures: tuple[Figure, ...] = ()
+    wall_bar_s: float | None = None
+    holds: str = ""
+    same_graph: bool = False
+
+
+@dataclass(frozen=True)
+class Study:
+    """Steps that are run one after the other in one empty folder."""
+
+    name: str
+    title: str
+    about: str
+    steps: tuple[Step, ...]
+    needs: str = ""
+
+
+OFFICE = (Figure("ate_rmse/PRIMARY", 0.20),)
+
+STUDIES = (
+    Study(
+        "demo",
+        "The demo",
+        "A laboratory of 10 x 3 m, rendered, driven and mapped with RGB-D; errors against the simulated truth.",
+        (
+            Step(
+                "hybridmap demo --out demo",
+                (
+                    Figure("ate_rmse/odometry"),
+                    Figure("ate_rmse/relaxation-ratslam"),
+                    Figure("ate_rmse/gtsam-gnc"),
+                    Figure("loops_accepted"),
+                    Figure("loop_precision/graph"),
+                ),
+                wall_bar_s=45.0,
+            ),
+        ),
+    ),
+    Study(
+        "fr079",
+        "fr079: an office building, laser, badly drifting wheels",
+        "A real log, mapped with no other option; errors of the published verified relations.",
+        (
+            Step("hybridmap map $HYBRIDMAP_DATA/real/fr079/fr079.mcap --out fr079", (Figure("cpu_s_per_min"), Figure("nodes"))),
+            Step(
+                "hybridmap evaluate fr079 --relations $HYBRIDMAP_DATA/real/fr079/relations.txt",
+                (
+                    Figure("relation_trans_mean/odometry"),
+                    Figure("relation_trans_mean/PRIMARY", 3.5),
+                    Figure("relation_rot_mean/PRIMARY"),
+                    Figure("relation_loop_trans_mean/odometry"),
+                    Figure("relation_loop_trans_mean/PRIMARY"),
+                ),
+            ),
+            Step(
+                "hybridmap compare fr079 --backends odometry,relaxation-ratslam,gtsam-lm,gtsam-isam2,gtsam-cauchy,gtsam-gnc",
+                tuple(
+                    Figure(f"chi2/{name}")
+                    for name in ("odometry", "relaxation-ratslam", "gtsam-lm", "gtsam-isam2", "gtsam-cauchy", "gtsam-gnc")
+                ),
+            ),
+        ),
+        needs="real/fr079/fr079.mcap",
+    ),
+    Study(
+        "aces",
+        "aces: a building of corridors, laser, few loops",
+        "A real log, mapped with no other option; errors of the published verified relations.",
+        (
+            Step("hybridmap map $HYBRIDMAP_DATA/real/aces/aces.bag --out aces", (Figure("cpu_s_per_min"), Figure("nodes"))),
+            Step(
+                "hybridmap evaluate aces --relations $HYBRIDMAP_DATA/real/aces/relations.txt",
+                (
+                    Figure("relation_trans_mean/odometry"),
+                    Figure("relation_trans_mean/PRIMARY", 0.06),
+                    Figure("relation_rot_mean/PRIMARY"),
+                    Figure("relation_loop_trans_mean/odometry"),
+                    Figure("relation_loop_trans_mean/PRIMARY", 0.5),
+                ),
+            ),
+        ),
+        needs="real/aces/aces.bag",
+    ),
+    Study(
+        "office",
+        "office: two laps of a simulated office, from four kinds of source",
+        "The same drive mapped from the live stream, a ROS 1 bag, a ROS 2 mcap and a TUM folder: the same nodes and edges.",
+        (
+            Step(
+                "hybridmap map office --out live", (Figure("ate_rmse/odometry"), *OFFICE, Figure("ate_rmse/relaxation-ratslam"))
+            ),
+            Step("hybridmap simulate office --out office.bag"),
+            Step("hybridmap map office.bag --config office --out bag", OFFICE, same_graph=True),
+            Step("hybridmap simulate office --out office.mcap"),
+            Step("hybridmap map office.mcap --config office --out mcap", OFFICE, same_graph=True),
+            Step("hybridmap simulate office --out office-tum"),
+            Step("hybridmap map office-tum --config office --out tum", OFFICE, same_graph=True),
+        ),
+    ),
+    Study(
+        "hololens",
+        "A real office, RGB-D, hand-held",
+        "Real colour and depth of a hand-held device, with made-up odometry; errors against the device's own tracking.",
+        (
+            Step(
+                "hybridmap map $HYBRIDMAP_DATA/real/hololens_office --out hololens",
+                (
+                    Figure("nodes"),
+                    Figure("loops_accepted"),
+                    Figure("ate_rmse/odometry"),
+                    Figure("ate_rmse/PRIMARY"),
+                    Figure("cpu_s_per_min"),
+                ),
+            ),
+            Step("hybridmap export hololens --format ply --out hololens.ply", holds="the merged cloud is written"),
+        ),
+        needs="real/hololens_office/rgb.txt",
+    ),
+    Study(
+        "manhattan",
+        "manhattanOlson3500, one referee",
+        "A standard pose graph through several back-ends. Its best known chi2 is 146.08.",
+        (
+            Step(
+                "hybridmap compare $HYBRIDMAP_DATA/posegraphs/manhattanOlson3500.g2o"
+                " --backends odometry,relaxation-ratslam,gtsam-lm,gtsam-gnc",
+                (
+                    Figure("chi2/odometry"),
+                    Figure("chi2/relaxation-ratslam"),
+                    Figure("chi2/gtsam-lm", 146.09),
+                    Figure("chi2/gtsam-gnc"),
+                ),
+            ),
+        ),
+        needs="posegraphs/manhattanOlson3500.g2o",
+    ),
+    Study(
+        "cells",
+        "The cells against exact integration",
+        "Decoded from activity alone, against exact integration of the same increments over 230 m.",
+        (
+            Step(
+                'python -m pytest -q -m slow tests/neural -k "230_m"',
+                holds="at 30 Hz every module stays within 0.5 % of its spacing, the position within 0.3 mm (3 seeds)",
+            ),
+        ),
+    ),
+)
