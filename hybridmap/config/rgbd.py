@@ -135,6 +135,8 @@ class RgbdConfig(Section):
     `auto`: level until a floor is seen that contradicts the mounting."""
     max_width_px: int = Field(default=320, ge=80)
     """Images are reduced by a whole factor until they are no wider."""
+    held_images: int = Field(default=100, ge=1)
+    """Newest nodes whose images stay in memory; the map file has all of them."""
     features: FeaturesConfig = FeaturesConfig()
     """Keypoints."""
     registration: RegistrationConfig = RegistrationConfig()

@@ -142,21 +142,26 @@ class LoopCloser:
 
     def _raise(self, new: _Hypothesis, belief: Belief) -> list[Proposal]:
         """File a hypothesis; accept it and what it supports if another one agrees."""
-        friends = [h for h in self._hypotheses if self._agrees(new, h, belief)]
+        near = [h for h in self._hypotheses if self._beside(new, h)]
+        friends = [h for h in near if h.proposal.verdict is Verdict.PENDING and self._agrees(new, h, belief)]
+        accepted = (h for h in near if h.proposal.verdict is Verdict.ACCEPTED)
+        supported = bool(friends) or self._closing.support_nodes == 0 or any(self._agrees(new, h, belief) for h in accepted)
         self._hypotheses.append(new)
-        if not friends and self._closing.support_nodes > 0:
+        if not supported:
             return [new.proposal]
-        changed = [new, *(h for h in friends if h.proposal.verdict is Verdict.PENDING)]
+        changed = [new, *friends]
         for h in changed:
             h.proposal = replace(h.proposal, verdict=Verdict.ACCEPTED, reason="verified and supported")
         self._travel_at_closure = max(self._travel_at_closure, float(belief.travel_m[new.source]))
         return [h.proposal for h in changed]
 
-    def _agrees(self, a: _Hypothesis, b: _Hypothesis, belief: Belief) -> bool:
-        """Two edges from different nodes near each other, to nodes near each other, give the same pose through the chain."""
+    def _beside(self, a: _Hypothesis, b: _Hypothesis) -> bool:
+        """Two edges from different nodes near each other, to nodes near each other."""
         apart = abs(a.source - b.source), abs(a.target - b.target)
-        if b.proposal.verdict is Verdict.REJECTED or apart[0] == 0 or max(apart) > self._closing.support_nodes:
-            return False
+        return apart[0] > 0 and max(apart) <= self._closing.support_nodes
+
+    def _agrees(self, a: _Hypothesis, b: _Hypothesis, belief: Belief) -> bool:
+        """Two edges give the same pose through the chain between them."""
         poses = belief.poses_map_node
         around = compose(between(poses[a.source], poses[b.source]), b.relative.delta)
         around = compose(around, between(poses[b.target], poses[a.target]))

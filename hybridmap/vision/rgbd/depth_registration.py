@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hybridmap.config.rgbd import RegistrationConfig
 from hybridmap.geometry import Array, RelativePose
 from hybridmap.vision.rgbd.depth_grid import Surface
-from hybridmap.vision.rgbd.spatial import apply, from_planar, rotation_of, small_rotvec, to_floor
+from hybridmap.vision.rgbd.spatial import apply, cross, from_planar, rotation_of, to_floor
 from hybridmap.vision.rgbd.stance import LevelPair, Stance, level_pair
 
 PLANAR = np.array([0, 1, 5])
@@ -34,6 +34,19 @@ class _FloorPrior:
         height = fixed.height_sigma_m**2 + moving.height_sigma_m**2
         tilt = fixed.tilt_sigma_rad**2 + moving.tilt_sigma_rad**2
         return cls(1.0 / np.array([height, tilt, tilt]))
+
+
+@dataclass(frozen=True, slots=True)
+class _PlanarPrior:
+    """Wheel odometry as prior: pose (3,) and information (3, 3) along the axes of the fixed robot."""
+
+    delta: Array
+    information: Array
+
+    @classmethod
+    def of(cls, odometry: RelativePose) -> _PlanarPrior:
+        axes = from_planar(odometry.delta)[:3, :3]
+        return cls(odometry.delta, np.asarray(axes @ np.linalg.inv(odometry.covariance) @ axes.T))
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,16 +122,17 @@ def register(
     """
     T = start.copy()
     floor = _FloorPrior.of(fixed.stance, moving.stance)
+    wheels = None if prior is None else _PlanarPrior.of(prior)
     for _ in range(config.iterations):
         pairing = _pair(fixed, moving, T, config)
         if len(pairing.residual) < config.min_points:
             return None
         H, b = _normal_equations(fixed, moving, pairing, T, pairs)
-        H_prior, b_prior = _prior_terms(T, prior, floor)
+        H_prior, b_prior = _prior_terms(T, wheels, floor)
         step = np.asarray(np.linalg.solve(H + H_prior, b + b_prior), dtype=np.float64)
         T[:3, 3] += step[:3]
         T[:3, :3] = rotation_of(step[3:]) @ T[:3, :3]
-        if np.linalg.norm(step[:3]) < 1e-5 and np.linalg.norm(step[3:]) < 1e-5:
+        if np.abs(step).max() < 1e-4:
             break
     return _summarise(fixed, moving, T, floor, config, pairs)
 
@@ -178,7 +192,7 @@ def _normal_equations(
 ) -> tuple[Array, Array]:
     """H (6, 6) and b (6,) of the data; with `scale` weights are not robust and information is divided by it."""
     normal = fixed.normals[pairing.fixed]
-    J = np.concatenate([normal, np.cross(pairing.arm, normal)], axis=1)
+    J = np.concatenate([normal, cross(pairing.arm, normal)], axis=1)
     variance = fixed.sigma_m[pairing.fixed] ** 2 + moving.sigma_m[pairing.moving] ** 2
     dulled = variance + pairing.residual**2 / 4.0 if scale is None else variance * scale
     weight = 1.0 / dulled
@@ -205,20 +219,17 @@ def _pair_terms(pairs: PointPairs, T: Array) -> tuple[Array, Array]:
     return np.einsum("kij,kil->jl", J, WJ), -np.einsum("kij,ki->j", WJ, error)
 
 
-def _prior_terms(T: Array, prior: RelativePose | None, floor: _FloorPrior) -> tuple[Array, Array]:
+def _prior_terms(T: Array, prior: _PlanarPrior | None, floor: _FloorPrior) -> tuple[Array, Array]:
     flat = to_floor(T)
-    tilt = small_rotvec(T[:3, :3] @ from_planar(flat.delta)[:3, :3].T)
+    tilt_x, tilt_y = -T[1, 2], T[0, 2]
     H, b = np.zeros((6, 6)), np.zeros(6)
     H[OUT_OF_PLANE, OUT_OF_PLANE] = floor.information
-    b[OUT_OF_PLANE] = -floor.information * np.array([flat.height_m, tilt[0], tilt[1]])
+    b[OUT_OF_PLANE] = -floor.information * np.array([flat.height_m, tilt_x, tilt_y])
     if prior is not None:
-        cos, sin = np.cos(prior.delta[2]), np.sin(prior.delta[2])
-        axes = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        information = np.linalg.inv(axes @ prior.covariance @ axes.T)
         error = flat.delta - prior.delta
         error[2] = (error[2] + np.pi) % (2.0 * np.pi) - np.pi
-        H[np.ix_(PLANAR, PLANAR)] += information
-        b[PLANAR] -= information @ error
+        H[np.ix_(PLANAR, PLANAR)] += prior.information
+        b[PLANAR] -= prior.information @ error
     return H, b
 
 

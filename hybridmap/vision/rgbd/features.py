@@ -1,4 +1,4 @@
-"""Keypoints of a keyframe with their points in space, and mutual matching of two keyframes."""
+"""Keypoints of a keyframe with their points in space, and the matching of two keyframes."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ MAX_SPREAD = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """ORB keypoints.
+    """ORB keypoints that have a point in space.
 
     Attributes:
         pixels: (F, 2) float64, column and row at the working width.
         descriptors: (F, 32) uint8.
-        points: (F, 3) float64 in the optical frame, m; NaN where there is no depth.
+        points: (F, 3) float64 in the optical frame, m.
     """
 
     pixels: Array
@@ -31,14 +31,14 @@ class Features:
 
 @dataclass(frozen=True, slots=True)
 class Correspondences:
-    """Indices of mutually best matches, (M,) each."""
+    """Indices of matches, (M,) each; no keypoint occurs twice."""
 
     first: NDArray[np.int64]
     second: NDArray[np.int64]
 
 
 def detect(grey: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: Camera, count: int, fast_threshold: int) -> Features:
-    """Find keypoints and give each its point in space.
+    """Find keypoints and give each its point in space; those without depth, or on a depth edge, are dropped.
 
     Args:
         grey: (H, W) uint8.
@@ -54,25 +54,27 @@ def detect(grey: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: Camera
     if descriptors is None or len(keypoints) == 0:
         return Features(np.zeros((0, 2)), np.zeros((0, 32), dtype=np.uint8), np.zeros((0, 3)))
     pixels = np.array([k.pt for k in keypoints], dtype=np.float64)
-    return Features(pixels, descriptors, _points_at(pixels, depth_m, camera))
+    points, known = _points_at(pixels, depth_m, camera)
+    return Features(pixels[known], descriptors[known], points[known])
 
 
 def match(a: Features, b: Features, ratio: float) -> Correspondences:
-    """Mutually best descriptors that also pass Lowe's ratio from a to b."""
+    """Best descriptor of b for each of a that passes Lowe's ratio; of several that claim one of b the nearest keeps it."""
     import cv2
 
     none = np.zeros(0, dtype=np.int64)
     if len(a.descriptors) < 2 or len(b.descriptors) < 2:
         return Correspondences(none, none)
     distance, nearest = cv2.batchDistance(a.descriptors, b.descriptors, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2)
-    _, back = cv2.batchDistance(b.descriptors, a.descriptors, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=1)
-    best = nearest[:, 0]
-    own = np.arange(len(best))
-    keep = (back[best, 0] == own) & (distance[:, 0] < ratio * distance[:, 1])
-    return Correspondences(own[keep].astype(np.int64), best[keep].astype(np.int64))
+    passed = np.flatnonzero(distance[:, 0] < ratio * distance[:, 1])
+    passed = passed[np.argsort(distance[passed, 0], kind="stable")]
+    _, keeper = np.unique(nearest[passed, 0], return_index=True)
+    own = np.sort(passed[keeper])
+    return Correspondences(own.astype(np.int64), nearest[own, 0].astype(np.int64))
 
 
-def _points_at(pixels: Array, depth_m: NDArray[np.float32], camera: Camera) -> Array:
+def _points_at(pixels: Array, depth_m: NDArray[np.float32], camera: Camera) -> tuple[Array, NDArray[np.bool_]]:
+    """Points (F, 3) from the mean of the 3 x 3 depths around each pixel, and which of them are on one surface."""
     height, width = depth_m.shape
     column = np.clip(np.rint(pixels[:, 0]).astype(int), 1, width - 2)
     row = np.clip(np.rint(pixels[:, 1]).astype(int), 1, height - 2)
@@ -84,6 +86,4 @@ def _points_at(pixels: Array, depth_m: NDArray[np.float32], camera: Camera) -> A
     good = (n >= 5) & (spread < MAX_SPREAD * z)
     x = (pixels[:, 0] - camera.cx_px) / camera.fx_px
     y = (pixels[:, 1] - camera.cy_px) / camera.fy_px
-    points = np.stack([x * z, y * z, z], axis=1)
-    points[~good] = np.nan
-    return points
+    return np.stack([x * z, y * z, z], axis=1), good

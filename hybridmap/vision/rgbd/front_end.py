@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from hybridmap.vision.rgbd.features import detect
 from hybridmap.vision.rgbd.keyframe import (
     Keyframe,
     WorkingImage,
-    packed_images,
+    depth_in_mm,
     working_camera,
     working_factor,
     working_image,
@@ -52,6 +53,7 @@ class RgbdFrontEnd:
             templates.threshold, templates.stable_frames, templates.max_shift, matching.mu_r, matching.mu_d
         )
         self._keyframes: list[Keyframe] = []
+        self._images: deque[tuple[int, RgbdFrame]] = deque(maxlen=rgbd.held_images)
         keys = itertools.count()
         self._tracker = Tracker(self._keyframes, rgbd, self._camera, keys.__next__)
         verifier = Verifier(self._camera, rgbd.pnp, rgbd.features, rgbd.registration, seed)
@@ -89,9 +91,8 @@ class RgbdFrontEnd:
         )
         grid = make_grid(self._image.depth_m, self._camera, rgbd.registration.grid_px, rgbd.registration.depth_sigma)
         stance = self._posture.stance(grid, features, self._keyframes[-1] if self._keyframes else None)
-        color, depth = packed_images(self._frame)
-        surface = place(grid, stance)
-        self._keyframes.append(Keyframe(view.profile, features, surface, color, depth))
+        self._keyframes.append(Keyframe(view.profile, features, place(grid, stance)))
+        self._images.append((node, self._frame))
         self._closer.add_node(view.profile)
 
     def track(self, node: int, odometry: RelativePose | None) -> list[Proposal]:
@@ -107,13 +108,22 @@ class RgbdFrontEnd:
         return self._closer.finish(belief)
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
-        """`profile` float32, `color` (H, W, 3) uint8 RGB, `depth_mm` (H, W) uint16, `T_base_camera` (4, 4) as it was then."""
+        """`profile` float32, `color` (H, W, 3) uint8 RGB, `depth_mm` (H, W) uint16, `T_base_camera` (4, 4) as it was then.
+
+        Raises:
+            StreamError: the node is not one of the newest `held_images`; the map file has what it had.
+        """
         kept = self._keyframes[node]
-        color, depth_mm = kept.images()
+        held = [frame for number, frame in self._images if number == node]
+        if not held:
+            newest = self._config.rgbd.held_images
+            raise StreamError(
+                f"vision: node {node}: only the newest {newest} images are held, take older ones from the map file"
+            )
         return {
             "profile": kept.profile,
-            "color": color,
-            "depth_mm": depth_mm,
+            "color": held[0].color,
+            "depth_mm": depth_in_mm(held[0].depth_m),
             "T_base_camera": kept.surface.stance.T_base_camera,
         }
 

@@ -28,30 +28,16 @@ class WorkingImage:
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """A node's frame: profile, features, surface, and the images, packed without loss.
-
-    Attributes:
-        color_png, depth_png: PNG files; depth in whole millimetres.
-    """
+    """A node's frame: profile, features and surface."""
 
     profile: Profile
     features: Features
     surface: Surface
-    color_png: NDArray[np.uint8]
-    depth_png: NDArray[np.uint8]
 
     @property
     def held(self) -> bool:
         """The camera's tilt was measured at this keyframe and not taken from the mounting."""
         return self.surface.stance.held
-
-    def images(self) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
-        """Colour (H, W, 3) uint8 RGB and depth (H, W) uint16 mm, as they came."""
-        import cv2
-
-        color = np.asarray(cv2.imdecode(self.color_png, cv2.IMREAD_COLOR), dtype=np.uint8)
-        depth = cv2.imdecode(self.depth_png, cv2.IMREAD_UNCHANGED)
-        return np.ascontiguousarray(color[:, :, ::-1]), np.asarray(depth, dtype=np.uint16)
 
 
 def working_factor(camera: Camera, max_width_px: int) -> int:
@@ -78,11 +64,7 @@ def working_image(frame: RgbdFrame, factor: int) -> WorkingImage:
     return WorkingImage(grey, depth)
 
 
-def packed_images(frame: RgbdFrame) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Colour and depth (whole millimetres) as PNG, without loss."""
-    import cv2
-
-    fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-    depth_mm = np.clip(np.rint(np.nan_to_num(frame.depth_m, posinf=0.0) * 1000.0), 0, 65535).astype(np.uint16)
-    color = np.ascontiguousarray(frame.color[:, :, ::-1])
-    return cv2.imencode(".png", color, fast)[1], cv2.imencode(".png", depth_mm, fast)[1]
+def depth_in_mm(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Depth in whole millimetres, 0 where invalid."""
+    millimetres = np.rint(np.nan_to_num(depth_m, posinf=0.0) * 1000.0)
+    return np.asarray(np.clip(millimetres, 0, 65535), dtype=np.uint16)

@@ -18,7 +18,7 @@ def point_pairs(
     focal_px: float,
     depth_sigma: float,
 ) -> PointPairs | None:
-    """Pair up keypoints that have depth in both keyframes; None where fewer than three have.
+    """Matched keypoints as pairs of points; None where there are fewer than three.
 
     Each carries the information of one pixel (1 sigma) sideways and of its depth along the ray.
 
@@ -28,11 +28,9 @@ def point_pairs(
         focal_px: focal length at the working width.
         depth_sigma: noise of depth at 1 m, m.
     """
-    a, b = fixed.features.points[matches.first], moving.features.points[matches.second]
-    known = np.isfinite(a[:, 0]) & np.isfinite(b[:, 0])
-    if known.sum() < 3:
+    if len(matches.first) < 3:
         return None
-    a, b = a[known], b[known]
+    a, b = fixed.features.points[matches.first], moving.features.points[matches.second]
     rotation = fixed.surface.stance.T_base_camera[:3, :3]
     ray = (a / np.linalg.norm(a, axis=1, keepdims=True)) @ rotation.T
     z = a[:, 2]

@@ -35,7 +35,7 @@ class PnpSolver:
         self._seed = seed
 
     def solve(self, points: Features, image: Features, of_points: NDArray[np.int64], of_image: NDArray[np.int64]) -> Pnp | None:
-        """Points of one keyframe in the image of another; None without enough depth or support.
+        """Points of one keyframe in the image of another; None without enough support.
 
         Args:
             points, image: features of the two keyframes.
@@ -43,10 +43,9 @@ class PnpSolver:
         """
         import cv2
 
-        usable = np.flatnonzero(np.isfinite(points.points[of_points, 0]))
-        if len(usable) < self._config.min_inliers:
+        if len(of_points) < self._config.min_inliers:
             return None
-        space, pixels = points.points[of_points[usable]], image.pixels[of_image[usable]]
+        space, pixels = points.points[of_points], image.pixels[of_image]
         cv2.setRNGSeed(self._seed)
         ok, rotation, translation, inliers = cv2.solvePnPRansac(
             space,
@@ -65,4 +64,4 @@ class PnpSolver:
         T = np.eye(4)
         T[:3, :3] = cv2.Rodrigues(rotation)[0]
         T[:3, 3] = np.ravel(translation)
-        return Pnp(T, usable[kept].astype(np.int64))
+        return Pnp(T, kept.astype(np.int64))

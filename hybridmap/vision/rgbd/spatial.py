@@ -67,6 +67,13 @@ def small_rotvec(R: Array) -> Array:
     return np.asarray(0.5 * twice_sin * angle / sin)
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Row-wise cross product of (N, 3) arrays (numpy's own is several times slower on small ones)."""
+    ax, ay, az = a[:, 0], a[:, 1], a[:, 2]
+    bx, by, bz = b[:, 0], b[:, 1], b[:, 2]
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+
+
 def apply(T_a_b: Array, points_b: Array) -> Array:
     """Bring points (N, 3) from frame b to frame a."""
     return np.asarray(points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rgbd_room import camera, render, textures
 
-from hybridmap.config.rgbd import RgbdClosingConfig, RgbdConfig
+from hybridmap.config.rgbd import RegistrationConfig, RgbdClosingConfig, RgbdConfig
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import RelativePose, between, compose
@@ -139,7 +139,7 @@ def test_another_place_is_refused(poses, frames):
 
 @pytest.mark.parametrize("mode", ["literal", "ratio", "signed", "plain", "four-band"])
 def test_seed_modes_close_by_the_shift_alone(mode, poses, frames):
-    config = VisionConfig(rgbd=RgbdConfig(matching=mode, verify="none"))
+    config = VisionConfig(rgbd=RgbdConfig(matching=mode, verify="none", registration=RegistrationConfig(enabled=False)))
     _, proposals, _ = drive(config, poses, 0.0, frames)
     loops = [p for p in proposals.values() if p.kind == "loop"]
     assert loops
