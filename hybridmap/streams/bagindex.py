@@ -78,6 +78,7 @@ class BagIndex:
         stamps_ns: topic -> header stamps in the order of the recording.
         first: topic -> its first message, decoded.
         odometry: topic -> its poses.
+        unusable_transforms: names of transforms that are no numbers, in order of appearance (a dict for its order).
         transforms: the transform tree; `tf_tracks` the moving transforms in it, by (parent, child).
     """
 
@@ -85,6 +86,7 @@ class BagIndex:
     stamps_ns: dict[str, list[int]] = field(default_factory=dict)
     first: dict[str, Any] = field(default_factory=dict)
     odometry: dict[str, PoseTrack] = field(default_factory=dict)
+    unusable_transforms: dict[str, None] = field(default_factory=dict)
     transforms: TransformTree = field(default_factory=TransformTree)
     tf_tracks: dict[tuple[str, str], PoseTrack] = field(default_factory=dict)
 
@@ -143,6 +145,7 @@ def _take_transforms(index: BagIndex, bag: BagFile, message: RawMessage, odom_fr
                 track.add(stamp_ns, p, q, what)
         values = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
         if not np.isfinite(values).all() or not any(values[3:]):
-            raise StreamError(f"{what}: found {values}, expected a finite translation and a rotation")
+            index.unusable_transforms[f"{parent} -> {child}"] = None
+            continue
         T = matrix((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
         index.transforms.add(parent, child, T, static=is_static(message.topic))

@@ -31,7 +31,7 @@ from hybridmap.streams.topics import Selection
 
 MessageKey = tuple[str, int]
 
-_RECTIFIED = re.compile(r"rect", re.IGNORECASE)
+_RECTIFIED = re.compile(r"rect[^/]*(/compressed(Depth)?)?$", re.IGNORECASE)  # image_rect, image_rect_color, ...
 _REGISTERED = re.compile(r"aligned|registered|depth_to_(color|rgb)", re.IGNORECASE)
 _SAME_PX = 0.5  # intrinsics closer than this are the same camera
 

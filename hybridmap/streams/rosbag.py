@@ -49,6 +49,7 @@ class BagStream:
         topics = [replace(topic, count=self._index.counts.get(topic.name, 0)) for topic in self._bag.topics]
         self.selection = select(topics, self._sensors, self._index.frame_of, str(path))
         self.remarks = list(self.selection.remarks)
+        self.remarks += [f"transform {name} holds NaN or no rotation: ignored" for name in self._index.unusable_transforms]
         track, what = self._self_motion()
         self._base_frame = self._choose_base(track)
         carry = self._carry(track, what)

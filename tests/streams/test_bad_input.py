@@ -319,3 +319,12 @@ def test_a_camera_whose_frame_is_no_optical_one_is_remarked_on(tmp_path):
     recording.transform("base_link", "camera_optical", (0.1, 0.0, 0.5))
     stream = open_stream(recording.write(tmp_path / "a.mcap"), Config())
     assert any("optical frame" in remark for remark in stream.remarks)
+
+
+def test_odometry_of_tf_that_is_no_number(tmp_path):
+    recording = Recording()
+    recording.transform("base_link", "laser")
+    for i in range(3):
+        recording.transform("odom", "base_link", (np.nan if i == 2 else 0.1 * i, 0, 0), topic="/tf", stamp_ns=100 * NS + i)
+    recording.scan(100 * NS, [1, 2, 3])
+    _refuses(recording.write(tmp_path / "a.mcap"), "/tf", "odom -> base_link", "NaN", "100.000000002")

@@ -441,3 +441,14 @@ def test_messages_that_are_lost_are_remarked_on(tmp_path):
     stream = open_stream(folder, Config())
     assert len(list(stream)) == 11
     assert "/scan: 5 messages of 6 can be read" in stream.report.remarks
+
+
+def test_a_broken_transform_elsewhere_does_not_matter_and_is_remarked_on(tmp_path):
+    recording = laser_drive()
+    recording.transform("base_link", "arm", (np.nan, 0.0, 0.0), topic="/tf", stamp_ns=100 * NS)
+    recording.transform("arm", "hand", xyzw=(0.0, 0.0, 0.0, 0.0), topic="/tf", stamp_ns=100 * NS)
+    stream = open_stream(recording.write(tmp_path / "a.mcap"), Config())
+    assert len(list(stream)) == 12
+    assert [remark.split(" holds")[0] for remark in stream.report.remarks] == [
+        "transform base_link -> arm", "transform arm -> hand"
+    ]  # fmt: skip
