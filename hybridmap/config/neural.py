@@ -88,6 +88,6 @@ class NeuralConfig(Section):
             raise ValueError("place.grid_inputs_side must divide sheet_side")
         if 2 * self.fourier_modes >= self.sheet_side:
             raise ValueError("fourier_modes must be less than half of sheet_side")
-        if self.kernel_widths[0] <= self.kernel_widths[1]:
-            raise ValueError("kernel_widths: the excitatory spectrum must be wider than the inhibitory")
+        if not self.kernel_widths[0] > self.kernel_widths[1] > 0:
+            raise ValueError("kernel_widths: both must be positive, and the excitatory spectrum the wider one")
         return self

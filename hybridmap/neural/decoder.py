@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from hybridmap.geometry import Array
 
+_AGREEMENT_CYCLES = 0.06
+
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
@@ -24,6 +26,11 @@ class Decoded:
     position_m: Array
     misfit_cycles: float
 
+    @property
+    def agreed(self) -> bool:
+        """Whether the modules agree, i.e. the position can be trusted."""
+        return self.misfit_cycles < _AGREEMENT_CYCLES
+
 
 class PhaseDecoder:
     """Least squares on the phases of all bands of all modules, with the wraps resolved from where to start.
@@ -31,8 +38,6 @@ class PhaseDecoder:
     One module repeats after its spacing; the phases of all modules together repeat only far beyond the largest. A start says
     which repetition is meant, and enters nowhere else: anywhere inside its basin the answer is the same.
     """
-
-    _AGREEMENT_CYCLES = 0.06
 
     def __init__(self, wave_vectors: NDArray[np.float64], box_m: float) -> None:
         """Take wave vectors (M, 3, 2), cycles per metre, and the half side of the scanned box, m."""
@@ -55,17 +60,17 @@ class PhaseDecoder:
         """
         phases = phases_cycles.reshape(-1)
         found = self._refine(phases, last_m)
-        if found.misfit_cycles < self._AGREEMENT_CYCLES:
+        if found.agreed:
             return found
         starts = starts_m()
         found = self._refine(phases, starts[0])
-        if found.misfit_cycles < self._AGREEMENT_CYCLES:
+        if found.agreed:
             return found
         near = self._refine(phases, self._scan(phases, starts[0]))
-        if near.misfit_cycles < self._AGREEMENT_CYCLES:
+        if near.agreed:
             return near
         far = min((self._refine(phases, start) for start in starts), key=lambda decoded: decoded.misfit_cycles)
-        return far if far.misfit_cycles < self._AGREEMENT_CYCLES else near
+        return far if far.agreed else near
 
     def _refine(self, phases: NDArray[np.float64], start_m: Array) -> Decoded:
         """Take whole cycles from a start (2,), solve for the position, and again until the whole cycles stay the same."""

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from hybridmap.errors import ConfigError
 from hybridmap.neural.torus import LowModes
 
 Rectifier = Callable[[NDArray[np.floating]], NDArray[np.floating]]
@@ -79,6 +80,11 @@ class GridModules:
         band_drive: float,
         dtype: DTypeLike = np.float64,
     ) -> None:
+        """Make the sheets and let them settle.
+
+        Raises:
+            ConfigError: with these gains no stationary pattern forms.
+        """
         self.modes = LowModes(side, fourier_modes, dtype)
         self._gains = gains.astype(dtype)
         self._rectifier = rectifier
@@ -91,9 +97,26 @@ class GridModules:
         wave = 2.0 * np.pi * np.arange(side) / side
         seed = np.cos(wave[:, None]) + np.cos(wave) + np.cos(wave[:, None] + wave)
         self.activity: NDArray[np.floating] = np.repeat((1.0 + 0.3 * seed)[None], modules, axis=0).astype(dtype)
+        self._settle(modules)
+
+    def _settle(self, modules: int) -> None:
+        """Let the pattern form, with every band at phase zero.
+
+        Raises:
+            ConfigError: it does not become stationary.
+        """
         still, phasors = np.zeros((modules, 3)), np.ones((modules, 3), dtype=self._complex)
-        for _ in range(300):
-            self.step(still, phasors)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in range(300):
+                before = self.activity
+                self.step(still, phasors)
+            change = float(np.abs(self.activity - before).max())
+            peak = float(self.activity.max())
+        if not change <= 1e-3 * peak < np.inf:
+            raise ConfigError(
+                f"neural: the grid sheets do not settle (after 300 steps still a change of {change:.3g} at a peak of {peak:.3g}): "
+                f"the largest gain of a mode is {float(self._gains.max()):.3g}; lower kernel_gain_first or kernel_widths"
+            )
 
     def step(self, band_advance: NDArray[np.floating], band_phasors: NDArray[np.complexfloating]) -> None:
         """Advance by one time constant.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 
 import numpy as np
@@ -18,6 +19,9 @@ from hybridmap.neural.head_direction import HeadDirectionRing
 from hybridmap.neural.place import PlaceCells
 from hybridmap.neural.torus import LowModes, shift_sheets
 
+log = logging.getLogger(__name__)
+
+_LARGEST_STEP_M = 1000.0
 _PART_OF_WRAP = 0.1
 _WRAPS = np.array(sorted(((x, y) for x in range(-8, 9) for y in range(-8, 9)), key=lambda w: (w[0] ** 2 + w[1] ** 2, w)), float)
 
@@ -46,6 +50,7 @@ class PathIntegrator:
         self._decoder = PhaseDecoder(self.bands.wave_vectors, config.decode_box_m)
         self._last_decoded_m: Array = np.zeros(2)
         self._moves = 0
+        self._warned = False
         self.place.learn(self.grid.activity)
 
     def step(self, delta_robot: ArrayLike, dt_s: float) -> None:
@@ -57,11 +62,15 @@ class PathIntegrator:
             dt_s: seconds since the last step; the sheets' time constant is one step, so their dynamics do not need it.
 
         Raises:
-            StreamError: the displacement is not finite.
+            StreamError: the displacement is not finite, or more than a kilometre.
         """
         dx, dy, dyaw = (float(value) for value in np.asarray(delta_robot, dtype=np.float64))
         if not math.isfinite(dx + dy + dyaw):
             raise StreamError(f"self-motion: expected a finite displacement (dx, dy, dyaw), found ({dx}, {dy}, {dyaw})")
+        if math.hypot(dx, dy) > _LARGEST_STEP_M:
+            raise StreamError(
+                f"self-motion: expected at most {_LARGEST_STEP_M:g} m in one step, found {math.hypot(dx, dy):g} m"
+            )
         if dx == 0.0 and dy == 0.0 and dyaw == 0.0:
             return
         config = self.config
@@ -94,6 +103,11 @@ class PathIntegrator:
     def decode(self) -> Decoded:
         """Decode the position from all sheets together, with how well the modules agree."""
         decoded = self._decoder.decode(self.grid.band_phases(), self._last_decoded_m, self._attractor_starts)
+        if not decoded.agreed and not self._warned:
+            log.warning(
+                "the grid modules agree on no position (misfit %.2f cycles); the likeliest is used", decoded.misfit_cycles
+            )
+            self._warned = True
         self._last_decoded_m = decoded.position_m
         return decoded
 

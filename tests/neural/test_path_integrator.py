@@ -6,7 +6,7 @@ from neural_drives import arc, wander
 
 from hybridmap import geometry
 from hybridmap.config.neural import NeuralConfig
-from hybridmap.errors import StreamError
+from hybridmap.errors import ConfigError, StreamError
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.band import BandMotion
 from hybridmap.neural.torus import shift_sheets
@@ -152,6 +152,24 @@ def test_a_displacement_that_is_not_finite_is_refused():
     with pytest.raises(StreamError, match="finite"):
         integrator.step((np.nan, 0.0, 0.0), 0.1)
     assert np.array_equal(integrator.pose, before)
+
+
+def test_an_absurd_jump_is_refused_with_its_size():
+    with pytest.raises(StreamError, match="found 20000 m"):
+        PathIntegrator(NeuralConfig()).step((2e4, 0.0, 0.0), 0.1)
+
+
+def test_a_kernel_that_does_not_settle_is_named():
+    with pytest.raises(ConfigError, match="do not settle"):
+        PathIntegrator(NeuralConfig(kernel_widths=(3.0, 1.0)))
+
+
+def test_modules_that_disagree_are_reported(caplog):
+    integrator = PathIntegrator(NeuralConfig())
+    rng = np.random.default_rng(5)
+    integrator.grid.activity = shift_sheets(integrator.grid.activity, rng.uniform(size=(8, 2)))
+    assert not integrator.decode().agreed
+    assert "agree on no position" in caplog.text
 
 
 def test_velocities_are_integrated_by_the_midpoint():
