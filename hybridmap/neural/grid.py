@@ -114,7 +114,7 @@ class GridModules:
             peak = float(self.activity.max())
         if not change <= 1e-3 * peak < np.inf:
             raise ConfigError(
-                f"neural: the grid sheets do not settle (after 300 steps still a change of {change:.3g} at a peak of {peak:.3g}): "
+                f"neural: the grid sheets do not settle (change {change:.3g} at a peak of {peak:.3g} after 300 steps): "
                 f"the largest gain of a mode is {float(self._gains.max()):.3g}; lower kernel_gain_first or kernel_widths"
             )
 

@@ -37,6 +37,11 @@ class PathIntegrator:
     """
 
     def __init__(self, config: NeuralConfig) -> None:
+        """Make every population and let it settle at the origin.
+
+        Raises:
+            ConfigError: the grid sheets do not settle with this kernel.
+        """
         self.config = config
         dtype = np.dtype(config.dtype)
         self.spacings_m: NDArray[np.float64] = np.geomspace(config.spacing_min_m, config.spacing_max_m, config.modules)
