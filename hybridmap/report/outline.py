@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.export.keyframes import depth_points, laser_points
 from hybridmap.geometry import Array, transform_points
 from hybridmap.store import MapStore
-from hybridmap.streams.base import Camera, Laser, Rig
+from hybridmap.streams.base import Rig
 
 _HEIGHTS_M = (0.1, 2.0)
-_DEPTH_COLUMNS = 80
+_DEPTH_POINTS = 4000
 _MAX_DEPTH_M = 6.0
 _MAX_KEYFRAMES = 1500
 _PIXELS = 900
@@ -37,9 +38,12 @@ class Raster:
 def outline(keyframe: Mapping[str, NDArray[Any]], rig: Rig) -> Array:
     """Points (M, 2) of what a node saw, in `base_link`, m; empty where it saw nothing that can be drawn."""
     if "ranges_m" in keyframe and rig.laser is not None:
-        return _laser_points(keyframe["ranges_m"], rig.laser)
+        ends, returned = laser_points(keyframe, rig.laser)
+        return ends[returned]
     if "depth_mm" in keyframe and rig.camera is not None:
-        return _depth_points(keyframe["depth_mm"], rig.camera)
+        seen = depth_points(keyframe, rig.camera, _MAX_DEPTH_M).xyz
+        walls = seen[(seen[:, 2] > _HEIGHTS_M[0]) & (seen[:, 2] < _HEIGHTS_M[1]), :2]
+        return walls[:: max(1, len(walls) // _DEPTH_POINTS)]
     return np.zeros((0, 2))
 
 
@@ -68,23 +72,3 @@ def raster(points_of: Mapping[int, Array], poses: Array) -> Raster | None:
     strength = np.minimum(np.log1p(counts.T) / np.log1p(full), 1.0)
     grey = np.where(counts.T > 0, _FAINTEST + (1.0 - _FAINTEST) * strength, 0.0).astype(np.float32)
     return Raster(grey, (float(low[0]), float(top[0]), float(low[1]), float(top[1])))
-
-
-def _laser_points(ranges_m: NDArray[Any], laser: Laser) -> Array:
-    ranges = np.asarray(ranges_m, dtype=np.float64)
-    seen = np.isfinite(ranges) & (ranges >= laser.range_min_m) & (ranges < laser.range_max_m)
-    bearing, distance = laser.bearings_rad[seen], ranges[seen]
-    points = np.column_stack([distance * np.cos(bearing), distance * np.sin(bearing)])
-    return transform_points(laser.pose_base_laser, points)
-
-
-def _depth_points(depth_mm: NDArray[Any], camera: Camera) -> Array:
-    height, width = depth_mm.shape
-    step = max(1, width // _DEPTH_COLUMNS)
-    v, u = np.mgrid[0:height:step, 0:width:step]
-    depth = depth_mm[::step, ::step].astype(np.float64) / 1000.0
-    seen = (depth > 0) & (depth < _MAX_DEPTH_M)
-    u, v, z = u[seen] * (camera.width_px / width), v[seen] * (camera.height_px / height), depth[seen]
-    x, y = (u - camera.cx_px) / camera.fx_px * z, (v - camera.cy_px) / camera.fy_px * z
-    base = np.column_stack([x, y, z]) @ camera.T_base_camera[:3, :3].T + camera.T_base_camera[:3, 3]
-    return np.asarray(base[(base[:, 2] > _HEIGHTS_M[0]) & (base[:, 2] < _HEIGHTS_M[1]), :2])

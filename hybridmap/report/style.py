@@ -96,7 +96,7 @@ def draw_building(axes: Any, building: Raster | None, darkness: float = 0.55) ->
     if building is None:
         return
     axes.imshow(
-        building.grey * darkness, cmap="Greys", vmin=0.0, vmax=1.0, origin="lower", extent=building.extent, zorder=0,
+        np.ma.masked_equal(building.grey, 0.0) * darkness, cmap="Greys", vmin=0.0, vmax=1.0, origin="lower", extent=building.extent, zorder=1,
         interpolation="antialiased",
     )  # fmt: skip
 
