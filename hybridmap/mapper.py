@@ -78,7 +78,7 @@ class Mapper:
         self.integrator = PathIntegrator(config.neural)
         self.vision = create_front_end(config.vision, rig if rig is not None else rig_of(config.sensors), config.seed)
         self.backends = Ensemble(config.backends, self.clock)
-        self._synchroniser = Synchroniser()
+        self._synchroniser = Synchroniser(latency_s=config.sensors.latency_s)
         self._novelty = Novelty(config.nodes)
         self._stamp_ns = 0
         self._pose_odom_given: Array = IDENTITY

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import yaml
 
-from hybridmap.config import Config, named_configs
+from hybridmap.config import Config
 from hybridmap.errors import ConfigError
 from hybridmap.streams import open_stream
-from hybridmap.streams.base import Stream
+from hybridmap.streams.base import Rig, Stream
+from hybridmap.streams.open import world_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +55,13 @@ def choose(
         StreamError: the source cannot be opened.
         ConfigError: the configuration cannot be used.
     """
-    world = source.removeprefix("sim:")
-    if config_name is None and world in named_configs() and not Path(source).exists():
-        config_name = world
+    if config_name is None:
+        config_name = world_of(source)
     if config_name is None:
         probe = open_stream(source, Config.load(None, overrides), start_s=start_s, end_s=end_s)
-        config_name = "laser" if probe.rig.laser is not None else "rgbd"
+        if probe.rig == Rig():
+            overrides = {**overrides, "vision.sensor": "none"}
+        else:
+            config_name = "laser" if probe.rig.laser is not None else "rgbd"
     config = Config.load(config_name, overrides)
     return Chosen(open_stream(source, config, start_s=start_s, end_s=end_s), config)
