@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hybridmap.errors import StoreError
 
-VERSION = 2
+VERSION = 1
 """Raised whenever the tables change; a file of another version is refused."""
 
 APPLICATION_ID = 0x68796D70
