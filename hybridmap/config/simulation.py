@@ -58,7 +58,7 @@ class CameraConfig(Section):
     depth_noise_width_px: float = Field(default=1.0, ge=0)
     """Pixels (one sigma) over which the noise of depth is alike, as matching windows make it; 0: each pixel its own."""
     hole_fraction: float = Field(default=0.01, ge=0, lt=1)
-    """Share of the image that patches without depth cover, on average."""
+    """Share of the image that patches without depth cover."""
     exposure_change: float = Field(default=0.12, ge=0, lt=1)
     """Relative slow change of brightness."""
     color_noise: float = Field(default=1.5, ge=0)

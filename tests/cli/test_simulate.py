@@ -11,6 +11,7 @@ from hybridmap.cli import main
 from hybridmap.config import Config
 from hybridmap.streams import open_stream
 from hybridmap.streams.base import LaserScan
+from hybridmap.streams.simulated import world_names
 
 SHORT = ["--duration", "1", "--set", "simulation.camera.width_px=32", "--set", "simulation.camera.height_px=24"]
 
@@ -87,3 +88,8 @@ def test_it_refuses_to_overwrite(run, tmp_path):
     assert code == 2
     assert "--overwrite" in err
     assert run(*arguments, "--overwrite")[0] == 0
+
+
+def test_help_names_every_world(run):
+    text = " ".join(run("simulate", "--help")[1].split())
+    assert all(name in text for name in world_names())

@@ -126,10 +126,4 @@ class CameraModel:
         if self._config.hole_fraction <= 0.0:
             return np.zeros(shape, dtype=np.bool_)
         field = smooth_noise(rng, (shape[0], shape[1]), shape[1] / 28.0)
-        return np.asarray(field > _normal_quantile(1.0 - self._config.hole_fraction) * 0.8)
-
-
-def _normal_quantile(probability: float) -> float:
-    from statistics import NormalDist
-
-    return NormalDist().inv_cdf(probability)
+        return np.asarray(field > np.quantile(field, 1.0 - self._config.hole_fraction))

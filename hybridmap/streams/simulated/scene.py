@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
 from hybridmap.geometry import Array
-from hybridmap.streams.simulated.atlas import build_atlas
+from hybridmap.streams.simulated.atlas import Atlas, build_atlas
 from hybridmap.streams.simulated.light import bake
 from hybridmap.streams.simulated.surfaces import Surface, World
 
@@ -73,7 +74,6 @@ class Scene:
         normals: (S, 3) float32, unit, towards the painted side.
         px_per_m: (S,) float32, texels a metre.
         in_depth: (S,) bool, whether a depth camera sees the surface.
-        atlas: textures with light.
     """
 
     def __init__(self, world: World) -> None:
@@ -83,10 +83,16 @@ class Scene:
         self.normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
         self.px_per_m = np.array([s.px_per_m for s in surfaces], dtype=np.float32)
         self.in_depth = np.array([s.in_depth for s in surfaces])
+        self._world = world
+
+    @cached_property
+    def atlas(self) -> Atlas:
+        """Textures with the light on them; painted when a camera first looks."""
+        surfaces = self._world.surfaces
         shadow_makers = Caster([s for s in surfaces if not s.decal])
-        generators = np.random.default_rng(world.texture_seed).spawn(len(surfaces))
+        generators = np.random.default_rng(self._world.texture_seed).spawn(len(surfaces))
         lights = bake(surfaces, shadow_makers)
-        self.atlas = build_atlas(
+        return build_atlas(
             [
                 light.apply(s.paint(rng, texture_size(s), s.px_per_m))
                 for s, rng, light in zip(surfaces, generators, lights, strict=True)
