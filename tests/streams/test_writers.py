@@ -136,7 +136,7 @@ class Breaking:
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_failure_leaves_nothing_behind(name, stream, tmp_path):
     with pytest.raises(StreamError, match="broken off"):
-        WRITERS[name](Breaking(stream), tmp_path / name)
+        WRITERS[name](Breaking(stream), tmp_path / "new" / "deep" / name)
     assert not list(tmp_path.iterdir())
 
 

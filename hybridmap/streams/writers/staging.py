@@ -28,6 +28,7 @@ def staged(path: Path, *, overwrite: bool) -> Iterator[Path]:
     """
     _check(path, overwrite=overwrite)
     scratch = path.with_name(f".{path.name}.partial")
+    new_folders = [parent for parent in path.parents if not parent.exists()]
     try:
         _remove(scratch)
         scratch.mkdir(parents=True)
@@ -38,6 +39,9 @@ def staged(path: Path, *, overwrite: bool) -> Iterator[Path]:
         raise StreamError(f"{path}: cannot be written: {error.strerror or error}") from None
     finally:
         _remove(scratch)
+        for folder in new_folders:
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
 
 
 def _check(path: Path, *, overwrite: bool) -> None:
