@@ -31,7 +31,7 @@ class SolveReport:
         iterations: of the solver (sweeps for relaxation).
         chi2_initial, chi2: by the one referee, `backends.objective.chi2`, over all edges; never the solver's own cost.
         cpu_s: process time spent.
-        rejected_edge_ids: loop edges whose final weight is below 0.5.
+        rejected_edge_ids: loop edges held for false: of weight zero (GNC), or with a residual beyond the gate (kernels).
         weights: loop edge id -> final weight in [0, 1]; empty for back-ends without a robust kernel.
     """
 

@@ -109,7 +109,7 @@ def metrics_of(rows: Sequence[Row]) -> list[Metric]:
             ("chi2", report.chi2, "1", "sum of squared Mahalanobis residuals after, over all edges"),
             ("iterations", float(report.iterations), "1", "iterations, sweeps or updates"),
             ("cpu_s", report.cpu_s, "s", "process time"),
-            ("rejected_loops", float(len(report.rejected_edge_ids)), "1", "loop edges with a final weight below one half"),
+            ("rejected_loops", float(len(report.rejected_edge_ids)), "1", "loop edges that the back-end holds for false"),
         )
         metrics += [Metric(f"{measure}/{row.backend}", value, unit, text) for measure, value, unit, text in figures]
     return metrics

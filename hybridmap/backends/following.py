@@ -21,13 +21,21 @@ from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a solver says: poses (N, 3), why it stopped, loop edge id -> final weight."""
+    """What a solver says.
+
+    Attributes:
+        poses: (N, 3).
+        status, message, iterations: why it stopped, and when.
+        weights: loop edge id -> final weight.
+        rejected: loops held for false.
+    """
 
     poses: Array
     status: SolveStatus
     message: str
     iterations: int
     weights: dict[int, float] = field(default_factory=dict)
+    rejected: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +105,7 @@ class GraphBackend(ABC):
         self._graph: PoseGraph | None = None
         self._poses: Array = np.zeros((0, 3))
         self._weights: dict[int, float] = {}
+        self._rejected: tuple[int, ...] = ()
 
     @property
     def name(self) -> str:
@@ -112,8 +121,10 @@ class GraphBackend(ABC):
         if self._must_work(change):
             outcome = self._guarded(graph, start, change)
         else:
-            outcome = Outcome(start, SolveStatus.CONVERGED, "extended by odometry", 0, self._weights)
-        self._graph, self._poses, self._weights = graph, outcome.poses, outcome.weights
+            message = "extended by odometry"
+            outcome = Outcome(start, SolveStatus.CONVERGED, message, 0, self._weights, self._rejected)
+        self._graph, self._poses = graph, outcome.poses
+        self._weights, self._rejected = outcome.weights, outcome.rejected
         return self._solution(graph, start, outcome, started)
 
     def finish(self, graph: PoseGraph) -> Solution:
@@ -176,7 +187,7 @@ class GraphBackend(ABC):
         """Refuse what is not finite, and bring node 0 back to where it is fixed."""
         if not np.isfinite(outcome.poses).all():
             message = "poses were not finite; kept those before"
-            return Outcome(start, SolveStatus.DIVERGED, message, outcome.iterations, outcome.weights)
+            return Outcome(start, SolveStatus.DIVERGED, message, outcome.iterations)
         if np.array_equal(outcome.poses[0], graph.initial[0]):
             return outcome
         poses = compose(graph.initial[0], between(outcome.poses[0], outcome.poses))
@@ -193,7 +204,7 @@ class GraphBackend(ABC):
             chi2_initial=final if outcome.poses is start else chi2(graph, start),
             chi2=final,
             cpu_s=time.process_time() - started,
-            rejected_edge_ids=tuple(edge for edge, weight in outcome.weights.items() if weight < 0.5),
+            rejected_edge_ids=outcome.rejected,
             weights=outcome.weights,
         )
         return Solution(outcome.poses, report)

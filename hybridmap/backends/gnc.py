@@ -7,43 +7,51 @@ quantised so that noise models are shared, and loops of weight zero left out of 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_law
 
 from hybridmap.backends.base import Solution, SolveStatus
 from hybridmap.backends.batch import run
 from hybridmap.backends.factors import NoiseModels, anchor, factors, poses_of, values
 from hybridmap.backends.following import GraphBackend, Outcome, prefix
 from hybridmap.backends.objective import squared_norms
-from hybridmap.backends.robust import cauchy
-from hybridmap.config.backends import GncConfig
+from hybridmap.backends.robust import gate_of, with_kernel
+from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.connectivity import extend
 from hybridmap.graph.pose_graph import PoseGraph
 
-_LEVELS = 16  # of a quantised weight
+_STEP = 0.5  # of a quantised weight's logarithm to the base 2
+_PATIENT, _NEAR_FIRST = 1e-4, 3e-2  # least weight of a loop that takes part in a round
+_SLACK = 4.0  # of the bound over the unit variance, where files overstate their noise
 
 
 @dataclass(frozen=True, slots=True)
-class _Result:
-    """Poses, weight of each loop (L,), rounds, and the truncated cost that the method minimises."""
+class Truncated:
+    """What an annealing came to.
+
+    Attributes:
+        poses: (N, 3).
+        kept: (L,) which loops are inliers.
+        rounds: steps and iterations taken.
+        bound: squared residual from which a loop counted as an outlier at the end.
+    """
 
     poses: Array
-    weights: Array
+    kept: NDArray[np.bool_]
     rounds: int
-    cost: float
+    bound: float
 
 
 class _Problem:
     """One graph's factors, made once; a round puts them together with the loops' current weights."""
 
-    def __init__(self, graph: PoseGraph, bound: float) -> None:
-        self.graph, self.bound = graph, bound
+    def __init__(self, graph: PoseGraph) -> None:
+        self.graph = graph
         self.loops = np.flatnonzero(graph.is_loop)
         whole = factors(graph, NoiseModels())
         self._known = gtsam.NonlinearFactorGraph()
@@ -57,22 +65,17 @@ class _Problem:
         """Squared residual of each loop."""
         return squared_norms(self.graph, poses)[self.loops]
 
-    def cost(self, poses: Array) -> float:
-        """Quadratic on known inliers, truncated at the bound on loops."""
-        every = squared_norms(self.graph, poses)
-        every[self.loops] = np.minimum(every[self.loops], self.bound)
-        return float(every.sum())
-
-    def weighted(self, weights: Array) -> Any:
-        """Factor graph in which each loop's information is multiplied by its weight."""
+    def weighted(self, weights: Array, negligible: float = 0.0) -> Any:
+        """Factor graph in which each loop's information is multiplied by its weight; loops below `negligible` are out."""
         out = gtsam.NonlinearFactorGraph(self._known)
-        levels = np.round(weights * _LEVELS).astype(int)
-        for i, level in enumerate(levels.tolist()):
-            if level == _LEVELS:
+        with np.errstate(divide="ignore"):
+            quantised = np.where(weights < negligible, 0.0, 2.0 ** (np.round(np.log2(weights) / _STEP) * _STEP))
+        for i, weight in enumerate(quantised.tolist()):
+            if weight == 1.0:
                 out.push_back(self._loop_factors[i])
-            elif level > 0:
+            elif weight > 0.0:
                 edge = self.loops[i]
-                model = self._models(self.graph.information[edge] * (level / _LEVELS), loop=False)
+                model = self._models(self.graph.information[edge] * weight, loop=False)
                 ends = int(self.graph.sources[edge]), int(self.graph.targets[edge])
                 out.push_back(gtsam.BetweenFactorPose2(*ends, gtsam.Pose2(*self.graph.deltas[edge]), model))
         return out
@@ -85,36 +88,63 @@ def truncated_weights(squared: Array, mu: float, bound: float) -> Array:
     return np.asarray(np.where(inside, 1.0, np.where(outside, 0.0, np.clip(between_, 0.0, 1.0))))
 
 
-def graduate(graph: PoseGraph, start: Array, config: GncConfig, max_iterations: int) -> _Result:
-    """Anneal from nearly convex to truncated, one optimiser step a round; then settle on the binary set."""
-    problem = _Problem(graph, float(chi2_law.ppf(config.quantile, df=3)))
-    bound, poses = problem.bound, start
+def truncated_cost(graph: PoseGraph, poses: Array, bound: float) -> float:
+    """What is minimised: chi2 with the squared residual of each loop cut off at the bound."""
+    every = squared_norms(graph, poses)
+    return float(np.where(graph.is_loop, np.minimum(every, bound), every).sum())
+
+
+def graduate(graph: PoseGraph, start: Array, config: BackendsConfig, negligible: float) -> Truncated:
+    """Anneal from nearly convex to truncated, one optimiser step a round; then settle on the set of inliers.
+
+    Args:
+        graph: connected by its known inliers.
+        start: (N, 3) poses.
+        config: schedule, gate, most iterations of each full solve at the end.
+        negligible: loops of less weight sit a round out. A small value lets far loops pull from the first round, a
+            larger one lets those that nearly agree go first: neither is better on every graph.
+    """
+    problem = _Problem(graph)
+    bound, poses = gate_of(config), start
     squared = problem.squared(poses)
     largest = float(squared.max(initial=0.0))
-    mu = bound / (2.0 * largest - bound) if 2.0 * largest > 2.0 * bound else np.inf
+    mu = bound / (2.0 * largest - bound) if largest > bound else np.inf
     rounds = 0
-    while np.isfinite(mu) and rounds < config.max_rounds:
+    while np.isfinite(mu) and rounds < config.gnc.max_rounds:
         weights = truncated_weights(squared, mu, bound)
-        poses = _step(problem.weighted(weights), poses)
+        poses = _step(problem.weighted(weights, negligible), poses)
         squared = problem.squared(poses)
         rounds += 1
-        if mu > 1e3 or np.all((weights < 0.5 / _LEVELS) | (weights > 1.0 - 0.5 / _LEVELS)):
+        if mu > 1.0 and np.all((weights < negligible) | (weights > 0.9)):
             break
-        mu *= config.mu_factor
-    return _settle(problem, poses, rounds, max_iterations)
+        mu *= config.gnc.mu_factor
+    settled = _settle(problem, poses, bound, config.max_iterations)
+    honest = min(1.0, _SLACK * unit_variance(graph, settled)) * bound
+    if honest < bound:
+        settled = _settle(problem, settled.poses, honest, config.max_iterations)
+    return replace(settled, rounds=rounds + settled.rounds)
 
 
-def _settle(problem: _Problem, poses: Array, rounds: int, max_iterations: int) -> _Result:
+def unit_variance(graph: PoseGraph, result: Truncated) -> float:
+    """Chi2 of the inliers per degree of freedom: 1 where the stated noise is the true one; 1 where there is no redundancy."""
+    inlier = np.ones(graph.n_edges, dtype=bool)
+    inlier[np.flatnonzero(graph.is_loop)] = result.kept
+    freedom = 3 * (int(inlier.sum()) - graph.n_nodes + 1)
+    return float(squared_norms(graph, result.poses)[inlier].sum()) / freedom if freedom > 0 else 1.0
+
+
+def _settle(problem: _Problem, poses: Array, bound: float, max_iterations: int) -> Truncated:
     """A few full solves with the set of inliers, until it no longer changes."""
-    keep: NDArray[np.bool_] = problem.squared(poses) <= problem.bound
+    keep: NDArray[np.bool_] = problem.squared(poses) <= bound
+    rounds = 0
     for _ in range(8):
         outcome = run("lm", problem.weighted(keep.astype(np.float64)), poses, max_iterations)
         poses, rounds = outcome.poses, rounds + outcome.iterations
-        again = problem.squared(poses) <= problem.bound
+        again = problem.squared(poses) <= bound
         if np.array_equal(again, keep):
             break
         keep = again
-    return _Result(poses, keep.astype(np.float64), rounds, problem.cost(poses))
+    return Truncated(poses, keep, rounds, bound)
 
 
 def _step(factor_graph: Any, poses: Array) -> Array:
@@ -126,53 +156,63 @@ def _step(factor_graph: Any, poses: Array) -> Array:
     return moved if np.isfinite(moved).all() else poses
 
 
-def grow(graph: PoseGraph, config: GncConfig, max_iterations: int) -> _Result:
+def grow(graph: PoseGraph, config: BackendsConfig, negligible: float) -> Truncated:
     """Solve the graph chunk by chunk, extending by odometry; loops rejected before compete again in every chunk."""
-    poses = graph.initial[:1]
-    result = None
-    rounds = 0
-    for end in [*range(config.chunk_nodes, graph.n_nodes, config.chunk_nodes), graph.n_nodes]:
+    poses, rounds = graph.initial[:1], 0
+    for end in range(config.gnc.chunk_nodes, graph.n_nodes, config.gnc.chunk_nodes):
         part = prefix(graph, end)
-        result = graduate(part, extend(part, poses), config, max_iterations)
+        result = graduate(part, extend(part, poses), config, negligible)
         poses, rounds = result.poses, rounds + result.rounds
-    assert result is not None
-    return _Result(result.poses, result.weights, rounds, result.cost)
+    last = graduate(graph, extend(graph, poses), config, negligible)
+    return replace(last, rounds=rounds + last.rounds)
 
 
 class GncBackend(GraphBackend):
     """`gtsam-gnc`: Cauchy on the loops while driving, graduated non-convexity on the whole graph at the end."""
 
     def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
-        return cauchy(graph, start, self._config)
+        return with_kernel("gtsam-cauchy", graph, start, self._config)
 
     def finish(self, graph: PoseGraph) -> Solution:
         """See `Backend.finish`: as `solve`, with the map at the end of the drive as one more start."""
-        self.update(graph)
-        return self._timed(graph, lambda: self._best(graph, self._poses))
+        driven = self.update(graph).poses
+        return self._timed(graph, lambda: self._best(graph, driven))
 
     def _solve_whole(self, graph: PoseGraph) -> Outcome:
         return self._best(graph, None)
 
     def _best(self, graph: PoseGraph, driven: Array | None) -> Outcome:
-        """Run the configured starts; the lowest truncated cost wins, and one that keeps every loop ends the search."""
-        config, limit = self._config.gnc, self._config.max_iterations
-        starts: dict[str, Callable[[], _Result]] = {}
+        """Run the configured starts; one that keeps every loop ends the search, else the lowest truncated cost wins.
+
+        Costs are compared at the tightest bound that any start ended with: files that overstate their noise would
+        otherwise prefer a false loop that happens to be consistent.
+        """
+        results: dict[str, Truncated] = {}
+        for name, attempt in self._attempts(graph, driven).items():
+            results[name] = attempt()
+            if results[name].kept.all():
+                return self._verdict(graph, results[name], name)
+        bound = min(result.bound for result in results.values())
+        costs = {name: truncated_cost(graph, result.poses, bound) for name, result in results.items()}
+        best = min(costs, key=costs.__getitem__)
+        return self._verdict(graph, results[best], best)
+
+    def _attempts(self, graph: PoseGraph, driven: Array | None) -> dict[str, Callable[[], Truncated]]:
+        config = self._config
+        if config.gnc.start == "batch":
+            return {"batch": lambda: graduate(graph, graph.initial, config, _PATIENT)}
+        attempts: dict[str, Callable[[], Truncated]] = {}
         if driven is not None:
-            starts["driven"] = lambda: graduate(graph, driven, config, limit)
-        starts["cauchy"] = lambda: graduate(graph, cauchy(graph, graph.initial, self._config).poses, config, limit)
-        starts["batch"] = lambda: graduate(graph, graph.initial, config, limit)
-        starts["grow"] = lambda: grow(graph, config, limit)
-        wanted = starts if config.start == "auto" else {config.start: starts[config.start]}
-        best, best_name = None, ""
-        for name, attempt in wanted.items():
-            result = attempt()
-            if best is None or result.cost < best.cost:
-                best, best_name = result, name
-            if np.all(best.weights > 0.5):
-                break
-        assert best is not None
+            attempts["drive"] = lambda: graduate(graph, driven, config, _PATIENT)
+        attempts["grown"] = lambda: grow(graph, config, _PATIENT)
+        if config.gnc.start == "auto":
+            attempts["grown, near loops first"] = lambda: grow(graph, config, _NEAR_FIRST)
+        return attempts
+
+    def _verdict(self, graph: PoseGraph, result: Truncated, start: str) -> Outcome:
         loops = graph.edge_ids[graph.is_loop].tolist()
-        weights = dict(zip(loops, best.weights.tolist(), strict=True))
-        lost = int(np.sum(best.weights < 0.5))
-        message = f"gnc: {lost} of {len(loops)} loops rejected (start: {best_name})"
-        return Outcome(best.poses, SolveStatus.CONVERGED, message, best.rounds, weights)
+        weights = dict(zip(loops, result.kept.astype(np.float64).tolist(), strict=True))
+        rejected = tuple(edge for edge, weight in weights.items() if weight == 0.0)
+        variance = unit_variance(graph, result)
+        message = f"gnc: {len(rejected)} of {len(loops)} loops rejected (start: {start}; unit variance {variance:.3g})"
+        return Outcome(result.poses, SolveStatus.CONVERGED, message, result.rounds, weights, rejected)

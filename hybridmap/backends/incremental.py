@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from hybridmap.backends.base import Solution, SolveStatus
 from hybridmap.backends.factors import NoiseModels, anchor, factors, poses_of, values
 from hybridmap.backends.following import Change, GraphBackend, Outcome, difference, prefix, with_edges
-from hybridmap.backends.robust import kernel_models, loop_weights
+from hybridmap.backends.robust import gate_of, judged, kernel_models
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.connectivity import extend
@@ -106,10 +106,10 @@ class Isam2Backend(GraphBackend):
 
     def _outcome(self, smoother: Smoother, graph: PoseGraph, updates: int) -> Outcome:
         poses = smoother.poses()
-        weights: dict[int, float] = {}
-        if _robust(self._config):
-            weights = loop_weights(kernel_models("gtsam-cauchy", self._config.robust)[0], graph, poses)
-        return Outcome(poses, SolveStatus.CONVERGED, f"isam2: {updates} updates", updates, weights)
+        outcome = Outcome(poses, SolveStatus.CONVERGED, f"isam2: {updates} updates", updates)
+        if not _robust(self._config):
+            return outcome
+        return judged(outcome, kernel_models("gtsam-cauchy", self._config.robust)[0], graph, gate_of(self._config))
 
 
 def _closing_nodes(graph: PoseGraph) -> list[int]:

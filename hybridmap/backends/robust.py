@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import gtsam
 import numpy as np
+from scipy.stats import chi2 as chi2_law
 
 from hybridmap.backends.batch import run
 from hybridmap.backends.factors import NoiseModels, factor_graph
@@ -29,27 +31,28 @@ def kernel_models(name: str, config: RobustConfig) -> tuple[Any, NoiseModels]:
     return kernel, NoiseModels(lambda base: gtsam.noiseModel.Robust.Create(kernel, base))
 
 
-def loop_weights(kernel: Any, graph: PoseGraph, poses: Array) -> dict[int, float]:
-    """Loop edge id -> the kernel's weight of its residual, in [0, 1]."""
+def judged(outcome: Outcome, kernel: Any, graph: PoseGraph, gate: float) -> Outcome:
+    """The outcome with each loop's weight, and with the loops whose squared residual is beyond the gate rejected."""
     loops = graph.is_loop
-    distance = np.sqrt(squared_norms(graph, poses)[loops])
-    return {int(e): float(kernel.weight(d)) for e, d in zip(graph.edge_ids[loops], distance, strict=True)}
+    ids, squared = graph.edge_ids[loops], squared_norms(graph, outcome.poses)[loops]
+    weights = {int(edge): float(kernel.weight(distance)) for edge, distance in zip(ids, np.sqrt(squared), strict=True)}
+    return replace(outcome, weights=weights, rejected=tuple(ids[squared > gate].tolist()))
 
 
-def cauchy(graph: PoseGraph, start: Array, config: BackendsConfig) -> Outcome:
-    """Levenberg-Marquardt with Cauchy on loops, from given poses; weights in the outcome."""
-    return _with_kernel("gtsam-cauchy", graph, start, config)
+def gate_of(config: BackendsConfig) -> float:
+    """Squared residual from which a loop is held for false: the configured quantile of chi2 with 3 degrees of freedom."""
+    return float(chi2_law.ppf(config.gnc.quantile, df=3))
 
 
-def _with_kernel(name: str, graph: PoseGraph, start: Array, config: BackendsConfig) -> Outcome:
+def with_kernel(name: str, graph: PoseGraph, start: Array, config: BackendsConfig) -> Outcome:
+    """Levenberg-Marquardt with a back-end's kernel on loops, from given poses (N, 3)."""
     kernel, models = kernel_models(name, config.robust)
     outcome = run("lm", factor_graph(graph, models), start, config.max_iterations)
-    weights = loop_weights(kernel, graph, outcome.poses)
-    return Outcome(outcome.poses, outcome.status, outcome.message, outcome.iterations, weights)
+    return judged(outcome, kernel, graph, gate_of(config))
 
 
 class KernelBackend(GraphBackend):
     """`gtsam-cauchy`, `gtsam-huber`, `gtsam-dcs`."""
 
     def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
-        return _with_kernel(self._name, graph, start, self._config)
+        return with_kernel(self._name, graph, start, self._config)

@@ -30,9 +30,9 @@ class RelaxationConfig(Section):
 class GncConfig(Section):
     """Graduated non-convexity (truncated least squares) on the loop edges; other edges are known inliers."""
 
-    start: Literal["auto", "cauchy", "batch", "grow"] = "auto"
-    """`batch` starts at the graph's initial poses, `cauchy` at a Cauchy solution from there, `grow` adds the nodes by chunks;
-    `auto` tries them all, at the end of a drive its map too, and takes the lowest truncated cost."""
+    start: Literal["auto", "batch", "grow"] = "auto"
+    """`batch` anneals the whole graph from its initial poses, `grow` adds the nodes by chunks, `auto` grows in two ways (and
+    starts from the map at the end of a drive, where there is one) and takes the lowest truncated cost."""
     chunk_nodes: int = Field(default=500, ge=10)
     """`grow`: nodes a chunk."""
     mu_factor: float = Field(default=4.0, gt=1)

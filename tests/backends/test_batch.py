@@ -102,7 +102,9 @@ def test_a_node_that_hangs_on_nothing_is_named(name):
 
 def test_one_node_alone_is_a_map():
     graph, _ = laps(np.random.default_rng(0), nodes=2)
-    alone = replace(graph, **{n: getattr(graph, n)[:0] for n in ("sources", "targets", "deltas", "information", "kinds", "edge_ids")})
+    alone = replace(
+        graph, **{n: getattr(graph, n)[:0] for n in ("sources", "targets", "deltas", "information", "kinds", "edge_ids")}
+    )
     alone = replace(alone, initial=graph.initial[:1])
     for name in backends.names():
         solution = backends.create(name).solve(alone)

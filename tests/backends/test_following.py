@@ -1,0 +1,157 @@
+"""Following a graph while it grows: cheap when nothing closes, equal to a whole solve in the end, exact after a failure."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from graphs_for_tests import laps
+
+from hybridmap import backends
+from hybridmap.backends.following import difference, prefix, with_edges
+from hybridmap.backends.objective import chi2
+from hybridmap.config.backends import BackendsConfig, Isam2Config
+from hybridmap.errors import BackendError, GraphError
+from hybridmap.geometry import between, compose
+from hybridmap.graph.pose_graph import EdgeKind
+
+FOLLOWERS = ["gtsam-lm", "gtsam-cauchy", "gtsam-gnc", "gtsam-isam2", "relaxation-ratslam", "odometry"]
+
+
+@pytest.mark.parametrize("name", FOLLOWERS)
+def test_a_node_on_odometry_alone_is_the_last_pose_and_its_edge(name):
+    graph, _ = laps(np.random.default_rng(0), nodes=31)
+    backend = backends.create(name)
+    before = backend.update(prefix(graph, 20)).poses
+    edge = int(np.flatnonzero((graph.sources == 19) & (graph.targets == 20))[0])
+    only_odometry = prefix(with_edges(graph, graph.kinds == EdgeKind.ODOMETRY), 21)
+    after = backend.update(only_odometry)
+    assert np.allclose(after.poses[20], compose(before[19], graph.deltas[edge]), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["gtsam-lm", "gtsam-gn", "gtsam-dogleg", "gtsam-isam2"])
+def test_a_replay_ends_at_the_optimum_of_the_whole(name):
+    graph, _ = laps(np.random.default_rng(4), nodes=90)
+    solutions = list(backends.replay(backends.create(name), graph))
+    assert [len(s.poses) for s in solutions] == list(range(1, 91))
+    assert solutions[-1].report.chi2 == pytest.approx(backends.create(name).solve(graph).report.chi2, rel=1e-3)
+    assert all(np.isfinite(s.poses).all() for s in solutions)
+
+
+@pytest.mark.parametrize("name", ["gtsam-lm", "gtsam-isam2", "gtsam-cauchy"])
+def test_taking_a_false_loop_out_returns_to_the_clean_optimum(name):
+    graph, _ = laps(np.random.default_rng(4), nodes=60)
+    false = replace(
+        graph,
+        sources=np.append(graph.sources, 55),
+        targets=np.append(graph.targets, 10),
+        deltas=np.concatenate([graph.deltas, [[0.2, 0.0, 0.1]]]),
+        information=np.concatenate([graph.information, graph.information[:1]]),
+        kinds=np.append(graph.kinds, np.int8(EdgeKind.LOOP)),
+        edge_ids=np.append(graph.edge_ids, graph.edge_ids[-1] + 1),
+    )
+    backend = backends.create(name)
+    clean = backend.update(graph)
+    disturbed = backend.update(false)
+    again = backend.update(graph)
+    assert np.abs(between(clean.poses, disturbed.poses)).max() > (1e-3 if name != "gtsam-cauchy" else 1e-5)
+    assert again.report.chi2 == pytest.approx(clean.report.chi2, rel=1e-3)
+    assert np.abs(between(clean.poses, again.poses)).max() < 2e-3
+
+
+@pytest.mark.parametrize("name", FOLLOWERS)
+def test_a_damaged_update_leaves_the_state_before_it(name):
+    graph, _ = laps(np.random.default_rng(1), nodes=50)
+    undisturbed, backend = backends.create(name), backends.create(name)
+    for nodes in (20, 40):
+        undisturbed.update(prefix(graph, nodes))
+        backend.update(prefix(graph, nodes))
+    deltas = graph.deltas.copy()
+    deltas[-1, 0] = np.nan
+    with pytest.raises(GraphError):
+        backend.update(replace(graph, deltas=deltas))
+    assert backend.update(graph).poses.tobytes() == undisturbed.update(graph).poses.tobytes()
+
+
+def test_isam2_recovers_from_an_exception_inside_the_solver(monkeypatch):
+    graph, _ = laps(np.random.default_rng(1), nodes=60)
+    backend = backends.create("gtsam-isam2")
+    kept = backend.update(prefix(graph, 40)).poses
+
+    def fail(*_):
+        raise RuntimeError("Indeterminate linear system\nmore words")
+
+    from hybridmap.backends.incremental import Smoother
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Smoother, "follow", fail)
+        with pytest.raises(BackendError, match=r"gtsam-isam2: the solver gave up: Indeterminate linear system$"):
+            backend.update(prefix(graph, 50))
+    repeated = backend.update(prefix(graph, 40)).poses
+    assert np.array_equal(repeated, kept)
+    best = backends.create("gtsam-lm").solve(graph).report.chi2
+    assert backend.update(graph).report.chi2 == pytest.approx(best, rel=1e-2)
+
+
+def test_what_is_new_and_what_is_gone_is_found_by_number_and_content():
+    graph, _ = laps(np.random.default_rng(0), nodes=30)
+    assert not difference(graph, graph).closes
+    grown = difference(prefix(graph, 15), prefix(graph, 16))
+    assert len(grown.added) == 1
+    assert not grown.closes
+    assert difference(prefix(graph, 25), prefix(graph, 26)).closes
+    fewer = difference(graph, with_edges(graph, np.arange(graph.n_edges) != 7))
+    assert fewer.removed.tolist() == [7]
+    assert fewer.closes
+    deltas = graph.deltas.copy()
+    deltas[7, 0] += 0.1
+    changed = difference(graph, replace(graph, deltas=deltas))
+    assert (changed.added.tolist(), changed.removed.tolist(), changed.closes) == ([7], [7], True)
+
+
+def test_a_second_chain_edge_of_a_new_node_waits_for_the_next_closure():
+    graph, _ = laps(np.random.default_rng(0), nodes=21)
+    chain_only = prefix(graph, 18)
+    both = replace(
+        chain_only,
+        sources=np.append(chain_only.sources, 15),
+        targets=np.append(chain_only.targets, 17),
+        deltas=np.concatenate([chain_only.deltas, [compose(graph.deltas[15], graph.deltas[16])]]),
+        information=np.concatenate([chain_only.information, graph.information[:1]]),
+        kinds=np.append(chain_only.kinds, np.int8(EdgeKind.REGISTRATION)),
+        edge_ids=np.append(chain_only.edge_ids, 999),
+    )
+    assert not difference(prefix(graph, 17), both).closes
+
+
+def test_a_loop_committed_late_is_replayed_late():
+    graph, _ = laps(np.random.default_rng(0), nodes=40)
+    entered = graph.entry_nodes.copy()
+    late = int(np.flatnonzero(graph.is_loop)[0])
+    entered[late] = 35
+    dated = replace(graph, entered=entered)
+    assert graph.edge_ids[late] not in prefix(dated, 35).edge_ids
+    assert graph.edge_ids[late] in prefix(dated, 36).edge_ids
+
+
+def test_a_graph_that_shrinks_is_refused():
+    graph, _ = laps(np.random.default_rng(0), nodes=30)
+    backend = backends.create("gtsam-lm")
+    backend.update(graph)
+    with pytest.raises(BackendError, match="shrank from 30 to 20"):
+        backend.update(prefix(graph, 20))
+
+
+def test_the_end_of_a_drive_is_no_worse_than_the_drive():
+    graph, _ = laps(np.random.default_rng(6), nodes=45)
+    for name in backends.names():
+        backend = backends.create(name)
+        *_, last = backends.replay(backend, graph)
+        assert backend.finish(graph).report.chi2 <= last.report.chi2 * 1.01, name
+
+
+def test_isam2_takes_a_kernel_on_loops_when_told_so():
+    graph, _ = laps(np.random.default_rng(4), nodes=60)
+    config = BackendsConfig(isam2=Isam2Config(loop_kernel="cauchy"))
+    robust = backends.create("gtsam-isam2", config).solve(graph)
+    assert set(robust.report.weights) == set(graph.edge_ids[graph.is_loop].tolist())
+    assert robust.report.chi2 >= chi2(graph, backends.create("gtsam-lm").solve(graph).poses)

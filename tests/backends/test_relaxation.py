@@ -1,0 +1,140 @@
+"""The paper's rule, its stable relative and RatSLAM's: the laws each of them keeps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from graphs_for_tests import graph_of, laps
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hybridmap import backends
+from hybridmap.backends.ratslam import LinkSweep, link_order
+from hybridmap.backends.relaxation import LinearRule, lambda_max, relax
+from hybridmap.config.backends import BackendsConfig, RelaxationConfig
+from hybridmap.geometry import wrap_angle
+from hybridmap.graph.pose_graph import EdgeKind
+
+
+def configured(**settings_):
+    return BackendsConfig(relaxation=RelaxationConfig(**settings_))
+
+
+def star(degree):
+    truth = np.array([[0.0, 0.0, 0.0]] + [[np.cos(a), np.sin(a), a] for a in np.linspace(0, 6, degree)])
+    pairs = [(0, k, EdgeKind.ODOMETRY) for k in range(1, degree + 1)]
+    pairs += [(k, k + 1, EdgeKind.LOOP) for k in range(1, degree)]
+    return graph_of(truth, pairs, np.random.default_rng(0), noise=3.0)
+
+
+def printed_rule(graph, positions, theta):
+    """Equation 16, node by node as it stands in the paper."""
+    yaw = graph.initial[:, 2]
+    moved = positions.copy()
+    for i in range(graph.n_nodes):
+        for e in range(graph.n_edges):
+            s, t = graph.sources[e], graph.targets[e]
+            c, sn = np.cos(yaw[s]), np.sin(yaw[s])
+            step = np.array([[c, -sn], [sn, c]]) @ graph.deltas[e, :2]
+            if s == i:
+                moved[i] += theta * (positions[t] - positions[i] - step)
+            if t == i:
+                moved[i] += theta * (positions[s] - positions[i] + step)
+    return moved
+
+
+def one_by_one(graph, poses, theta):
+    """RatSLAM's sweep, link by link in place."""
+    poses = poses.copy()
+    for e in link_order(graph):
+        s, t = graph.sources[e], graph.targets[e]
+        dx, dy, turn = graph.deltas[e]
+        c, sn = np.cos(poses[s, 2]), np.sin(poses[s, 2])
+        apart = poses[t, :2] - poses[s, :2] - [c * dx - sn * dy, sn * dx + c * dy]
+        poses[s, :2] += theta * apart
+        poses[t, :2] -= theta * apart
+        error = wrap_angle(poses[t, 2] - poses[s, 2] - turn)
+        poses[s, 2] += theta * error
+        poses[t, 2] -= theta * error
+    poses[:, 2] = wrap_angle(poses[:, 2])
+    return poses
+
+
+def test_a_sweep_of_the_paper_s_rule_is_equation_16():
+    graph, _ = laps(np.random.default_rng(0), nodes=45)
+    start = graph.initial[:, :2] + np.random.default_rng(1).normal(size=(45, 2))
+    swept, _ = relax(LinearRule.of(graph), start, 0.1, 1, 0.0)
+    assert np.allclose(swept, printed_rule(graph, start, 0.1), atol=1e-12)
+
+
+@pytest.mark.parametrize("theta", [0.5, 0.2])
+def test_a_sweep_of_ratslam_s_rule_is_the_loop_over_links(theta):
+    graph, _ = laps(np.random.default_rng(0), nodes=80, noise=3.0)
+    poses = swept = graph.initial
+    sweep = LinkSweep(graph, theta)
+    for _ in range(5):
+        poses, swept = one_by_one(graph, poses, theta), sweep(swept)
+    assert np.allclose(wrap_angle(swept - poses), 0.0, atol=1e-10)
+
+
+@given(st.integers(0, 10_000), st.floats(0.05, 1.0))
+@settings(max_examples=20, deadline=None)
+def test_the_normalised_rule_never_raises_its_objective(seed, theta):
+    rng = np.random.default_rng(seed)
+    graph, _ = laps(rng, nodes=40, noise=10.0)
+    rule = LinearRule.of(graph)
+    positions = graph.initial[:, :2] + rng.normal(size=(40, 2))
+    rate = theta / rule.degree[:, None]
+    for _ in range(10):
+        after, _ = relax(rule, positions, rate, 1, 0.0)
+        assert rule.objective(after) <= rule.objective(positions) * (1 + 1e-12)
+        positions = after
+
+
+@pytest.mark.parametrize("make", [lambda: laps(np.random.default_rng(0), nodes=100)[0], lambda: star(50)])
+def test_theta_max_is_where_the_paper_s_rule_turns_unstable(make):
+    graph = make()
+    theta_max = 2.0 / lambda_max(LinearRule.of(graph).laplacian)
+    start = graph.initial + np.random.default_rng(0).normal(size=graph.initial.shape) * [1, 1, 0]
+    statuses = {}
+    for factor in (0.99, 1.01):
+        config = configured(theta=factor * theta_max, solve_sweeps=4000)
+        statuses[factor] = backends.create("relaxation-paper", config).solve(replace(graph, initial=start)).report
+    assert statuses[0.99].status != "diverged"
+    assert statuses[1.01].status == "diverged"
+    assert f"{theta_max:.4g}" in statuses[1.01].message
+
+
+def test_the_paper_s_theta_diverges_and_leaves_the_map_as_it_was():
+    graph = star(50)
+    for choice in ("run", "refuse"):
+        solution = backends.create("relaxation-paper", configured(theta=0.5, on_unstable=choice)).solve(graph)
+        assert solution.report.status == "diverged"
+        assert np.array_equal(solution.poses, graph.initial)
+    normalised = backends.create("relaxation-paper", configured(theta=0.5, on_unstable="normalise")).solve(graph)
+    assert normalised.report.status != "diverged"
+    assert "normalised" in normalised.report.message
+
+
+@pytest.mark.parametrize("name", ["relaxation-paper", "relaxation-normalised", "relaxation-ratslam"])
+@pytest.mark.parametrize("make", [lambda: star(50), lambda: laps(np.random.default_rng(0), noise=40.0)[0]])
+def test_relaxation_never_gives_anything_but_finite_poses(name, make):
+    graph = make()
+    assert np.isfinite(backends.create(name, configured(theta=1.0)).solve(graph).poses).all()
+    for solution in backends.replay(backends.create(name, configured(theta=1.0)), graph):
+        assert np.isfinite(solution.poses).all()
+
+
+def test_ratslam_corrects_headings_where_world_frame_rules_cannot():
+    graph, truth = laps(np.random.default_rng(2), nodes=120, noise=3.0)
+    last = {n: list(backends.replay(backends.create(n), graph))[-1].poses for n in ("odometry", "relaxation-ratslam")}
+    errors = {n: np.abs(wrap_angle(p[:, 2] - truth[:, 2])).mean() for n, p in last.items()}
+    assert errors["relaxation-ratslam"] < 0.5 * errors["odometry"]
+
+
+def test_a_decaying_theta_ends_nearer_to_the_optimum_than_the_limit_cycle():
+    graph, _ = laps(np.random.default_rng(2), nodes=60, noise=3.0)
+    constant = backends.create("relaxation-ratslam", configured(solve_sweeps=400)).solve(graph)
+    decaying = backends.create("relaxation-ratslam", configured(solve_sweeps=400, theta_decay=0.96)).solve(graph)
+    best = backends.create("gtsam-lm").solve(graph).report.chi2
+    assert best < decaying.report.chi2 < 0.7 * constant.report.chi2

@@ -1,0 +1,102 @@
+"""False loops: what survives them, and what does not."""
+
+import numpy as np
+import pytest
+from graphs_for_tests import laps
+
+from hybridmap import backends
+from hybridmap.backends.false_loops import inject
+from hybridmap.config.backends import BackendsConfig, GncConfig
+from hybridmap.errors import GraphError
+from hybridmap.geometry import align, transform_points
+from hybridmap.graph.io import read_graph
+
+
+def ate(poses, reference):
+    moved = transform_points(align(reference, poses), poses[:, :2])
+    return float(np.sqrt(np.mean(np.sum((moved - reference[:, :2]) ** 2, axis=1))))
+
+
+@pytest.fixture(scope="module")
+def disturbed():
+    graph, _ = laps(np.random.default_rng(0), nodes=150, per_lap=30)
+    return graph, inject(graph, 0.2, "random", np.random.default_rng(1)), backends.create("gtsam-lm").solve(graph).poses
+
+
+@pytest.mark.parametrize("name", ["gtsam-cauchy", "gtsam-gnc"])
+@pytest.mark.parametrize("mode", ["random", "aliased"])
+def test_a_fifth_of_false_loops_ruins_least_squares_but_not_robust_back_ends(disturbed, name, mode):
+    graph, _, clean = disturbed
+    false = inject(graph, 0.2, mode, np.random.default_rng(1))
+    assert ate(backends.create("gtsam-lm").solve(false).poses, clean) > 0.3
+    solution = backends.create(name).solve(false)
+    assert ate(solution.poses, clean) < 0.05
+    rejected = set(solution.report.rejected_edge_ids)
+    injected = set(false.edge_ids[graph.n_edges :].tolist())
+    assert len(injected - rejected) <= 1
+    assert len(rejected - injected) <= {"gtsam-gnc": 0.05, "gtsam-cauchy": 0.15}[name] * graph.is_loop.sum()
+
+
+@pytest.mark.parametrize("start", ["auto", "batch", "grow"])
+def test_every_start_of_gnc_finds_the_false_loops_of_a_mild_drive(disturbed, start):
+    _, false, clean = disturbed
+    config = BackendsConfig(gnc=GncConfig(start=start, chunk_nodes=40))
+    solution = backends.create("gtsam-gnc", config).solve(false)
+    assert ate(solution.poses, clean) < 0.05
+    assert set(solution.report.weights) == set(false.edge_ids[false.is_loop].tolist())
+    assert set(solution.report.weights.values()) <= {0.0, 1.0}
+
+
+def test_gnc_without_false_loops_is_least_squares(disturbed):
+    graph, _, clean = disturbed
+    solution = backends.create("gtsam-gnc").solve(graph)
+    assert len(solution.report.rejected_edge_ids) <= 0.05 * graph.is_loop.sum()  # honest noise: one in a hundred is beyond 99 %
+    assert ate(solution.poses, clean) < 0.02
+
+
+def test_gnc_follows_with_a_kernel_and_ends_with_a_verdict(disturbed):
+    _, false, clean = disturbed
+    backend = backends.create("gtsam-gnc")
+    *_, driven = backends.replay(backend, false)
+    assert 0.0 < min(driven.report.weights.values()) < 0.1
+    final = backend.finish(false)
+    assert ate(final.poses, clean) < 0.05
+    assert f"{len(final.report.rejected_edge_ids)} of {int(false.is_loop.sum())} loops rejected" in final.report.message
+
+
+def test_odometry_is_never_rejected(disturbed):
+    _, false, _ = disturbed
+    for name in ("gtsam-cauchy", "gtsam-dcs", "gtsam-huber", "gtsam-gnc"):
+        report = backends.create(name).solve(false).report
+        assert set(report.rejected_edge_ids) <= set(false.edge_ids[false.is_loop].tolist()), name
+        assert all(0.0 <= weight <= 1.0 for weight in report.weights.values()), name
+
+
+@pytest.mark.parametrize("mode", ["random", "aliased"])
+def test_injection_gives_the_share_asked_for_and_only_that(mode):
+    graph, _ = laps(np.random.default_rng(0), nodes=150, per_lap=30)
+    false = inject(graph, 0.4, mode, np.random.default_rng(1))
+    added = false.n_edges - graph.n_edges
+    assert added / false.is_loop.sum() == pytest.approx(0.4, abs=0.01)
+    assert np.array_equal(false.deltas[: graph.n_edges], graph.deltas)
+    assert np.all(np.diff(false.edge_ids) > 0)
+    false.validate()
+    again = inject(graph, 0.4, mode, np.random.default_rng(1))
+    assert np.array_equal(again.sources, false.sources)
+    with pytest.raises(GraphError, match="share"):
+        inject(graph, 1.0, mode, np.random.default_rng(1))
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["random", "aliased"])
+@pytest.mark.parametrize("share", [0.1, 0.4])
+def test_gnc_on_intel_with_false_loops(data_dir, share, mode):
+    graph = read_graph(data_dir / "posegraphs" / "intel.g2o")
+    clean = backends.create("gtsam-lm").solve(graph).poses
+    for seed in range(3):
+        false = inject(graph, share, mode, np.random.default_rng(seed))
+        report = (solution := backends.create("gtsam-gnc").solve(false)).report
+        assert ate(solution.poses, clean) < 0.05
+        rejected = np.array(report.rejected_edge_ids)
+        assert np.sum(rejected <= graph.edge_ids[-1]) <= 0.005 * graph.is_loop.sum()

@@ -1,0 +1,113 @@
+"""`hybridmap optimize`: figures, files, and one line with exit code 2 for everything else."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybridmap.backends.objective import chi2
+from hybridmap.cli import main
+from hybridmap.graph.io import read_graph
+
+SQUARE = """VERTEX_SE2 0 0 0 0
+VERTEX_SE2 1 1.1 0 1.6
+VERTEX_SE2 2 1.1 1.2 3.1
+VERTEX_SE2 3 0.1 1.1 -1.5
+EDGE_SE2 0 1 1 0 1.5708 100 0 0 100 0 400
+EDGE_SE2 1 2 1 0 1.5708 100 0 0 100 0 400
+EDGE_SE2 2 3 1 0 1.5708 100 0 0 100 0 400
+EDGE_SE2 3 0 1 0 1.5700 100 0 0 100 0 400
+"""
+
+
+def run(monkeypatch, capsys, *words):
+    monkeypatch.setattr(sys, "argv", ["hybridmap", *map(str, words)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    printed = capsys.readouterr()
+    return end.value.code or 0, printed.out, printed.err
+
+
+@pytest.fixture
+def square(tmp_path):
+    path = tmp_path / "square.g2o"
+    path.write_text(SQUARE)
+    return path
+
+
+def test_json_holds_the_figures_and_the_file_has_the_poses_they_are_of(monkeypatch, capsys, square, tmp_path):
+    out = tmp_path / "out" / "solved.g2o"
+    code, printed, _ = run(monkeypatch, capsys, "optimize", square, "--backend", "gtsam-lm", "--out", out, "--json")
+    assert code == 0
+    told = json.loads(printed)
+    figures = {row["name"]: row["value"] for row in told["metrics"]}
+    assert told["status"] == "converged"
+    assert (told["nodes"], told["edges"], told["loops"]) == (4, 4, 1)
+    before, after = read_graph(square), read_graph(out)
+    assert figures["chi2_initial/gtsam-lm"] == pytest.approx(chi2(before, before.initial))
+    assert figures["chi2/gtsam-lm"] == pytest.approx(chi2(before, after.initial), rel=1e-9)
+    assert figures["chi2/gtsam-lm"] < 1e-2 * figures["chi2_initial/gtsam-lm"]
+
+
+def test_without_json_there_is_a_table(monkeypatch, capsys, square):
+    code, printed, _ = run(monkeypatch, capsys, "optimize", square)
+    assert code == 0
+    assert "chi2/gtsam-lm" in printed
+
+
+def test_a_back_end_that_diverged_is_exit_code_1_and_no_file(monkeypatch, capsys, tmp_path):
+    spokes = [f"EDGE_SE2 0 {k} 1 0 0 1 0 0 1 0 1" for k in range(1, 40)]
+    spokes += [f"EDGE_SE2 {k} {k + 1} 0.1 0.2 0 1 0 0 1 0 1" for k in range(1, 39)]
+    star = tmp_path / "star.g2o"
+    star.write_text("\n".join(spokes))
+    out = tmp_path / "never.g2o"
+    code, printed, _ = run(monkeypatch, capsys, "optimize", star, "--backend", "relaxation-paper", "--out", out, "--json")
+    assert code == 1
+    assert json.loads(printed)["status"] == "diverged"
+    assert "theta_max" in json.loads(printed)["message"]
+    assert not out.exists()
+
+
+def test_settings_reach_the_back_end(monkeypatch, capsys, square):
+    words = ("optimize", square, "--backend", "relaxation-ratslam", "--set", "backends.relaxation.solve_sweeps=3", "--json")
+    _, printed, _ = run(monkeypatch, capsys, *words)
+    figures = {row["name"]: row["value"] for row in json.loads(printed)["metrics"]}
+    assert figures["iterations/relaxation-ratslam"] == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("optimize", "nowhere.g2o"), "nowhere.g2o: no such graph file"),
+        (("optimize", "SQUARE", "--backend", "g2o"), "unknown back-end 'g2o'; there are odometry"),
+        (("optimize", "FOLDER"), "holds no session"),
+        (("optimize", "SQUARE", "--set", "backends.speed=3"), "unknown key 'backends.speed'"),
+        (("optimize", "SQUARE", "--sideways"), "No such option"),
+        (("compare", "SQUARE", "--backends", "gtsam-lm,none"), "unknown back-end 'none'"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(monkeypatch, capsys, square, tmp_path, words, says):
+    (tmp_path / "empty").mkdir()
+    named = {"SQUARE": square, "FOLDER": tmp_path / "empty"}
+    code, printed, errors = run(monkeypatch, capsys, *(named.get(word, word) for word in words))
+    assert code == 2
+    assert printed == ""
+    assert errors.count("\n") == 1
+    assert errors.startswith("hybridmap: error: ")
+    assert says in errors
+
+
+@pytest.mark.data
+def test_manhattan_reaches_the_published_optimum(monkeypatch, capsys, data_dir):
+    path = data_dir / "posegraphs" / "manhattanOlson3500.g2o"
+    _, printed, _ = run(monkeypatch, capsys, "optimize", path, "--json")
+    figures = {row["name"]: row["value"] for row in json.loads(printed)["metrics"]}
+    assert figures["chi2/gtsam-lm"] == pytest.approx(146.08, abs=0.01)
+
+
+def test_files_are_never_left_half_written(square, tmp_path):
+    graph = read_graph(square)
+    assert np.isfinite(graph.initial).all()
+    assert not list(Path(tmp_path).glob(".*partial"))

@@ -1,0 +1,73 @@
+"""Covariance along the shortest path: equal to chaining the edges one by one."""
+
+import time
+
+import numpy as np
+import pytest
+
+from hybridmap.errors import GraphError
+from hybridmap.geometry import RelativePose, compose_relative, invert_relative
+from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.uncertainty import relative_covariances
+
+
+def graph_of(pairs, rng, nodes):
+    root = rng.normal(size=(len(pairs), 3, 3))
+    covariance = 1e-2 * (root @ root.transpose(0, 2, 1) + np.eye(3))
+    return PoseGraph(
+        initial=np.zeros((nodes, 3)),
+        sources=np.array([p[0] for p in pairs]),
+        targets=np.array([p[1] for p in pairs]),
+        deltas=rng.normal(size=(len(pairs), 3)),
+        information=np.linalg.inv(covariance),
+        kinds=np.full(len(pairs), EdgeKind.ODOMETRY, dtype=np.int8),
+        edge_ids=np.arange(len(pairs)),
+    )
+
+
+def edge(graph, number, turned=False):
+    relative = RelativePose(graph.deltas[number], np.linalg.inv(graph.information[number]))
+    return invert_relative(relative) if turned else relative
+
+
+def test_a_chain_is_the_chain_of_its_edges_in_both_directions():
+    graph = graph_of([(0, 1), (2, 1), (2, 3), (3, 4)], np.random.default_rng(0), 5)
+    found = relative_covariances(graph, 1)
+    there = compose_relative(compose_relative(edge(graph, 1, turned=True), edge(graph, 2)), edge(graph, 3))
+    assert np.allclose(found[4], there.covariance)
+    assert np.allclose(found[0], edge(graph, 0, turned=True).covariance)
+    assert np.array_equal(found[1], np.zeros((3, 3)))
+
+
+def test_the_surer_of_two_ways_counts():
+    graph = graph_of([(0, 1), (1, 2), (2, 3), (0, 3), (0, 3)], np.random.default_rng(1), 4)
+    information = graph.information.copy()
+    information[4] *= 1e4
+    sure = PoseGraph(graph.initial, graph.sources, graph.targets, graph.deltas, information, graph.kinds, graph.edge_ids)
+    assert np.allclose(relative_covariances(sure, 0)[3], edge(sure, 4).covariance)
+    assert np.allclose(relative_covariances(sure, 3)[0], edge(sure, 4, turned=True).covariance)
+
+
+def test_every_covariance_is_one_on_a_large_graph_and_growth_is_that_of_the_path():
+    rng = np.random.default_rng(2)
+    n = 3000
+    pairs = [(i - 1, i) for i in range(1, n)] + [(int(i), int(j)) for i, j in rng.integers(0, n, (1500, 2)) if i != j]
+    graph = graph_of(pairs, rng, n)
+    relative_covariances(graph, 0)
+    started = time.process_time()
+    found = relative_covariances(graph, 1234)
+    assert time.process_time() - started < 0.2
+    assert np.linalg.eigvalsh(np.delete(found, 1234, axis=0)).min() > 0
+    assert np.allclose(found, found.transpose(0, 2, 1))
+
+
+def test_a_node_out_of_reach_is_infinitely_uncertain():
+    graph = graph_of([(0, 1), (2, 3)], np.random.default_rng(0), 4)
+    found = relative_covariances(graph, 0)
+    assert np.all(np.isinf(np.diagonal(found[2:], axis1=1, axis2=2)))
+    assert np.isfinite(found[:2]).all()
+
+
+def test_an_unknown_node_is_refused():
+    with pytest.raises(GraphError, match="node 9"):
+        relative_covariances(graph_of([(0, 1)], np.random.default_rng(0), 2), 9)
