@@ -1,0 +1,90 @@
+"""Small worlds of line segments, cast in numpy, and drives through them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hybridmap.geometry import between, compose
+from hybridmap.streams.base import Laser
+
+LASER = Laser(np.deg2rad(np.arange(-135.0, 136.0, 1.0)), 0.05, 30.0, np.array([0.1, 0.0, 0.0]))
+
+
+def box(x0, y0, x1, y1):
+    return [(x0, y0, x1, y0), (x1, y0, x1, y1), (x1, y1, x0, y1), (x0, y1, x0, y0)]
+
+
+def room():
+    """8 x 6 m with furniture, no symmetry."""
+    return np.array(
+        [
+            *box(-4, -3, 4, 3),
+            *box(2.2, 1.5, 3.2, 2.4),
+            *box(-3.5, -2.6, -2.3, -2.0),
+            *box(-1.0, 2.4, 0.7, 3.0),
+            (4, -1, 3.1, -1),
+        ]
+    )
+
+
+def corridor(length=80.0):
+    """Two bare walls 2.4 m apart; no end in sight from the middle."""
+    return np.array([(-length / 2, -1.2, length / 2, -1.2), (-length / 2, 1.2, length / 2, 1.2)])
+
+
+def ring():
+    """A corridor 2 m wide round a block of 12 x 8 m, with niches and pillars that differ everywhere."""
+    rng = np.random.default_rng(5)
+    walls = [*box(-8, -6, 8, 6), *box(-6, -4, 6, 4)]
+    for x in (-7.0, -4.6, -1.3, 1.9, 5.2):
+        w, d = rng.uniform(0.4, 1.2), rng.uniform(0.2, 0.5)
+        walls += box(x, 6 - d, x + w, 6)
+    for x in (-5.5, -2.2, 0.4, 4.1):
+        w, d = rng.uniform(0.3, 1.4), rng.uniform(0.2, 0.5)
+        walls += box(x, -6, x + w, -6 + d)
+    for y in (-3.0, 0.2, 2.7):
+        w, d = rng.uniform(0.3, 1.2), rng.uniform(0.2, 0.5)
+        walls += [*box(8 - d, y, 8, y + w), *box(-8, y - 1.3, -8 + d, y - 1.3 + w)]
+    return np.array(walls)
+
+
+def cast(world, pose, rng=None, laser=LASER, sigma_m=0.01):
+    """Ranges (B,) float32 from a pose of `base_link`; NaN where no wall is met."""
+    x, y, yaw = compose(pose, laser.pose_base_laser)
+    angle = yaw + laser.bearings_rad
+    dx, dy = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    ax, ay, bx, by = world.T
+    ex, ey = bx - ax, by - ay
+    det = dx * ey - dy * ex
+    safe = np.where(np.abs(det) < 1e-12, 1e-12, det)
+    t = ((ax - x) * ey - (ay - y) * ex) / safe
+    u = ((ax - x) * dy - (ay - y) * dx) / safe
+    hit = (np.abs(det) > 1e-12) & (t > 0) & (u >= 0) & (u <= 1)
+    ranges = np.where(hit, t, np.inf).min(axis=1)
+    if rng is not None:
+        ranges = ranges + rng.normal(0.0, sigma_m, ranges.shape)
+    ranges[~(ranges < laser.range_max_m)] = np.nan
+    return ranges.astype(np.float32)
+
+
+def ring_drive(laps, step_m=0.1):
+    """Poses (N, 3) round the ring, counter-clockwise, turning on the spot at the corners."""
+    corners = [(-7.0, -5.0), (7.0, -5.0), (7.0, 5.0), (-7.0, 5.0)]
+    poses = []
+    for leg in range(round(4 * laps)):
+        a, b = np.array(corners[leg % 4]), np.array(corners[(leg + 1) % 4])
+        yaw, length = np.arctan2(*(b - a)[::-1]), np.hypot(*(b - a))
+        poses += [(*(a + (b - a) * s), yaw) for s in np.arange(0.0, 1.0, step_m / length)]
+        poses += [(*b, yaw + turn) for turn in np.arange(0.0, np.pi / 2, np.deg2rad(6.0))]
+    return np.array(poses)
+
+
+def drifting(poses, rng, bias_deg_per_m=1.0, noise_deg=0.05, gain=1.01):
+    """What wheels would say of a drive: a gain, a heading bias per metre, white noise; starts at the first pose."""
+    out = [poses[0]]
+    for a, b in zip(poses[:-1], poses[1:], strict=True):
+        step = between(a, b)
+        step[:2] *= gain
+        step[2] += np.deg2rad(bias_deg_per_m) * np.hypot(step[0], step[1]) + rng.normal(0.0, np.deg2rad(noise_deg))
+        out.append(compose(out[-1], step))
+    return np.array(out)

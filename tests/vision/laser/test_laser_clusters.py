@@ -1,0 +1,78 @@
+"""Late commitment: a cluster waits for enough probes, over enough travel, and for its rivals."""
+
+import numpy as np
+import pytest
+
+from hybridmap.config.laser import CommitmentConfig
+from hybridmap.geometry import RelativePose, between, compose
+from hybridmap.vision.base import Belief
+from hybridmap.vision.laser.clusters import Commitment
+from hybridmap.vision.laser.hypotheses import Hypothesis
+
+N = 400
+STEP_M = 0.5
+CHAIN = np.column_stack([np.arange(N) * STEP_M, np.zeros(N), np.zeros(N)])
+TRAVEL = np.arange(N) * STEP_M
+BELIEF = Belief(CHAIN, np.arange(N, dtype=float), TRAVEL, lambda node: np.tile(np.eye(3), (N, 1, 1)))
+
+
+def hypothesis(probe, anchor, where=(2.0, 5.0, 0.3), quality=0.7, sigma_m=5.0):
+    """A probe that lies at `CHAIN[anchor] * where + way since node 200` in the old map: all with one `where` agree."""
+    at = compose(compose(CHAIN[20], np.array(where)), between(CHAIN[200], CHAIN[probe]))
+    relative = RelativePose(between(at, CHAIN[anchor]), np.diag([0.03, 0.03, 0.01]) ** 2)
+    return Hypothesis(probe, anchor, relative, quality, sigma_m, {}, "")
+
+
+@pytest.fixture
+def commitment():
+    return Commitment(CommitmentConfig(), TRAVEL.__getitem__, CHAIN.__getitem__)
+
+
+def test_waits_until_enough_probes_over_enough_travel_agree(commitment):
+    for key, probe in enumerate((200, 206, 212)):
+        commitment.add(key, hypothesis(probe, 20 + key))
+        assert commitment.settle(TRAVEL[probe], BELIEF) == []
+    commitment.add(3, hypothesis(214, 22))
+    assert commitment.settle(TRAVEL[214], BELIEF) == []
+    commitment.add(4, hypothesis(219, 24))
+    settled = commitment.settle(TRAVEL[219], BELIEF)
+    assert [s.key for s in settled] == [0, 1, 2, 3, 4]
+    assert all(s.accepted for s in settled)
+    assert "5 probes over 9.5 m" in settled[0].reason
+
+
+def test_fewer_are_enough_where_the_gate_is_narrow(commitment):
+    commitment.add(0, hypothesis(200, 20, sigma_m=0.3))
+    assert commitment.settle(TRAVEL[200], BELIEF) == []
+    commitment.add(1, hypothesis(207, 22, sigma_m=0.3))
+    assert [s.accepted for s in commitment.settle(TRAVEL[207], BELIEF)] == [True, True]
+
+
+def test_an_equal_rival_blocks_and_a_weak_one_is_refused(commitment):
+    for key, probe in enumerate((200, 206, 212, 220)):
+        commitment.add(2 * key, hypothesis(probe, 20))
+        commitment.add(2 * key + 1, hypothesis(probe, 20, where=(6.0, 5.0, 0.3), quality=0.65))
+    assert commitment.settle(TRAVEL[220], BELIEF) == []
+    for key, probe in enumerate((224, 228), start=10):
+        commitment.add(key, hypothesis(probe, 24))
+    settled = commitment.settle(TRAVEL[228], BELIEF)
+    assert {s.key for s in settled if s.accepted} == {0, 2, 4, 6, 10, 11}
+    assert {s.key for s in settled if not s.accepted} == {1, 3, 5, 7}
+    assert "contradicts" in next(s.reason for s in settled if not s.accepted)
+
+
+def test_single_hypotheses_that_agree_with_nothing_are_given_up(commitment):
+    for key, probe in enumerate((200, 206, 212, 220)):
+        commitment.add(key, hypothesis(probe, 20, where=(2.0 + 3.0 * key, 5.0, 0.3)))
+    assert commitment.settle(TRAVEL[220], BELIEF) == []
+    late = commitment.settle(TRAVEL[200] + 33.0, BELIEF)
+    assert [(s.key, s.accepted) for s in late] == [(0, False)]
+    assert "32 m" in late[0].reason
+    assert [s.key for s in commitment.flush()] == [1, 2, 3]
+    assert commitment.flush() == []
+
+
+def test_several_hypotheses_of_one_probe_count_once(commitment):
+    for key in range(6):
+        commitment.add(key, hypothesis(200 + key // 3, 20 + key))
+    assert commitment.settle(TRAVEL[202], BELIEF) == []

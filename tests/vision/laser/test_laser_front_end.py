@@ -1,0 +1,180 @@
+"""The laser front-end as the mapper drives it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from laser_worlds import LASER, cast, corridor, drifting, ring, ring_drive, room
+
+from hybridmap.config.laser import LaserConfig
+from hybridmap.config.vision import VisionConfig
+from hybridmap.errors import StreamError
+from hybridmap.geometry import IDENTITY, RelativePose, align, between, compose
+from hybridmap.streams.base import LaserScan, RgbdFrame
+from hybridmap.vision.base import Belief, RetracingFrontEnd, Verdict
+from hybridmap.vision.laser.front_end import LaserFrontEnd
+
+SIGMAS = np.array([0.03, 0.03, np.deg2rad(0.5)])
+
+
+class Run:
+    """A drive through a world; the belief is the chain, moved on as a whole by nothing: no solver is needed to see proposals."""
+
+    def __init__(self, world, truth, odometry, every=5, config=None, seed=0):
+        rng = np.random.default_rng(seed)
+        self.front_end = LaserFrontEnd(config or VisionConfig(), LASER, 0)
+        self.proposals, self.poses, self.travel, last = [], [IDENTITY], [0.0], 0
+        self.truth, self.node_at = truth, []
+        for i, pose in enumerate(truth):
+            motion = between(odometry[last], odometry[i])
+            scan = LaserScan(1_000_000_000 + i * 100_000_000, cast(world, pose, rng))
+            view = self.front_end.observe(scan, motion)
+            if i % every:
+                continue
+            node = len(self.node_at)
+            self.node_at.append(i)
+            self.front_end.add_node(node, view)
+            relative = RelativePose(motion, np.diag(SIGMAS**2)) if node else None
+            tracked = self.front_end.track(node, relative)
+            if node:
+                step = tracked[0].relative or relative
+                self.poses.append(compose(self.poses[-1], step.delta))
+                self.travel.append(self.travel[-1] + np.hypot(*step.delta[:2]))
+            self.proposals += tracked + self.front_end.close(node, self.belief())
+            last = i
+
+    def belief(self, poses=None):
+        travel = np.array(self.travel)
+
+        def covariance_from(node):
+            way = np.abs(travel - travel[node])
+            sigma_rad = np.deg2rad(0.45) * np.sqrt(way)
+            sigma_m = 0.02 * np.sqrt(way) + sigma_rad * way / 2
+            return np.stack([np.diag([s**2, s**2, r**2]) for s, r in zip(sigma_m, sigma_rad, strict=True)])
+
+        return Belief(np.array(self.poses) if poses is None else poses, np.zeros(len(travel)), travel, covariance_from)
+
+    def loops(self, verdict):
+        final = {p.key: p for p in self.proposals if p.kind == "loop"}
+        return [p for p in final.values() if p.verdict is verdict]
+
+    def error(self, proposal):
+        a, b = self.truth[self.node_at[proposal.source]], self.truth[self.node_at[proposal.target]]
+        return between(between(a, b), proposal.relative.delta)
+
+
+@pytest.fixture(scope="module")
+def two_laps():
+    truth = ring_drive(1.6)
+    return Run(ring(), truth, drifting(truth, np.random.default_rng(2)))
+
+
+def test_a_second_lap_is_closed_rightly(two_laps):
+    accepted = two_laps.loops(Verdict.ACCEPTED)
+    assert len(accepted) >= 5
+    errors = np.array([two_laps.error(p) for p in accepted])
+    assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.25
+    assert np.abs(errors[:, 2]).max() < np.deg2rad(3.0)
+    assert all(p.source > p.target for p in accepted)
+    for p in accepted:
+        assert np.linalg.eigvalsh(p.relative.covariance).min() > 0
+
+
+def test_nothing_is_accepted_on_the_first_lap(two_laps):
+    first_lap = 4 * 60
+    early = [p for p in two_laps.proposals if p.kind == "loop" and p.verdict is Verdict.ACCEPTED and p.source < first_lap // 5]
+    assert early == []
+
+
+def test_a_closure_waits_before_it_is_accepted(two_laps):
+    history = {}
+    for p in two_laps.proposals:
+        history.setdefault(p.key, []).append(p.verdict)
+    accepted = [v for v in history.values() if Verdict.ACCEPTED in v and v != [Verdict.ACCEPTED]]
+    assert accepted
+    assert all(v == [Verdict.PENDING, Verdict.ACCEPTED] for v in accepted)
+
+
+def test_every_decision_has_its_figures_and_reason(two_laps):
+    loops = [p for p in two_laps.proposals if p.kind == "loop"]
+    assert all(p.reason for p in loops)
+    assert all({"near", "fit", "gate_sigma_m"} <= set(p.scores) for p in loops)
+
+
+def test_re_proposal_on_the_right_map_is_right_and_ends(two_laps):
+    start = two_laps.truth[0]
+    final = between(start, two_laps.truth[two_laps.node_at])
+    proposals = two_laps.front_end.finish(two_laps.belief(final))
+    near = [p for p in proposals if p.verdict is Verdict.ACCEPTED]
+    assert len(near) >= 10
+    errors = np.array([two_laps.error(p) for p in near])
+    assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.15
+    for _ in range(VisionConfig().laser.revisits.rounds):
+        proposals = two_laps.front_end.finish(two_laps.belief(final))
+    assert proposals == []
+
+
+def test_scans_between_nodes_are_put_right_on_the_final_map(two_laps):
+    final = between(two_laps.truth[0], two_laps.truth[two_laps.node_at])
+    assert isinstance(two_laps.front_end, RetracingFrontEnd)
+    retraced = two_laps.front_end.retrace(two_laps.belief(final))
+    assert len(retraced.nodes) > 0.95 * len(two_laps.truth)
+    assert (np.diff(retraced.stamps_ns) > 0).all()
+    index = (retraced.stamps_ns - 1_000_000_000) // 100_000_000
+    off = between(between(two_laps.truth[0], two_laps.truth[index]), compose(final[retraced.nodes], retraced.deltas))
+    assert np.percentile(np.hypot(off[:, 0], off[:, 1]), 95) < 0.03
+    assert np.percentile(np.abs(off[:, 2]), 95) < np.deg2rad(0.5)
+
+
+def test_two_different_rooms_are_not_one():
+    shift = np.array([30.0, 0.0, 30.0, 0.0])
+    other = np.array(
+        [(-4, -3, 4, -3), (4, -3, 4, 3), (4, 3, -4, 3), (-4, 3, -4, -3), (-1, -1, 1, -1), (1, -1, 1, 0.5), (-4, 0, -2, 0)]
+    )
+    world = np.concatenate([room(), other + shift])
+    path = np.column_stack([np.linspace(-1.5, 1.5, 60), np.full(60, -0.3), np.zeros(60)])
+    back = path[::-1]
+    truth = np.concatenate([path, back, path, back, path + [30.0, 1.6, 0.0], back + [30.0, 1.6, 0.0]])
+    run = Run(world, truth, np.concatenate([truth[:240], truth[240:] - [30.0, 0.0, 0.0]]))
+    first_in_second_room = 240 // 5
+    wrong = [p for p in run.loops(Verdict.ACCEPTED) if p.source >= first_in_second_room + 4 and p.target < first_in_second_room]
+    assert wrong == []
+
+
+def test_a_bare_corridor_closes_nothing():
+    x = np.concatenate([np.linspace(-12, 12, 240), np.linspace(12, -12, 240)])
+    truth = np.column_stack([x, np.zeros(480), np.repeat([0.0, np.pi], 240)])
+    run = Run(corridor(), truth, truth)
+    assert run.loops(Verdict.ACCEPTED) == []
+
+
+def test_two_runs_give_the_same_bytes():
+    truth = ring_drive(1.3)[:420]
+    odometry = drifting(truth, np.random.default_rng(2))
+
+    def flat(run):
+        return b"".join(
+            p.relative.delta.tobytes() + p.relative.covariance.tobytes() for p in run.proposals if p.relative is not None
+        )
+
+    a, b = Run(ring(), truth, odometry), Run(ring(), truth, odometry)
+    assert flat(a) == flat(b)
+    assert [dataclasses.astuple(p)[:6] for p in a.proposals] == [dataclasses.astuple(p)[:6] for p in b.proposals]
+
+
+def test_frames_of_another_kind_are_refused():
+    front_end = LaserFrontEnd(VisionConfig(), LASER, 0)
+    with pytest.raises(StreamError, match="expected a LaserScan"):
+        front_end.observe(RgbdFrame(0, np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), np.float32)), IDENTITY)
+    with pytest.raises(StreamError, match="271 ranges, found"):
+        front_end.observe(LaserScan(0, np.zeros(5, np.float32)), IDENTITY)
+
+
+def test_a_keyframe_holds_profile_and_ranges():
+    front_end = LaserFrontEnd(VisionConfig(laser=LaserConfig()), LASER, 0)
+    ranges = cast(room(), IDENTITY)
+    front_end.add_node(0, front_end.observe(LaserScan(5, ranges), IDENTITY))
+    assert front_end.track(0, None) == []
+    keyframe = front_end.keyframe(0)
+    np.testing.assert_array_equal(keyframe["ranges_m"], ranges)
+    assert keyframe["profile"].shape == (1, 64)
