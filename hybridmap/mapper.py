@@ -125,7 +125,7 @@ class Mapper:
         view = self._look(ready, moved)
         if view is None and self.vision is not None:
             return self._update(pose_odom, "no view at this instant")
-        reason = self._novelty.reason(moved, self.integrator.place_code, view is not None and view.new_template)
+        reason = self._novelty.reason(moved, lambda: self.integrator.place_code, view is not None and view.new_template)
         if reason is None:
             return self._update(pose_odom, "nothing new")
         node = self._make_node(pose_odom, moved, view)

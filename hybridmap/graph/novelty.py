@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,12 +20,12 @@ class Novelty:
         self._codes: NDArray[Any] = np.zeros((0, 0), dtype=np.float32)
         self._count = 0
 
-    def reason(self, delta_node_robot: Array, place_code: NDArray[np.float32], new_template: bool) -> str | None:
+    def reason(self, delta_node_robot: Array, place_code: Callable[[], NDArray[np.float32]], new_template: bool) -> str | None:
         """Why a node is due, or None.
 
         Args:
             delta_node_robot: (3,) motion since the node that the robot is at.
-            place_code: (P,) current activity.
+            place_code: gives the current activity (P,); asked only where the rule needs it.
             new_template: the current frame founded a view template.
         """
         if self._count == 0:
@@ -33,7 +34,7 @@ class Novelty:
             return self._travelled(delta_node_robot)
         if new_template:
             return "new view template"
-        distance = self.distance(place_code)
+        distance = self.distance(place_code())
         return f"place code differs by {distance:.2f} from every node's" if distance > self._config.place_threshold else None
 
     def distance(self, place_code: NDArray[np.float32]) -> float:

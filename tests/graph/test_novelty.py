@@ -14,11 +14,11 @@ HERE, ELSEWHERE = np.array([1.0, 0.0], np.float32), np.array([0.0, 2.0], np.floa
 
 def test_travel_rule_names_its_reason():
     novelty = Novelty(NodesConfig(distance_m=0.5, angle_deg=20))
-    assert novelty.reason(np.zeros(3), HERE, False) == "first experience"
+    assert novelty.reason(np.zeros(3), lambda: HERE, False) == "first experience"
     novelty.remember(HERE)
-    assert novelty.reason(np.array([0.3, 0.3, 0.1]), ELSEWHERE, True) is None
-    assert "0.51 m" in str(novelty.reason(np.array([0.4, 0.31, 0.1]), HERE, False))
-    assert "23 deg" in str(novelty.reason(np.array([0.0, 0.0, -0.4]), HERE, False))
+    assert novelty.reason(np.array([0.3, 0.3, 0.1]), lambda: ELSEWHERE, True) is None
+    assert "0.51 m" in str(novelty.reason(np.array([0.4, 0.31, 0.1]), lambda: HERE, False))
+    assert "23 deg" in str(novelty.reason(np.array([0.0, 0.0, -0.4]), lambda: HERE, False))
 
 
 def test_novelty_rule_compares_with_every_node():
@@ -26,9 +26,9 @@ def test_novelty_rule_compares_with_every_node():
     for code in (HERE, ELSEWHERE):
         novelty.remember(code)
     far = np.array([9.0, 9.0, 1.0])
-    assert novelty.reason(far, 5 * HERE, False) is None
-    assert novelty.reason(far, -HERE, False) is not None
-    assert novelty.reason(np.zeros(3), HERE, True) == "new view template"
+    assert novelty.reason(far, lambda: 5 * HERE, False) is None
+    assert novelty.reason(far, lambda: -HERE, False) is not None
+    assert novelty.reason(np.zeros(3), lambda: HERE, True) == "new view template"
 
 
 def test_odometry_covariance_agrees_with_a_random_walk():
