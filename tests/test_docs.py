@@ -58,6 +58,30 @@ def test_walk_through_does_what_it_shows(tmp_path: Path) -> None:
     assert not (tmp_path / "other").exists()
 
 
+README_INPUT = """
+import numpy as np
+rng = np.random.default_rng(0)
+stamp_s, pose_odom_robot = 1.0, (0.0, 0.0, 0.0)
+T_base_camera = np.array([[0, 0, 1, 0.1], [-1, 0, 0, 0], [0, -1, 0, 1.0], [0, 0, 0, 1]], dtype=float)
+color = rng.integers(0, 255, (240, 320, 3)).astype(np.uint8)
+depth_m = np.full((240, 320), 2.0, dtype=np.float32)
+"""
+
+
+def test_readme_example_runs(tmp_path: Path) -> None:
+    (example,) = [text for language, text in blocks(ROOT / "README.md") if language == "python"]
+    asked = "\nassert update.new_node == 0 and len(solution.poses) == len(mapper.map) == 1"
+    done = run(sys.executable, "-c", README_INPUT + example + asked, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+def test_readme_names_every_back_end() -> None:
+    from hybridmap.backends import names
+
+    table = (ROOT / "README.md").read_text().split("The back-ends:")[1].split("## ")[0]
+    assert set(re.findall(r"`((?:gtsam|relaxation)-\w+|odometry)`", table)) == set(names())
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
