@@ -3,7 +3,7 @@
 # make check  set up, then format, lint, types, import contracts and declared dependencies
 # make setup  leave .venv with the command hybridmap in it (PYTHON=/path/to/python chooses the interpreter)
 # make clean  remove what these have written, but for .venv; make distclean: that too
-.PHONY: setup test demo check clean distclean
+.PHONY: setup test demo check format lint types contracts dependencies clean distclean
 
 BIN := .venv/bin
 JOBS ?= 2
@@ -17,11 +17,21 @@ demo: setup
 test: setup
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) $(TESTS)
 
-check: setup
+check: format lint types contracts dependencies
+
+format: setup
 	$(BIN)/ruff format --check hybridmap tests tools
+
+lint: setup
 	$(BIN)/ruff check hybridmap tests tools
+
+types: setup
 	$(BIN)/mypy
+
+contracts: setup
 	$(BIN)/lint-imports
+
+dependencies: setup
 	$(BIN)/deptry .
 
 clean:
