@@ -143,7 +143,7 @@ def _overlay(scene: Scene, edge: Edge, points_of: Mapping[int, Array]) -> str | 
         return None
     delta = edge.relative.delta if edge.relative is not None else between(scene.nodes[edge.source], scene.nodes[edge.target])
     placed = transform_points(delta, old)
-    with style.figure(3.8, 3.4) as picture:
+    with style.figure(3.8, 3.4, margins=(0.15, 0.98, 0.23, 0.92)) as picture:
         axes = picture.add_subplot()
         dots: dict[str, Any] = {"linestyle": "none", "marker": ".", "markeredgewidth": 0, "rasterized": True}
         axes.plot(placed[:, 0], placed[:, 1], color=_OLD, markersize=4.0, alpha=0.6, label="older", **dots)
@@ -153,7 +153,7 @@ def _overlay(scene: Scene, edge: Edge, points_of: Mapping[int, Array]) -> str | 
         style.metric_axes(axes)
         how = "by the measured pose" if edge.relative is not None else "as the map has them (nothing was measured)"
         axes.set_title(f"laid over each other {how}", fontsize=8.5)
-        legend = picture.legend(loc="outside lower center", ncols=2, markerscale=3.0)
+        legend = picture.legend(loc="lower center", ncols=2, markerscale=3.0)
         for handle in legend.legend_handles:
             handle.set_alpha(1.0)
         return style.svg_uri(picture)
@@ -168,7 +168,7 @@ def _profiles(new: NDArray[Any], old: NDArray[Any], shift: int) -> str:
     bands, width = new.shape
     spacing = 1.15 * float(max(np.ptp(new, axis=1).max(), np.ptp(old, axis=1).max(), 1e-6))
     column = np.arange(width)
-    with style.figure(3.8, 3.4) as picture:
+    with style.figure(3.8, 3.4, margins=(0.22, 0.98, 0.15, 0.92)) as picture:
         axes = picture.add_subplot()
         for band in range(bands):
             base = (bands - 1 - band) * spacing

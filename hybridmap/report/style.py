@@ -17,6 +17,9 @@ from hybridmap.report.outline import Raster
 TRUTH, ODOMETRY, PRIMARY = "#000000", "#d55e00", "#0072b2"
 OTHERS = ("#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#7f6000", "#5b3a8e")
 ACCEPTED, UNWEIGHTED, PENDING, REJECTED = "#009e73", "#cc79a7", "#e69f00", "#d55e00"
+Margins = tuple[float, float, float, float]
+"""Left, right, bottom and top of the axes, as shares of the figure."""
+
 PAGE_WIDTH_IN = 9.6
 _MAX_POINTS = 2500
 _SETTINGS = {
@@ -61,13 +64,17 @@ def line_styles(backends: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 @contextmanager
-def figure(width_in: float, height_in: float) -> Iterator[Any]:
-    """A matplotlib figure in the page's style; no window, no global state."""
+def figure(width_in: float, height_in: float, margins: Margins | None = None) -> Iterator[Any]:
+    """A matplotlib figure in the page's style; no window, no global state. Without margins they are worked out, slowly."""
     import matplotlib
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(_SETTINGS):
-        yield Figure(figsize=(width_in, height_in), layout="constrained")
+        picture = Figure(figsize=(width_in, height_in), layout="constrained" if margins is None else None)
+        if margins is not None:
+            left, right, bottom, top = margins
+            picture.subplots_adjust(left=left, right=right, bottom=bottom, top=top)
+        yield picture
 
 
 def svg_uri(picture: Any) -> str:
@@ -95,10 +102,9 @@ def draw_building(axes: Any, building: Raster | None, darkness: float = 0.55) ->
     """What the robot saw, in grey, under everything else."""
     if building is None:
         return
-    axes.imshow(
-        np.ma.masked_equal(building.grey, 0.0) * darkness, cmap="Greys", vmin=0.0, vmax=1.0, origin="lower", extent=building.extent, zorder=1,
-        interpolation="antialiased",
-    )  # fmt: skip
+    seen = np.ma.masked_equal(building.grey, 0.0) * darkness
+    looks = {"cmap": "Greys", "vmin": 0.0, "vmax": 1.0, "interpolation": "antialiased", "zorder": 1}
+    axes.imshow(seen, origin="lower", extent=building.extent, **looks)
 
 
 def metric_axes(axes: Any, adjustable: str = "datalim") -> None:
