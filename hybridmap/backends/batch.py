@@ -9,10 +9,11 @@ import gtsam
 import numpy as np
 
 from hybridmap.backends.base import SolveStatus
-from hybridmap.backends.factors import NoiseModels, factor_graph, poses_of, values
-from hybridmap.backends.following import GraphBackend, Outcome
+from hybridmap.backends.factors import NoiseModels, anchor, factor_graph, factors, poses_of, values
+from hybridmap.backends.following import Change, GraphBackend, Outcome, difference, with_edges
 from hybridmap.backends.initial import best_start
 from hybridmap.backends.objective import chi2
+from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
 
@@ -22,8 +23,10 @@ _MAKE: dict[str, tuple[Callable[[], Any], Callable[..., Any]]] = {
     "dogleg": (gtsam.DoglegParams, gtsam.DoglegOptimizer),
 }
 
+_STUCK = 1e4  # Levenberg-Marquardt's lambda where it gave up rather than arrived
 
-def run(method: str, factor_graph_: Any, start: Array, max_iterations: int) -> Outcome:
+
+def run(method: str, factor_graph_: Any, start: Array, max_iterations: int, initial: Any = None) -> Outcome:
     """One optimiser run; exceptions become the status `failed`, standing still on a slope `stalled`.
 
     Args:
@@ -31,28 +34,65 @@ def run(method: str, factor_graph_: Any, start: Array, max_iterations: int) -> O
         factor_graph_: a `gtsam.NonlinearFactorGraph` over keys 0..N-1.
         start: (N, 3) poses.
         max_iterations: the limit.
+        initial: the same poses as `gtsam.Values`, where they are there already.
     """
     make_params, make_optimizer = _MAKE[method]
     params = make_params()
     params.setMaxIterations(max_iterations)
     try:
-        optimizer = make_optimizer(factor_graph_, values(start), params)
-        poses = poses_of(optimizer.optimize())
+        optimizer = make_optimizer(factor_graph_, values(start) if initial is None else initial, params)
+        result = optimizer.optimize()
     except RuntimeError as error:
         text = str(error).strip().splitlines()
         return Outcome(start, SolveStatus.FAILED, f"{method}: {text[0] if text else type(error).__name__}", 0)
-    iterations = int(optimizer.iterations())
+    poses, iterations = poses_of(result), int(optimizer.iterations())
     if not np.isfinite(poses).all():
         return Outcome(start, SolveStatus.DIVERGED, f"{method}: poses were not finite", iterations)
+    status, message = SolveStatus.CONVERGED, f"{method}: converged"
     if iterations >= max_iterations:
-        return Outcome(poses, SolveStatus.MAX_ITERATIONS, f"{method}: stopped at {iterations} iterations", iterations)
-    if method == "lm" and optimizer.lambda_() > 1e4:
-        return Outcome(poses, SolveStatus.STALLED, f"lm: no step lowered the cost after {iterations} iterations", iterations)
-    return Outcome(poses, SolveStatus.CONVERGED, f"{method}: converged", iterations)
+        status, message = SolveStatus.MAX_ITERATIONS, f"{method}: stopped at {iterations} iterations"
+    elif method == "lm" and optimizer.lambda_() > _STUCK:
+        status, message = SolveStatus.STALLED, f"lm: no step lowered the cost after {iterations} iterations"
+    return Outcome(poses, status, message, iterations, values=result)
+
+
+class WarmStart:
+    """Factors and poses kept from one update to the next, so that only what is new is converted."""
+
+    def __init__(self, models: NoiseModels) -> None:
+        self._models = models
+        self._graph: PoseGraph | None = None
+        self._factors: dict[int, Any] = {}
+        self._values: Any = None
+
+    def __call__(self, method: str, graph: PoseGraph, start: Array, max_iterations: int) -> Outcome:
+        """One optimiser run; where the graph was seen before, `start` (N, 3) must carry on from the last outcome."""
+        added = difference(self._graph, graph).added
+        known = self._graph.n_nodes if self._graph is not None else 0
+        new = with_edges(graph, added)
+        self._factors |= zip(new.edge_ids.tolist(), factors(new, self._models), strict=True)
+        initial = values(start[known:], known)
+        if self._values is not None:
+            initial.insert(self._values)
+        whole = gtsam.NonlinearFactorGraph()
+        for edge in graph.edge_ids.tolist():
+            whole.push_back(self._factors[edge])
+        whole.push_back(anchor(graph.initial[0]))
+        outcome = run(method, whole, start, max_iterations, initial)
+        self._graph, self._values = graph, initial if outcome.values is None else outcome.values
+        return outcome
 
 
 class BatchBackend(GraphBackend):
     """`gtsam-lm` (with a start of its own and Dogleg to fall back on), `gtsam-gn`, `gtsam-dogleg`."""
+
+    def __init__(self, name: str, config: BackendsConfig) -> None:
+        super().__init__(name, config)
+        self._warm = WarmStart(NoiseModels())
+
+    def _follow(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
+        del change
+        return self._warm(self._name.removeprefix("gtsam-"), graph, start, self._config.max_iterations)
 
     def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
         method = self._name.removeprefix("gtsam-")

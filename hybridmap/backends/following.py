@@ -6,6 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ class Outcome:
         status, message, iterations: why it stopped, and when.
         weights: loop edge id -> final weight.
         rejected: loops held for false.
+        values: the poses in the solver's own form, to start from again.
     """
 
     poses: Array
@@ -36,6 +38,7 @@ class Outcome:
     iterations: int
     weights: dict[int, float] = field(default_factory=dict)
     rejected: tuple[int, ...] = ()
+    values: Any = None
 
 
 @dataclass(frozen=True, slots=True)

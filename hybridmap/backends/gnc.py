@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from hybridmap.backends.base import Solution, SolveStatus
 from hybridmap.backends.batch import run
 from hybridmap.backends.factors import NoiseModels, anchor, factors, poses_of, values
-from hybridmap.backends.following import GraphBackend, Outcome, prefix
+from hybridmap.backends.following import Change, GraphBackend, Outcome, prefix
 from hybridmap.backends.objective import squared_norms
-from hybridmap.backends.robust import gate_of, with_kernel
+from hybridmap.backends.robust import WarmKernel, gate_of, with_kernel
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.connectivity import extend
@@ -169,6 +169,14 @@ def grow(graph: PoseGraph, config: BackendsConfig, negligible: float) -> Truncat
 
 class GncBackend(GraphBackend):
     """`gtsam-gnc`: Cauchy on the loops while driving, graduated non-convexity on the whole graph at the end."""
+
+    def __init__(self, name: str, config: BackendsConfig) -> None:
+        super().__init__(name, config)
+        self._warm = WarmKernel("gtsam-cauchy", config)
+
+    def _follow(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
+        del change
+        return self._warm(graph, start)
 
     def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
         return with_kernel("gtsam-cauchy", graph, start, self._config)

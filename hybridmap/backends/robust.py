@@ -10,9 +10,9 @@ import gtsam
 import numpy as np
 from scipy.stats import chi2 as chi2_law
 
-from hybridmap.backends.batch import run
+from hybridmap.backends.batch import WarmStart, run
 from hybridmap.backends.factors import NoiseModels, factor_graph
-from hybridmap.backends.following import GraphBackend, Outcome
+from hybridmap.backends.following import Change, GraphBackend, Outcome
 from hybridmap.backends.objective import squared_norms
 from hybridmap.config.backends import BackendsConfig, RobustConfig
 from hybridmap.geometry import Array
@@ -51,8 +51,30 @@ def with_kernel(name: str, graph: PoseGraph, start: Array, config: BackendsConfi
     return judged(outcome, kernel, graph, gate_of(config))
 
 
+class WarmKernel:
+    """A kernel's optimiser that carries on from update to update."""
+
+    def __init__(self, name: str, config: BackendsConfig) -> None:
+        self._config = config
+        self._kernel, models = kernel_models(name, config.robust)
+        self._warm = WarmStart(models)
+
+    def __call__(self, graph: PoseGraph, start: Array) -> Outcome:
+        """See `WarmStart`; with weights and verdicts."""
+        outcome = self._warm("lm", graph, start, self._config.max_iterations)
+        return judged(outcome, self._kernel, graph, gate_of(self._config))
+
+
 class KernelBackend(GraphBackend):
     """`gtsam-cauchy`, `gtsam-huber`, `gtsam-dcs`."""
+
+    def __init__(self, name: str, config: BackendsConfig) -> None:
+        super().__init__(name, config)
+        self._warm = WarmKernel(name, config)
+
+    def _follow(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
+        del change
+        return self._warm(graph, start)
 
     def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
         return with_kernel(self._name, graph, start, self._config)
