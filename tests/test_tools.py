@@ -1,0 +1,59 @@
+"""What developers run: the picture, and the page of results."""
+
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+
+from tests.store.sessions import ring_map, write_session
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(autouse=True)
+def tools_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+
+
+def test_picture_of_a_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    figures = importlib.import_module("figures")
+    session = write_session(tmp_path / "session", ring_map(1.2))
+    figures.draw(session, tmp_path / "images" / "picture.png")
+    picture = cv2.imread(str(tmp_path / "images" / "picture.png"))
+    assert picture.shape[1] > 1000
+    assert picture.min() < 100 < 250 < picture.max()
+    assert "picture.png" in capsys.readouterr().out
+
+
+def test_page_of_results_is_what_was_recorded() -> None:
+    results = importlib.import_module("results")
+    found = json.loads((ROOT / "docs" / "results.json").read_text())
+    assert (ROOT / "docs" / "results.md").read_text() == results.page(found)
+
+
+def test_figures_are_held_against_their_bars(tmp_path: Path) -> None:
+    results, studies = importlib.import_module("results"), importlib.import_module("result_studies")
+    step = studies.Step("hybridmap map x", (studies.Figure("ate_rmse/PRIMARY", 0.2), studies.Figure("nodes")), same_graph=True)
+    output = {
+        "primary_backend": "gtsam-lm",
+        "graph_hash": "b",
+        "metrics": [
+            {"name": "ate_rmse/gtsam-lm", "value": 0.3, "unit": "m"},
+            {"name": "nodes", "value": None, "unit": "1"},
+        ],
+    }
+    done = subprocess.CompletedProcess([], 0, json.dumps(output), "")
+    rows = results.read(step, done, 1.0, ["a"])
+    assert [(row["value"], row["passed"]) for row in rows] == [("0.3", False), ("–", None), ("no", False)]
+    assert results.table_line(rows[0]) == "| `ate_rmse/gtsam-lm` | 0.3 | m | <= 0.2 ✗ missed |"
+    with pytest.raises(SystemExit, match="gave no figure"):
+        results.read(studies.Step("x", (studies.Figure("other"),)), done, 1.0, [])
+
+
+def test_results_names_its_studies() -> None:
+    said = subprocess.run([sys.executable, ROOT / "tools" / "results.py", "--list"], capture_output=True, text=True, check=True)
+    assert "demo: The demo" in said.stdout
