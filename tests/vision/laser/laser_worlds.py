@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from hybridmap.geometry import between, compose
@@ -82,7 +84,7 @@ def ring_drive(laps, step_m=0.1):
 def drifting(poses, rng, bias_deg_per_m=1.0, noise_deg=0.05, gain=1.01):
     """What wheels would say of a drive: a gain, a heading bias per metre, white noise; starts at the first pose."""
     out = [poses[0]]
-    for a, b in zip(poses[:-1], poses[1:], strict=True):
+    for a, b in pairwise(poses):
         step = between(a, b)
         step[:2] *= gain
         step[2] += np.deg2rad(bias_deg_per_m) * np.hypot(step[0], step[1]) + rng.normal(0.0, np.deg2rad(noise_deg))

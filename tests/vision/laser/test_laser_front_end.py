@@ -9,7 +9,7 @@ from laser_worlds import LASER, cast, corridor, drifting, ring, ring_drive, room
 from hybridmap.config.laser import LaserConfig
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
-from hybridmap.geometry import IDENTITY, RelativePose, align, between, compose
+from hybridmap.geometry import IDENTITY, RelativePose, between, compose
 from hybridmap.streams.base import LaserScan, RgbdFrame
 from hybridmap.vision.base import Belief, RetracingFrontEnd, Verdict
 from hybridmap.vision.laser.front_end import LaserFrontEnd
@@ -18,7 +18,7 @@ SIGMAS = np.array([0.03, 0.03, np.deg2rad(0.5)])
 
 
 class Run:
-    """A drive through a world; the belief is the chain, moved on as a whole by nothing: no solver is needed to see proposals."""
+    """A drive through a world; the belief is the chain itself: proposals need no solver."""
 
     def __init__(self, world, truth, odometry, every=5, config=None, seed=0):
         rng = np.random.default_rng(seed)
@@ -133,8 +133,8 @@ def test_two_different_rooms_are_not_one():
     )
     world = np.concatenate([room(), other + shift])
     path = np.column_stack([np.linspace(-1.5, 1.5, 60), np.full(60, -0.3), np.zeros(60)])
-    back = path[::-1]
-    truth = np.concatenate([path, back, path, back, path + [30.0, 1.6, 0.0], back + [30.0, 1.6, 0.0]])
+    back, far = path[::-1], np.array([30.0, 1.6, 0.0])
+    truth = np.concatenate([path, back, path, back, path + far, back + far])
     run = Run(world, truth, np.concatenate([truth[:240], truth[240:] - [30.0, 0.0, 0.0]]))
     first_in_second_room = 240 // 5
     wrong = [p for p in run.loops(Verdict.ACCEPTED) if p.source >= first_in_second_room + 4 and p.target < first_in_second_room]

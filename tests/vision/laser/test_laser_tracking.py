@@ -1,5 +1,7 @@
 """Refined self-motion: wheels that drift and drop out, corridors that hide the way, scans between nodes."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from laser_worlds import LASER, cast, corridor, ring, ring_drive, room
@@ -38,7 +40,7 @@ class Drive:
 def test_drift_of_the_wheels_is_taken_out():
     poses = ring_drive(0.7)[::5]
     drive = Drive(ring(), poses[0])
-    for a, b in zip(poses[:-1], poses[1:], strict=True):
+    for a, b in pairwise(poses):
         truth = between(a, b)
         step = drive.step(truth, truth + np.array([0.01, 0.0, np.deg2rad(1.0)]))
         assert step.measured
