@@ -15,7 +15,7 @@ demo: setup
 	$(BIN)/hybridmap demo --out hybridmap-demo --overwrite
 
 test: setup
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) $(TESTS)
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --hypothesis-profile=ci $(TESTS)
 
 check: format lint types contracts dependencies
 
