@@ -74,6 +74,14 @@ class PnpConfig(Section):
     """The two directions must give the same heading within this, degrees."""
     refine: bool = True
     """Refine jointly on keypoints and depth."""
+    map_inliers: float = Field(default=0.8, gt=0, le=1)
+    """By depth alone, from the map's guess: least share of the points in common view that fit."""
+    map_overlap: float = Field(default=0.35, gt=0, le=1)
+    """By depth alone: least share of a keyframe's points that the other one sees."""
+    map_points: int = Field(default=150, ge=10)
+    """By depth alone: fewest matched points."""
+    map_sigma_m: float = Field(default=0.05, gt=0)
+    """By depth alone: largest standard deviation in the loosest direction, m."""
     translation_floor_m: float = Field(default=0.01, gt=0)
     """Floor of the standard deviation of a loop edge, m."""
     rotation_floor_deg: float = Field(default=0.2, gt=0)
@@ -115,10 +123,14 @@ class RgbdClosingConfig(Section):
     """Unverified edges: standard deviation of the translation, m."""
     shift_sigma_deg: float = Field(default=6.0, gt=0)
     """Unverified edges: standard deviation of the heading, degrees."""
-    repropose_m: float = Field(default=1.5, ge=0)
-    """At the end, nodes this near on the optimised map are tried again; 0: no."""
-    repropose_rounds: int = Field(default=1, ge=0)
-    """How often."""
+    repropose_m: float = Field(default=2.0, ge=0)
+    """At the end, nodes this near on the optimised map are tried again, by features and then by depth alone; 0: no."""
+    repropose_rounds: int = Field(default=2, ge=0)
+    """How often, each time on the map as it has become."""
+    repropose_sigma_m: float = Field(default=0.15, gt=0)
+    """By depth alone: how far the map may be off, m (one standard deviation)."""
+    repropose_sigma_deg: float = Field(default=3.0, gt=0)
+    """By depth alone: how far the map may be off, degrees."""
     repropose_per_node: int = Field(default=2, ge=1)
     """At the end, candidates tried for a node."""
 

@@ -15,7 +15,7 @@ GBar = Literal["templates", "shifts"]
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-MODERATE_THRESHOLD: dict[Mode, float] = {"literal": 1.0, "ratio": 0.45, "signed": -0.35, "plain": 0.35, "four-band": 0.45}
+MODERATE_THRESHOLD: dict[Mode, float] = {"literal": 1.0, "ratio": 0.4, "signed": -0.38, "plain": 0.28, "four-band": 0.33}
 """c_t of each mode where candidates are not verified and the configuration names none (z-normalised profiles)."""
 
 

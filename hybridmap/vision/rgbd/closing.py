@@ -15,7 +15,7 @@ from hybridmap.geometry import Array, RelativePose, between, compose, wrap_angle
 from hybridmap.vision.base import Belief, Proposal, Verdict
 from hybridmap.vision.profile import Profile
 from hybridmap.vision.rgbd.keyframe import Keyframe
-from hybridmap.vision.rgbd.pnp import Verifier
+from hybridmap.vision.rgbd.pnp import Verification, Verifier
 from hybridmap.vision.templates import MODERATE_THRESHOLD, Matcher
 
 Indices = NDArray[np.int64]
@@ -27,6 +27,7 @@ class _Hypothesis:
 
     proposal: Proposal
     relative: RelativePose
+    finding: str
 
     @property
     def source(self) -> int:
@@ -61,6 +62,8 @@ class LoopCloser:
         self._hypotheses: list[_Hypothesis] = []
         self._tried: set[tuple[int, int]] = set()
         self._travel_at_closure = 0.0
+        sigma_m, sigma_rad = config.closing.repropose_sigma_m, np.deg2rad(config.closing.repropose_sigma_deg)
+        self._map_covariance = np.diag([sigma_m, sigma_m, sigma_rad]) ** 2
         self._rounds_left = config.closing.repropose_rounds
 
     def add_node(self, profile: Profile) -> None:
@@ -74,17 +77,15 @@ class LoopCloser:
         return [*changed, *self._give_up(before=node - self._closing.pending_nodes)]
 
     def finish(self, belief: Belief) -> list[Proposal]:
-        """Try pairs that the optimised map puts side by side and that were never tried; then settle everything."""
+        """Try pairs that the optimised map puts side by side and that are not joined yet; then settle everything."""
         out: list[Proposal] = []
         if self._rounds_left > 0 and self._closing.repropose_m > 0 and self._config.verify != "none":
             self._rounds_left -= 1
-            closed = Counter(h.source for h in self._hypotheses if h.proposal.verdict is Verdict.ACCEPTED)
+            settled = {(h.source, h.target) for h in self._hypotheses if h.proposal.verdict is Verdict.ACCEPTED}
+            closed = Counter(source for source, _ in settled)
             for node in range(len(self._keyframes)):
-                if closed[node] >= self._closing.accept:
-                    continue
-                near = self._nearest_untried(node, belief)
-                if near:
-                    out += self._try_candidates(node, near, belief)
+                if closed[node] < self._closing.accept:
+                    out += self._try_again(node, self._nearest(node, settled, belief), belief)
         return [*out, *self._give_up(before=len(self._keyframes))]
 
     def _gate(self, node: int, belief: Belief) -> Indices:
@@ -119,7 +120,7 @@ class LoopCloser:
         return chosen
 
     def _try_candidates(self, node: int, ranked: dict[int, dict[str, float]], belief: Belief) -> list[Proposal]:
-        """Measure each candidate; what has support enters, the best first."""
+        """Measure each candidate, the best first, until enough have entered."""
         if self._config.verify == "none":
             return self._accept_unverified(node, ranked, belief)
         out: list[Proposal] = []
@@ -129,16 +130,33 @@ class LoopCloser:
                 break
             self._tried.add((node, target))
             found = self._verifier.verify(self._keyframes[node], self._keyframes[target])
-            scores = {**scores, **found.scores}
-            proposal = Proposal(self._new_key(), "loop", node, target, Verdict.REJECTED, found.reason, found.relative, scores)
-            if found.relative is None:
-                out.append(proposal)
-                continue
-            hypothesis = _Hypothesis(replace(proposal, verdict=Verdict.PENDING, reason="waits for support"), found.relative)
-            raised = self._raise(hypothesis, belief)
-            entered += hypothesis.proposal.verdict is Verdict.ACCEPTED
-            out += raised
+            changed = self._file(node, target, scores, found, belief)
+            entered += changed[0].verdict is Verdict.ACCEPTED
+            out += changed
         return out
+
+    def _try_again(self, node: int, near: dict[int, dict[str, float]], belief: Belief) -> list[Proposal]:
+        """Measure pairs that the map puts side by side: by features if that was not tried, else by depth alone."""
+        out: list[Proposal] = []
+        for target, scores in near.items():
+            found: Verification | None = None
+            if (node, target) not in self._tried:
+                self._tried.add((node, target))
+                found = self._verifier.verify(self._keyframes[node], self._keyframes[target])
+            if found is None or found.relative is None:
+                guess = RelativePose(between(belief.poses_map_node[node], belief.poses_map_node[target]), self._map_covariance)
+                found = self._verifier.verify_on_map(self._keyframes[node], self._keyframes[target], guess)
+            out += self._file(node, target, scores, found, belief)
+        return out
+
+    def _file(self, node: int, target: int, scores: dict[str, float], found: Verification, belief: Belief) -> list[Proposal]:
+        """Turn a verification into proposals: its own first, then those that it supports."""
+        scores = {**scores, **found.scores}
+        proposal = Proposal(self._new_key(), "loop", node, target, Verdict.REJECTED, found.reason, found.relative, scores)
+        if found.relative is None:
+            return [proposal]
+        waiting = replace(proposal, verdict=Verdict.PENDING, reason="waits for support")
+        return self._raise(_Hypothesis(waiting, found.relative, found.reason), belief)
 
     def _raise(self, new: _Hypothesis, belief: Belief) -> list[Proposal]:
         """File a hypothesis; accept it and what it supports if another one agrees."""
@@ -151,7 +169,7 @@ class LoopCloser:
             return [new.proposal]
         changed = [new, *friends]
         for h in changed:
-            h.proposal = replace(h.proposal, verdict=Verdict.ACCEPTED, reason="verified and supported")
+            h.proposal = replace(h.proposal, verdict=Verdict.ACCEPTED, reason=f"{h.finding}; supported")
         self._travel_at_closure = max(self._travel_at_closure, float(belief.travel_m[new.source]))
         return [h.proposal for h in changed]
 
@@ -180,18 +198,18 @@ class LoopCloser:
             h.proposal = replace(h.proposal, verdict=Verdict.REJECTED, reason="no other edge supports it")
         return [h.proposal for h in late]
 
-    def _nearest_untried(self, node: int, belief: Belief) -> dict[int, dict[str, float]]:
-        """Earlier nodes that look at the same place from nearly the same pose, nearest first."""
+    def _nearest(self, node: int, settled: set[tuple[int, int]], belief: Belief) -> dict[int, dict[str, float]]:
+        """Earlier nodes, not joined to this one, that look at the same place from nearly the same pose, nearest first."""
         poses = belief.poses_map_node
         gap = np.hypot(*(poses[:node, :2] - poses[node, :2]).T)
         turned = np.abs(wrap_angle(poses[:node, 2] - poses[node, 2]))
         old = belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s
-        near = old & (gap <= self._closing.repropose_m) & (turned <= np.deg2rad(0.7 * self._closing.heading_deg))
+        near = old & (gap <= self._closing.repropose_m) & (turned <= np.deg2rad(self._closing.heading_deg))
         cost = gap + turned
         chosen: dict[int, dict[str, float]] = {}
         for i in np.argsort(np.where(near, cost, np.inf), kind="stable")[: int(near.sum())]:
             target = int(i)
-            if (node, target) in self._tried:
+            if (node, target) in settled:
                 continue
             if all(abs(target - other) >= self._closing.separation for other in chosen):
                 chosen[target] = {"map_distance_m": float(gap[i])}

@@ -68,6 +68,26 @@ class Verifier:
         both = np.intersect1d(forward.inliers, backward.inliers)
         return self._refined(source, target, flat, pairs.first[both], pairs.second[both], scores)
 
+    def verify_on_map(self, source: Keyframe, target: Keyframe, guess: RelativePose) -> Verification:
+        """Measure by depth alone, from where the map has the target (for views that share surfaces but no features).
+
+        Args:
+            source, target: the keyframes.
+            guess: the target in the source's frame as the map has it, and how far that may be off.
+        """
+        fit = register(source.surface, target.surface, from_planar(guess.delta), guess, self._registration)
+        if fit is None:
+            return Verification(None, "too little depth in common view", {})
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(fit.relative.covariance[:2, :2])[-1]))
+        scores = {"depth_inliers": fit.inliers, "overlap": fit.overlap, "points": float(fit.points), "sigma_m": sigma_m}
+        if fit.inliers < self._pnp.map_inliers:
+            return Verification(None, f"only {fit.inliers:.0%} of the depth in common view fits", scores)
+        if fit.overlap < self._pnp.map_overlap or fit.points < self._pnp.map_points:
+            return Verification(None, f"only {fit.points} points of depth in common", scores)
+        if sigma_m > self._pnp.map_sigma_m:
+            return Verification(None, f"depth slides: {sigma_m:.2f} m along its loosest direction", scores)
+        return Verification(with_floor(fit.relative, *self._floors()), "depth agrees with the map", scores)
+
     def _implausible(self, flat: FloorPose, reverse: FloorPose, held: bool, scores: dict[str, float]) -> str | None:
         """Why the two poses cannot be right, or None."""
         gap = between(flat.delta, reverse.delta)
