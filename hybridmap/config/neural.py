@@ -30,6 +30,9 @@ class PlaceConfig(Section):
     """Moving steps between two learning steps (four at 30 Hz: the theta rhythm)."""
     max_cells: int = Field(default=32768, ge=1)
     """No more place cells than this are recruited; the log says when it is reached."""
+    attractor_input: float = Field(default=0.0, ge=0, lt=1)
+    """Share of the place cells' input in the attractor's activity at each learning step; 0: the attractor is moved by
+    self-motion alone."""
 
 
 class NeuralConfig(Section):
@@ -47,6 +50,8 @@ class NeuralConfig(Section):
     """Grid spacing of the finest module, m."""
     spacing_max_m: float = Field(default=0.52, gt=0)
     """Grid spacing of the coarsest module, m."""
+    metric: Literal["hexagonal", "square"] = "hexagonal"
+    """Metric of the sheets; `square` has bands at 0 and 90 degrees and fires on a square lattice (for comparison)."""
     orientation_deg: float = Field(default=7.0, ge=-180, le=180)
     """Orientation of the finest module's first band, degrees."""
     orientation_step_deg: float = Field(default=7.5, ge=-60, le=60)
@@ -57,10 +62,13 @@ class NeuralConfig(Section):
     """beta of softplus, log(1 + exp(beta x)) / beta."""
     fourier_modes: int = Field(default=4, ge=2, le=15)
     """K, the Fourier modes along each axis of a sheet that its recurrent weights carry."""
+    kernel: Literal["two-amplitudes", "printed"] = "two-amplitudes"
+    """Recurrent weights: a difference of two Gaussians with an amplitude each, or with the printed single one, which is
+    unstable at one step a time constant and is refused with the name of what happens."""
     kernel_gain_first: float = Field(default=1.4, gt=1)
     """Fourier gain of the recurrent weights at the first hexagonal mode."""
     kernel_gain_zero: float = Field(default=-1.0, le=0)
-    """Fourier gain of the recurrent weights at mode zero: net inhibition."""
+    """Fourier gain of the recurrent weights at mode zero: net inhibition (two amplitudes only)."""
     kernel_widths: tuple[float, float] = (1.5, 0.3)
     """Widths of the excitatory and the inhibitory Gaussian's spectrum, in squared wave numbers of the first mode."""
     band_cells: int = Field(default=32, ge=16)
@@ -69,6 +77,10 @@ class NeuralConfig(Section):
     """Stripe width r as a share of the period; the rate is exp(-(s - l/2)^2 / (2 r^2))."""
     band_drive: float = Field(default=0.1, ge=0, le=1)
     """Gain of the band stripes' excitatory input to the sheets (the uniform input is 1); 0 leaves only the shift."""
+    neuron_noise: float = Field(default=0.0, ge=0, le=0.5)
+    """Standard deviation of the noise that multiplies every cell's rate in every step; 0.05 is 5 %."""
+    neuron_noise_seed: int = Field(default=0, ge=0)
+    """Seed of that noise, where no generator is handed to the integrator."""
     gain: float = Field(default=1.0, gt=0, le=10)
     """k_m, metres of path integration a metre of odometry."""
     turn_gain: float = Field(default=1.0, gt=0, le=10)

@@ -55,6 +55,13 @@ class PlaceAttractor:
         spread /= spread.sum()
         self.activity = spread
 
+    def receive(self, place_input: NDArray[np.floating], share: float) -> None:
+        """Mix the input (N * N,) of the place cells into the activity, as a share of its sum; no input changes nothing."""
+        total = float(place_input.sum())
+        if total > 0.0:
+            given = (place_input * (share / total)).reshape(self.activity.shape).astype(self.activity.dtype)
+            self.activity = (1.0 - share) * self.activity + given
+
     def settle(self, iterations: int = 10) -> None:
         """Let the cells compete without self-motion, until one bump is left."""
         for _ in range(iterations):

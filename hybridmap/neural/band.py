@@ -7,7 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from hybridmap.neural.torus import Metric
+
 ORIENTATIONS_DEG = (0.0, 60.0, 120.0)
+SQUARE_ORIENTATIONS_DEG = (0.0, 45.0, 90.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,10 +33,12 @@ class BandRings:
     displacement is alpha + l/2. No running integral d is kept: the ring feeds its rates back through cosine weights that the
     velocity along its orientation shifts, the net input h is normalised (divisive inhibition), and the transfer function
     h -> exp(-(l arccos(h) / 2 pi)^2 / (2 r^2)) gives back the printed stripe, which is the attractor of the ring.
-    Periods are l = lambda sqrt(3)/2.
+    Periods are l = lambda sqrt(3)/2. On the square metric (for comparison) the bands are at 0 and 90 degrees with period lambda,
+    and the ring between them, which drives no sheet, is their sum at 45 degrees.
 
     Attributes:
         activity: (M, 3, n) rates 0..1 in the order of `ORIENTATIONS_DEG`; the whole state.
+        periods_m, orientations_rad: (M, 3).
         wave_vectors: (M, 3, 2) cycles per metre; the third is the second minus the first (phi60 = phi0 + phi120).
     """
 
@@ -44,13 +49,14 @@ class BandRings:
         cells: int,
         width: float,
         dtype: DTypeLike = np.float64,
+        metric: Metric = "hexagonal",
     ) -> None:
-        angles = orientations_rad[:, None] + np.radians(ORIENTATIONS_DEG)
-        self.periods_m: NDArray[np.float64] = spacings_m * np.sqrt(3.0) / 2.0
+        square = metric == "square"
+        angles = orientations_rad[:, None] + np.radians(SQUARE_ORIENTATIONS_DEG if square else ORIENTATIONS_DEG)
+        period = np.array([1.0, np.sqrt(0.5), 1.0]) if square else np.full(3, np.sqrt(3.0) / 2.0)
+        self.periods_m: NDArray[np.float64] = spacings_m[:, None] * period
         self.orientations_rad: NDArray[np.float64] = angles
-        self.wave_vectors: NDArray[np.float64] = (
-            np.stack([np.cos(angles), np.sin(angles)], axis=-1) / self.periods_m[:, None, None]
-        )
+        self.wave_vectors: NDArray[np.float64] = np.stack([np.cos(angles), np.sin(angles)], axis=-1) / self.periods_m[..., None]
         self._turn = 2j * np.pi * self.wave_vectors
         preferred = 2.0 * np.pi * (np.arange(cells) / cells + 0.5)
         self._weights = np.stack([np.cos(preferred), np.sin(preferred)], axis=1).astype(dtype)

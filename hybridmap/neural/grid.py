@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from hybridmap.errors import ConfigError
-from hybridmap.neural.torus import LowModes
+from hybridmap.neural.torus import LowModes, Metric
 
 Rectifier = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 
 
 def relu(drive: NDArray[np.floating]) -> NDArray[np.floating]:
     """The paper's rectifying linear f."""
-    return np.asarray(np.maximum(drive, np.zeros_like(drive)))
+    return np.asarray(np.maximum(drive, np.zeros_like(drive)))  # an array of zeros is several times faster than a scalar
 
 
 def softplus(sharpness: float) -> Rectifier:
@@ -35,14 +36,22 @@ def softplus(sharpness: float) -> Rectifier:
 
 
 def kernel_spectrum(
-    squared_wave_number: NDArray[np.int64], gain_first: float, gain_zero: float, widths: tuple[float, float]
+    squared_wave_number: NDArray[np.int64],
+    gain_first: float,
+    gain_zero: float,
+    widths: tuple[float, float],
+    kernel: Literal["two-amplitudes", "printed"] = "two-amplitudes",
 ) -> NDArray[np.float64]:
     """Return the Fourier gains of w0(x) = a exp(-gamma |x|^2) - c exp(-beta |x|^2) at the given |k|^2.
 
-    The paper's single amplitude (a = c) has no local excitation; the two amplitudes here are fixed by the gains at the
-    first hexagonal mode and at zero, which they meet exactly.
+    The spectrum of exp(-gamma |x|^2) is exp(-|k|^2 / (4 gamma)) / gamma up to a constant, so widths (4 gamma, 4 beta). As
+    printed (paper eq. 6) a = c: no local excitation, and once `gain_first` is met, `gain_zero` cannot be chosen and is far
+    below -1. With two amplitudes the gains at the first mode and at zero are met exactly.
     """
     wide, narrow = widths
+    if kernel == "printed":
+        printed = np.exp(-squared_wave_number / wide) / wide - np.exp(-squared_wave_number / narrow) / narrow
+        return np.asarray(gain_first * printed / (np.exp(-1.0 / wide) / wide - np.exp(-1.0 / narrow) / narrow))
     system = np.array([[np.exp(-1.0 / wide), -np.exp(-1.0 / narrow)], [1.0, -1.0]])
     excitation, inhibition = np.linalg.solve(system, np.array([gain_first, gain_zero]))
     return np.asarray(excitation * np.exp(-squared_wave_number / wide) - inhibition * np.exp(-squared_wave_number / narrow))
@@ -61,13 +70,11 @@ def combine_bands(cycles: NDArray[np.float64]) -> NDArray[np.float64]:
 class GridModules:
     """M sheets of N x N grid cells on a twisted torus (paper eqs. 5-7).
 
-    Cell (i, j) of a sheet prefers the phases (i/N, j/N) of the module's 0 and 120 degree bands, so that the plain torus of
-    indices carries the hexagonal metric. With dt = tau the dynamics are s <- f[W(ds) s + I_BC]: the recurrent weights W,
-    shifted by the band cells' advance ds, act on the low Fourier modes; I_BC is uniform excitation plus the stripes of the
-    three bands, which hold the sheet in register with the rings. A stationary bump moves by exactly ds.
-
-    Attributes:
-        activity: (M, N, N) rates; the whole state.
+    Cell (i, j) of a sheet prefers the phases (i/N, j/N) of the module's first and last band (0 and 120 degrees), so that the
+    plain torus of indices carries the hexagonal metric, or for comparison the square one (bands at 0 and 90 degrees). With
+    dt = tau the dynamics are s <- f[W(ds) s + I_BC]: the recurrent weights W, shifted by the band cells' advance ds, act on the
+    low Fourier modes; I_BC is uniform excitation plus the stripes of the bands, which hold the sheet in register with the
+    rings. A stationary bump moves by exactly ds.
     """
 
     def __init__(
@@ -79,25 +86,35 @@ class GridModules:
         rectifier: Rectifier,
         band_drive: float,
         dtype: DTypeLike = np.float64,
+        metric: Metric = "hexagonal",
     ) -> None:
         """Make the sheets and let them settle.
 
         Raises:
-            ConfigError: with these gains no stationary pattern forms.
+            ConfigError: with these gains no stationary pattern forms; says what happens instead.
         """
         self.modes = LowModes(side, fourier_modes, dtype)
-        self._gains = gains.astype(dtype)
+        self._gains = gains.astype(dtype)[:, None, :]
         self._rectifier = rectifier
         self._centre = fourier_modes
         self._complex = np.result_type(self._gains.dtype, np.complex64)
-        self._stripes = self._stripe_weights(band_drive, side)
-        uniform = np.zeros((2 * fourier_modes + 1, fourier_modes + 1, 2), dtype=dtype)
-        uniform[fourier_modes, 0, 0] = side**2
-        self._uniform = uniform.reshape(-1)
+        self._stripes = self._stripe_weights(band_drive, side, metric)
+        self._uniform = side**2
         wave = 2.0 * np.pi * np.arange(side) / side
-        seed = np.cos(wave[:, None]) + np.cos(wave) + np.cos(wave[:, None] + wave)
-        self.activity: NDArray[np.floating] = np.repeat((1.0 + 0.3 * seed)[None], modules, axis=0).astype(dtype)
+        seed = np.cos(wave[:, None]) + np.cos(wave)
+        if metric == "hexagonal":
+            seed = seed + np.cos(wave[:, None] + wave)
+        self._stack: NDArray[np.floating] = np.repeat((1.0 + 0.3 * seed)[:, None], modules, axis=1).astype(dtype)
         self._settle(modules)
+
+    @property
+    def activity(self) -> NDArray[np.floating]:
+        """Rates (M, N, N); the whole state, as a view: it may be written to, or replaced."""
+        return self._stack.swapaxes(0, 1)
+
+    @activity.setter
+    def activity(self, rates: NDArray[np.floating]) -> None:
+        self._stack = np.ascontiguousarray(rates.swapaxes(0, 1), dtype=self._gains.dtype)
 
     def _settle(self, modules: int) -> None:
         """Let the pattern form, with every band at phase zero.
@@ -106,17 +123,30 @@ class GridModules:
             ConfigError: it does not become stationary.
         """
         still, phasors = np.zeros((modules, 3)), np.ones((modules, 3), dtype=self._complex)
+        last = [self._stack] * 3
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(300):
-                before = self.activity
                 self.step(still, phasors)
-            change = float(np.abs(self.activity - before).max())
-            peak = float(self.activity.max())
-        if not change <= 1e-3 * peak < np.inf:
-            raise ConfigError(
-                f"neural: the grid sheets do not settle (change {change:.3g} at a peak of {peak:.3g} after 300 steps): "
-                f"the largest gain of a mode is {float(self._gains.max()):.3g}; lower kernel_gain_first or kernel_widths"
-            )
+                last = [*last[1:], self._stack]
+            change, again = (float(np.abs(last[2] - before).max()) for before in (last[1], last[0]))
+            peak = float(last[2].max())
+        if change <= 1e-3 * peak < np.inf:
+            return
+        raise ConfigError(f"neural: the grid sheets do not settle: {self._what_happens(change, again, peak)}")
+
+    def _what_happens(self, change: float, again: float, peak: float) -> str:
+        """Name the instability from the changes over one and over two steps and the peak after settling."""
+        zero, largest = float(self._gains[self._centre, 0, 0]), float(self._gains.max())
+        if not peak < 1e6:
+            found = f"the activity grows without bound (peak {peak:.3g} after 300 steps)"
+        elif again <= 1e-3 * max(peak, change):
+            found = f"all cells fire in every second step (period-two oscillation; change {change:.3g} a step)"
+        else:
+            found = f"no pattern becomes stationary (change {change:.3g} at a peak of {peak:.3g} after 300 steps)"
+        return (
+            f"{found}; the recurrent weights have the Fourier gain {zero:.3g} at mode zero and {largest:.3g} at most, where one "
+            "step of dt = tau needs about -1 and 1.4: set kernel to 'two-amplitudes', or lower kernel_gain_first or kernel_widths"
+        )
 
     def step(self, band_advance: NDArray[np.floating], band_phasors: NDArray[np.complexfloating]) -> None:
         """Advance by one time constant.
@@ -125,33 +155,35 @@ class GridModules:
             band_advance: (M, 3) how far each band ring moved in this step, cycles; two of the three fix the sheet's shift.
             band_phasors: (M, 3) unit phasors of where the band rings are after it.
         """
-        modes = self.modes.forward(self.activity)
+        modes = self.modes.forward(self._stack)
         modes *= self.modes.shift(band_advance[:, ::2])
         modes *= self._gains
         modes += self._band_input(band_phasors)
-        self.activity = self._rectifier(self.modes.inverse(modes))
+        modes[self._centre, :, 0] += self._uniform
+        self._stack = self._rectifier(self.modes.inverse(modes))
 
     def _band_input(self, phasors: NDArray[np.complexfloating]) -> NDArray[np.complexfloating]:
-        """Modes (M, 2K+1, K+1) of I_BC: uniform excitation and the stripes of the three bands."""
+        """Modes (2K+1, M, K+1) of the stripes of the bands."""
         drive = np.ascontiguousarray(phasors, dtype=self._complex).view(self._gains.dtype) @ self._stripes
-        drive += self._uniform
-        return np.asarray(drive.view(self._complex)).reshape(-1, *self._gains.shape)
+        return drive.view(self._complex).reshape(len(drive), len(self.modes.first), -1).swapaxes(0, 1)
 
-    def _stripe_weights(self, band_drive: float, side: int) -> NDArray[np.floating]:
+    def _stripe_weights(self, band_drive: float, side: int, metric: Metric) -> NDArray[np.floating]:
         """Weights (6, 2 * modes) from the phasors of three bands to their stripes' modes, all as (real, imaginary)."""
         k, stripe = self._centre, 0.5 * band_drive * side**2
         weights = np.zeros((3, 2, 2 * k + 1, k + 1, 2))
         for band, mode, sign in ((0, (k + 1, 0), -1.0), (0, (k - 1, 0), 1.0), (1, (k + 1, 1), -1.0), (2, (k, 1), -1.0)):
+            if band == 1 and metric == "square":
+                continue
             weights[band, 0][mode][0] = stripe
             weights[band, 1][mode][1] = sign * stripe
         return weights.reshape(6, -1).astype(self._gains.dtype)
 
     def band_phases(self) -> NDArray[np.float64]:
-        """Return the phases (M, 3) of the first hexagonal modes of the activity, cycles in [-0.5, 0.5]."""
-        modes, k = self.modes.forward(self.activity), self._centre
-        first = np.stack([modes[:, k + 1, 0], modes[:, k + 1, 1], modes[:, k, 1]], axis=1)
+        """Return the phases (M, 3) of the modes (1,0), (1,1) and (0,1) of the activity, cycles in [-0.5, 0.5]."""
+        modes, k = self.modes.forward(self._stack), self._centre
+        first = np.stack([modes[k + 1, :, 0], modes[k + 1, :, 1], modes[k, :, 1]], axis=1)
         return np.asarray(-np.angle(first.astype(np.complex128)) / (2.0 * np.pi))
 
     def phases(self) -> NDArray[np.float64]:
-        """Return the sheets' decoded phases (M, 2), cycles in [0, 1), of the 0 and 120 degree bands."""
+        """Return the sheets' decoded phases (M, 2), cycles in [0, 1), of the first and the last band."""
         return combine_bands(self.band_phases()) % 1.0

@@ -39,6 +39,12 @@ class HeadDirectionRing:
         c, s = self.direction()
         return math.atan2(s, c)
 
+    def angle_to(self, activity: NDArray[np.floating]) -> float:
+        """Return how far the ring would turn to reach another activity (m,), rad in [-pi, pi]."""
+        c, s = self.direction()
+        x, y = (self._readout @ activity).tolist()
+        return math.atan2(c * y - s * x, c * x + s * y)
+
     def turn(self, angle_rad: float) -> None:
         """Rotate the population vector by omega dt, rad, left positive."""
         if angle_rad == 0.0:

@@ -16,7 +16,7 @@ from hybridmap.neural.band import BandRings
 from hybridmap.neural.decoder import Decoded, PhaseDecoder
 from hybridmap.neural.grid import GridModules, kernel_spectrum, relu, softplus
 from hybridmap.neural.head_direction import HeadDirectionRing
-from hybridmap.neural.place import PlaceCells
+from hybridmap.neural.place import PlaceCells, PlaceProjection
 from hybridmap.neural.torus import LowModes, shift_sheets
 
 log = logging.getLogger(__name__)
@@ -36,8 +36,12 @@ class PathIntegrator:
     activity means another pose.
     """
 
-    def __init__(self, config: NeuralConfig) -> None:
+    def __init__(self, config: NeuralConfig, rng: np.random.Generator | None = None) -> None:
         """Make every population and let it settle at the origin.
+
+        Args:
+            config: settings of the cells.
+            rng: of the neuron noise; by default one is made from `neuron_noise_seed`.
 
         Raises:
             ConfigError: the grid sheets do not settle with this kernel.
@@ -47,11 +51,13 @@ class PathIntegrator:
         self.spacings_m: NDArray[np.float64] = np.geomspace(config.spacing_min_m, config.spacing_max_m, config.modules)
         turned = np.radians(config.orientation_deg + config.orientation_step_deg * np.arange(config.modules))
         self.head_direction = HeadDirectionRing(config.head_direction_cells, dtype)
-        self.bands = BandRings(self.spacings_m, turned, config.band_cells, config.band_width, dtype)
+        self.bands = BandRings(self.spacings_m, turned, config.band_cells, config.band_width, dtype, config.metric)
         self.grid = _grid(config)
         place = config.place
         self.place = PlaceCells(place, config.sheet_side, self.spacings_m)
         self.attractor = PlaceAttractor(place.attractor_side, place.attractor_cell_m, place.attractor_width_cells, dtype)
+        self._projection = PlaceProjection(place.attractor_side**2)
+        self._rng = np.random.default_rng(config.neuron_noise_seed) if rng is None else rng
         self._decoder = PhaseDecoder(self.bands.wave_vectors, config.decode_box_m)
         self._last_decoded_m: Array = np.zeros(2)
         self._moves = 0
@@ -84,6 +90,8 @@ class PathIntegrator:
         forward, left = config.gain * (cos * dx + sin * dy), config.gain * (cos * dy - sin * dx)
         c, s = self.head_direction.direction(half_turn)
         self.head_direction.turn(2.0 * half_turn)
+        if config.neuron_noise > 0.0:
+            self._disturb()
         if dx != 0.0 or dy != 0.0:
             self._translate(np.array([c * forward - s * left, s * forward + c * left]))
 
@@ -150,8 +158,22 @@ class PathIntegrator:
             "near_m": near.copy(),
         }
 
-    def restore(self, snapshot: dict[str, NDArray[np.generic]]) -> None:
-        """Put a stored activity back: hard re-anchoring (paper eq. 16, the visual recalibration)."""
+    def restore(self, snapshot: dict[str, NDArray[np.generic]], weight: float = 1.0) -> None:
+        """Put a stored activity back: re-anchoring (paper eq. 16, the visual recalibration).
+
+        Args:
+            snapshot: what `snapshot` gave.
+            weight: 1 puts it back hard; less is a soft pull, by that share of the way: of the turn of the ring, and of the
+                shift of each band, sheet and the attractor, their wraps being taken from both decoded positions.
+
+        Raises:
+            ConfigError: the weight is not in 0..1.
+        """
+        if not 0.0 <= weight <= 1.0:
+            raise ConfigError(f"re-anchoring: expected a weight from 0 to 1, found {weight}")
+        if weight < 1.0:
+            self._pull(snapshot, weight)
+            return
         dtype = self.grid.activity.dtype
         self.head_direction.activity = np.asarray(snapshot["heading"], dtype=dtype).copy()
         self.bands.activity = self.bands.rates_at(np.asarray(snapshot["band_phases"], dtype=np.float64))
@@ -159,6 +181,20 @@ class PathIntegrator:
         self.grid.activity = shift_sheets(self.grid.activity, target - self.grid.phases())
         self.attractor.activity = np.asarray(snapshot["attractor"], dtype=dtype).copy()
         self._last_decoded_m = np.asarray(snapshot["near_m"], dtype=np.float64).copy()
+
+    def _pull(self, snapshot: dict[str, NDArray[np.generic]], weight: float) -> None:
+        here = self.decode().position_m
+        way = np.asarray(snapshot["near_m"], dtype=np.float64) - here
+        expected = self.bands.wave_vectors @ way
+        stored = np.asarray(snapshot["heading"], dtype=np.float64)
+        self.head_direction.turn(weight * self.head_direction.angle_to(stored))
+        bands, sheets = self.bands.phases(), self.grid.phases()
+        band_way = _unwrapped(np.asarray(snapshot["band_phases"], dtype=np.float64) - bands, expected)
+        sheet_way = _unwrapped(np.asarray(snapshot["grid_phases"], dtype=np.float64) - sheets, expected[:, [0, 2]])
+        self.bands.activity = self.bands.rates_at(bands + weight * band_way)
+        self.grid.activity = shift_sheets(self.grid.activity, weight * sheet_way)
+        self.attractor.step(weight * way)
+        self._last_decoded_m = here + weight * way
 
     def _attractor_starts(self) -> Array:
         """Where the attractor's bump may be, (S, 2), m: nearest to the last decoded position first."""
@@ -176,16 +212,40 @@ class PathIntegrator:
         self.attractor.step(displacement_m)
         self._moves += 1
         if self._moves % self.config.place.learning_period_steps == 0:
-            self.place.learn(self.grid.activity)
+            self._learn()
             self.decode()
+
+    def _learn(self) -> None:
+        """Let the place cells learn, and the attractor receive their input where it is configured."""
+        share = self.config.place.attractor_input
+        rates = self.place.learn(self.grid.activity)
+        if share > 0.0:
+            self.attractor.receive(self._projection.onto(rates), share)
+            self._projection.learn(rates, self.attractor.activity.ravel())
+
+    def _disturb(self) -> None:
+        """Multiply the rate of every cell that carries the state by 1 + noise."""
+        noise, rng = self.config.neuron_noise, self._rng
+        for population in (self.head_direction, self.bands, self.grid, self.attractor):
+            rates = population.activity
+            population.activity = rates * (1.0 + noise * rng.standard_normal(rates.shape)).astype(rates.dtype)
+
+
+def _unwrapped(difference: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The phase difference, cycles, in the repetition that is nearest to the expected one."""
+    return np.asarray(difference - np.round(difference - expected))
 
 
 def _grid(config: NeuralConfig) -> GridModules:
-    modes = LowModes(config.sheet_side, config.fourier_modes)
-    gains = kernel_spectrum(
-        modes.squared_wave_number(), config.kernel_gain_first, config.kernel_gain_zero, config.kernel_widths
-    )
-    rectifier = relu if config.rectifier == "relu" else softplus(config.softplus_sharpness)
+    squared = LowModes(config.sheet_side, config.fourier_modes).squared_wave_number(config.metric)
+    gains = kernel_spectrum(squared, config.kernel_gain_first, config.kernel_gain_zero, config.kernel_widths, config.kernel)
     return GridModules(
-        config.modules, config.sheet_side, config.fourier_modes, gains, rectifier, config.band_drive, np.dtype(config.dtype)
+        config.modules,
+        config.sheet_side,
+        config.fourier_modes,
+        gains,
+        relu if config.rectifier == "relu" else softplus(config.softplus_sharpness),
+        config.band_drive,
+        np.dtype(config.dtype),
+        config.metric,
     )

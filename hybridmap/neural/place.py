@@ -35,21 +35,27 @@ class PlaceCells:
 
     def rates(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return p = A f[W (s - C_inh_g) - C_inh_p] of every recruited cell, (cells,), 1 at the peak of a field."""
-        return self._respond(self._drive(sheets))
+        return self.respond(self.inputs(sheets))
 
-    def learn(self, sheets: NDArray[np.floating]) -> None:
-        """One learning step: recruit where nothing responds, else move the responding cells' weights (eq. 8)."""
-        drive = self._drive(sheets)
-        rates = self._respond(drive)
+    def learn(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
+        """One learning step: recruit where nothing responds, else move the responding cells' weights (eq. 8).
+
+        Returns:
+            The rates (cells,) of all cells here, of a recruited one as it will be.
+        """
+        drive = self.inputs(sheets)
+        rates = self.respond(drive)
         if rates.size == 0 or float(rates.max()) < self.config.recruit_threshold:
             self._recruit(drive)
-            return
+            return self.respond(drive)
         active = np.flatnonzero(rates)
         grown = self._weights[active] + np.float32(self.config.learning_rate) * rates[active, None] * drive
         np.maximum(grown, 0.0, out=grown)
         self._weights[active] = grown / np.linalg.norm(grown, axis=1, keepdims=True)
+        return rates
 
-    def _respond(self, drive: NDArray[np.float32]) -> NDArray[np.float32]:
+    def respond(self, drive: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the rates (cells,) or (cells, P) to inputs (inputs,) or (inputs, P), as `inputs` gives them."""
         inhibition = np.float32(self.config.inhibition)
         above = np.maximum(self.weights @ drive - inhibition, np.float32(0.0))
         return np.asarray(above / (np.float32(1.0) - inhibition))
@@ -64,8 +70,30 @@ class PlaceCells:
         if self._recruited == self.config.max_cells:
             log.warning("all %d place cells are recruited; new places get no cell of their own", self._recruited)
 
-    def _drive(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
+    def inputs(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
         """Rates above the module's mean of the grid cells that project to place cells, (inputs,), of unit length."""
         sampled = sheets[:, :: self._stride, :: self._stride].reshape(len(sheets), -1).astype(np.float32)
         above = np.maximum(sampled - sampled.mean(axis=1, keepdims=True), np.float32(0.0)) * self._module_weight
         return np.asarray(above.reshape(-1) / np.linalg.norm(above))
+
+
+class PlaceProjection:
+    """Hebbian weights from the place cells onto the place attractor: a cell learns where the bump is when it fires."""
+
+    def __init__(self, attractor_cells: int) -> None:
+        self._weights = np.zeros((256, attractor_cells), dtype=np.float32)
+        self._fired = np.zeros(256, dtype=np.float32)
+
+    def learn(self, rates: NDArray[np.float32], bump: NDArray[np.floating]) -> None:
+        """Move each cell's weights to the mean of the bumps (N * N,) it fired with, weighted by its rates (cells,)."""
+        while len(rates) > len(self._weights):
+            self._weights = np.concatenate([self._weights, np.zeros_like(self._weights)])
+            self._fired = np.concatenate([self._fired, np.zeros_like(self._fired)])
+        active = np.flatnonzero(rates)
+        self._fired[active] += rates[active]
+        step = (rates[active] / self._fired[active])[:, None]
+        self._weights[active] += step * (bump.astype(np.float32) - self._weights[active])
+
+    def onto(self, rates: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the input (N * N,) of place cells with rates (cells,), or (N * N, P) of rates (cells, P)."""
+        return np.asarray(self._weights[: len(rates)].T @ rates)

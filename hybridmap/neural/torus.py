@@ -1,15 +1,21 @@
-"""The low Fourier modes of a periodic sheet, and the hexagonal metric on them."""
+"""The low Fourier modes of a periodic sheet, and the metric on them."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+Metric = Literal["hexagonal", "square"]
+
 
 class LowModes:
-    """Transforms between sheets (M, N, N) and their modes (M, 2K+1, K+1): p = -K..K on the first axis, q = 0..K on the second.
+    """Transforms between a stack of sheets (N, M, N) and their modes (2K+1, M, K+1).
 
-    Two small matrix products each way; the half plane q >= 0 suffices because sheets are real.
+    The stack has a sheet's first axis first, then the module, then the sheet's second axis: so each transform of all modules is
+    two small matrix products. Modes are p = -K..K on the first axis, q = 0..K on the last; the half plane suffices because
+    sheets are real. Both transforms work in buffers of their own and return arrays that the next call overwrites.
     """
 
     def __init__(self, side: int, modes: int, dtype: DTypeLike = np.float64) -> None:
@@ -26,33 +32,50 @@ class LowModes:
         self._left = np.exp(-1j * angle_p).astype(complex_type)
         self._right = np.ascontiguousarray(np.exp(1j * angle_p).T).astype(complex_type)
         self._complex = complex_type
-        pairs = np.stack(np.meshgrid(self.first, self.second, indexing="ij")).reshape(2, -1)
-        self._angles = (-2.0 * np.pi * pairs).astype(dtype)
+        self._angles = np.zeros((2, len(self.first) + len(self.second)), dtype=dtype)
+        self._angles[0, : len(self.first)] = -2.0 * np.pi * self.first
+        self._angles[1, len(self.first) :] = -2.0 * np.pi * self.second
+        self._buffers: dict[int, tuple[NDArray[np.complexfloating], ...]] = {}
 
-    def forward(self, sheets: NDArray[np.floating]) -> NDArray[np.complexfloating]:
-        """Return the modes of sheets (M, N, N)."""
-        half = (sheets.reshape(-1, self.side) @ self._columns).view(self._complex)
-        return np.asarray(np.matmul(self._left, half.reshape(-1, self.side, len(self.second))))
+    def forward(self, stack: NDArray[np.floating]) -> NDArray[np.complexfloating]:
+        """Return the modes of a contiguous stack of sheets (N, M, N)."""
+        half, modes, _ = self._buffers_of(stack.shape[1])
+        np.dot(stack.reshape(-1, self.side), self._columns, out=half.view(self._rows.dtype).reshape(stack.size // self.side, -1))
+        np.dot(self._left, half, out=modes)
+        return modes.reshape(len(self.first), -1, len(self.second))
 
     def inverse(self, modes: NDArray[np.complexfloating]) -> NDArray[np.floating]:
-        """Return the sheets (M, N, N) that have these modes and no others."""
-        half = self._right @ modes
-        return np.asarray(half.reshape(-1, len(self.second)).view(self._rows.dtype) @ self._rows).reshape(
-            -1, self.side, self.side
+        """Return the stack of sheets (N, M, N) that have these modes, contiguous, and no others."""
+        half = self._buffers_of(modes.shape[1])[2]
+        np.dot(self._right, modes.reshape(len(self.first), -1), out=half)
+        return np.dot(half.view(self._rows.dtype).reshape(-1, 2 * len(self.second)), self._rows).reshape(
+            self.side, -1, self.side
         )
 
+    def _buffers_of(self, modules: int) -> tuple[NDArray[np.complexfloating], ...]:
+        """Work space: half-transformed sheets, modes, half-transformed modes."""
+        if modules not in self._buffers:
+            width = modules * len(self.second)
+            rows = (self.side, len(self.first), self.side)
+            self._buffers[modules] = tuple(np.empty((count, width), dtype=self._complex) for count in rows)
+        return self._buffers[modules]
+
     def shift(self, shift_cycles: NDArray[np.floating]) -> NDArray[np.complexfloating]:
-        """Return the factors (M, 2K+1, K+1) that move sheets by shifts (M, 2), cycles of the sheet."""
+        """Return the factors (2K+1, M, K+1) that move sheets by shifts (M, 2), cycles of the sheet."""
         angle = shift_cycles.astype(self._angles.dtype) @ self._angles
         factors = np.empty(angle.shape, dtype=self._complex)
         np.cos(angle, out=factors.real)
         np.sin(angle, out=factors.imag)
-        return factors.reshape(-1, len(self.first), len(self.second))
+        split = len(self.first)
+        return np.asarray(factors[:, :split].T[:, :, None] * factors[:, split:])
 
-    def squared_wave_number(self) -> NDArray[np.int64]:
-        """Return |k|^2 (2K+1, K+1) in the hexagonal metric: axes 120 degrees apart, first shell (1,0), (0,1), (1,1)."""
+    def squared_wave_number(self, metric: Metric = "hexagonal") -> NDArray[np.int64]:
+        """Return |k|^2 (2K+1, K+1).
+
+        Hexagonal: axes 120 degrees apart, first shell (1,0), (0,1), (1,1). Square: orthogonal axes, first shell (1,0), (0,1).
+        """
         p, q = self.first[:, None], self.second
-        return np.asarray(p * p + q * q - p * q)
+        return np.asarray(p * p + q * q - (p * q if metric == "hexagonal" else 0))
 
 
 def shift_sheets(sheets: NDArray[np.floating], shift_cycles: NDArray[np.float64]) -> NDArray[np.floating]:

@@ -20,7 +20,7 @@ def cycles_apart(a, b):
 def test_a_ring_fires_the_printed_stripe():
     ring, position = rings(), np.array([0.07, -0.31])
     ring.step(position)
-    period = ring.periods_m[2]
+    period = ring.periods_m[2, 1]
     angle = ORIENTATIONS[2] + np.radians(60.0)
     d = np.array([np.cos(angle), np.sin(angle)]) @ position
     alpha = np.arange(32) / 32 * period
@@ -29,7 +29,7 @@ def test_a_ring_fires_the_printed_stripe():
 
 
 def test_periods_are_those_of_the_hexagonal_lattice():
-    assert rings().periods_m == pytest.approx(SPACINGS * np.sqrt(3) / 2)
+    assert rings().periods_m == pytest.approx(np.repeat(SPACINGS[:, None] * np.sqrt(3) / 2, 3, axis=1))
 
 
 @given(x=st.floats(-3, 3), y=st.floats(-3, 3))

@@ -33,7 +33,7 @@ def test_the_kernel_has_exactly_the_gains_asked_for():
 
 
 def test_the_kernel_in_space_excites_near_and_inhibits_in_sum():
-    kernel = LowModes(32, 4).inverse(GAINS[None].astype(complex))[0]
+    kernel = LowModes(32, 4).inverse(GAINS[:, None].astype(complex))[:, 0]
     assert kernel[0, 0] == kernel.max() > 0.0
     assert kernel.sum() == pytest.approx(-1.0)
 
