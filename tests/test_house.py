@@ -1,6 +1,7 @@
 """What holds for the package as a whole: cheap imports, a complete wheel, documented and small modules, layers."""
 
 import ast
+import json
 import os
 import subprocess
 import sys
@@ -71,7 +72,7 @@ def test_wheel_holds_every_file_that_the_package_reads(wheel: Path) -> None:
     assert [name for name in names if name.endswith("licenses/LICENSE")]
 
 
-def test_configurations_are_found_by_name_outside_a_checkout(wheel: Path, tmp_path: Path) -> None:
+def test_the_wheel_works_outside_a_checkout(wheel: Path, tmp_path: Path) -> None:
     installed, empty = tmp_path / "installed", tmp_path / "empty"
     empty.mkdir()
     pip = (sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", installed, wheel)
@@ -79,6 +80,10 @@ def test_configurations_are_found_by_name_outside_a_checkout(wheel: Path, tmp_pa
     names = run(sys.executable, "-c", BY_NAME, installed, cwd=empty, path=installed).split()
     assert sorted(names) == sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
     assert {"rgbd", "laser"} <= set(names)
+    mapping = ("map", "lab", "--config", "rgbd", "--end", "1", "--out", "session", "--json")
+    out = run(sys.executable, "-c", "from hybridmap.cli import main; main()", *mapping, cwd=empty, path=installed)
+    assert json.loads(out)["source"] == "lab"
+    assert (empty / "session" / "report.html").is_file()
 
 
 def public(tree: ast.Module) -> list[ast.Module | ast.ClassDef | ast.FunctionDef]:
