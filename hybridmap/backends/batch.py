@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -21,26 +22,46 @@ _MAKE: dict[str, tuple[Callable[[], Any], Callable[..., Any]]] = {
     "lm": (gtsam.LevenbergMarquardtParams, gtsam.LevenbergMarquardtOptimizer),
     "gn": (gtsam.GaussNewtonParams, gtsam.GaussNewtonOptimizer),
     "dogleg": (gtsam.DoglegParams, gtsam.DoglegOptimizer),
+    "dogleg-qr": (gtsam.DoglegParams, gtsam.DoglegOptimizer),
 }
 
+_ON_THE_WAY = 1e-3  # relative tolerance while the graph grows: the next closure comes soon
 _STUCK = 1e4  # Levenberg-Marquardt's lambda where it gave up rather than arrived
 
 
-def run(method: str, factor_graph_: Any, start: Array, max_iterations: int, initial: Any = None) -> Outcome:
+def run(method: str, graph: Any, start: Array, max_iterations: int, *, initial: Any = None, tolerance: float = 1e-5) -> Outcome:
     """One optimiser run; exceptions become the status `failed`, standing still on a slope `stalled`.
+
+    Levenberg-Marquardt that fails or stalls (the normal equations square the condition of the graph) is followed by
+    Dogleg on orthogonal factors, which do not.
 
     Args:
         method: `lm`, `gn` or `dogleg`.
-        factor_graph_: a `gtsam.NonlinearFactorGraph` over keys 0..N-1.
+        graph: a `gtsam.NonlinearFactorGraph` over keys 0..N-1.
         start: (N, 3) poses.
         max_iterations: the limit.
         initial: the same poses as `gtsam.Values`, where they are there already.
+        tolerance: relative decrease of the cost at which an optimiser is done.
     """
+    initial = values(start) if initial is None else initial
+    outcome = _attempt(method, graph, start, initial, max_iterations, tolerance)
+    if method != "lm" or outcome.status in (SolveStatus.CONVERGED, SolveStatus.MAX_ITERATIONS):
+        return outcome
+    onward = initial if outcome.values is None else outcome.values
+    other = _attempt("dogleg-qr", graph, outcome.poses, onward, max_iterations, tolerance)
+    message = f"{outcome.message}; {other.message}"
+    return replace(other, message=message) if other.status is SolveStatus.CONVERGED else replace(outcome, message=message)
+
+
+def _attempt(method: str, graph: Any, start: Array, initial: Any, max_iterations: int, tolerance: float) -> Outcome:
     make_params, make_optimizer = _MAKE[method]
     params = make_params()
     params.setMaxIterations(max_iterations)
+    params.setRelativeErrorTol(tolerance)
+    if method.endswith("-qr"):
+        params.setLinearSolverType("MULTIFRONTAL_QR")
     try:
-        optimizer = make_optimizer(factor_graph_, values(start) if initial is None else initial, params)
+        optimizer = make_optimizer(graph, initial, params)
         result = optimizer.optimize()
     except RuntimeError as error:
         text = str(error).strip().splitlines()
@@ -78,7 +99,7 @@ class WarmStart:
         for edge in graph.edge_ids.tolist():
             whole.push_back(self._factors[edge])
         whole.push_back(anchor(graph.initial[0]))
-        outcome = run(method, whole, start, max_iterations, initial)
+        outcome = run(method, whole, start, max_iterations, initial=initial, tolerance=_ON_THE_WAY)
         self._graph, self._values = graph, initial if outcome.values is None else outcome.values
         return outcome
 
@@ -96,13 +117,7 @@ class BatchBackend(GraphBackend):
 
     def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
         method = self._name.removeprefix("gtsam-")
-        whole = factor_graph(graph, NoiseModels())
-        outcome = run(method, whole, start, self._config.max_iterations)
-        if method == "lm" and outcome.status is not SolveStatus.CONVERGED:
-            other = run("dogleg", whole, outcome.poses, self._config.max_iterations)
-            if other.status is SolveStatus.CONVERGED:
-                return other
-        return outcome
+        return run(method, factor_graph(graph, NoiseModels()), start, self._config.max_iterations)
 
     def _solve_whole(self, graph: PoseGraph) -> Outcome:
         outcome = self._optimise(graph, best_start(graph))

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from hybridmap.backends.base import Solution, SolveStatus
 from hybridmap.backends.batch import run
-from hybridmap.backends.factors import NoiseModels, anchor, factors, poses_of, values
+from hybridmap.backends.factors import NoiseModels, anchor, factor_graph, factors, poses_of, values
 from hybridmap.backends.following import Change, GraphBackend, Outcome, prefix
+from hybridmap.backends.initial import best_start
 from hybridmap.backends.objective import squared_norms
 from hybridmap.backends.robust import WarmKernel, gate_of, with_kernel
 from hybridmap.config.backends import BackendsConfig
@@ -27,6 +28,7 @@ from hybridmap.graph.pose_graph import PoseGraph
 
 _STEP = 0.5  # of a quantised weight's logarithm to the base 2
 _PATIENT, _NEAR_FIRST = 1e-4, 3e-2  # least weight of a loop that takes part in a round
+_MOSTLY = 0.9  # share of loops that least squares must agree with to be worth going on from
 _SLACK = 4.0  # of the bound over the unit variance, where files overstate their noise
 
 
@@ -125,6 +127,17 @@ def graduate(graph: PoseGraph, start: Array, config: BackendsConfig, negligible:
     return replace(settled, rounds=rounds + settled.rounds)
 
 
+def trusting(graph: PoseGraph, config: BackendsConfig) -> Truncated:
+    """Least squares with all loops, then the loops within the gate: right where there is hardly a false one."""
+    bound = gate_of(config)
+    outcome = run("lm", factor_graph(graph, NoiseModels()), best_start(graph), config.max_iterations)
+    kept = squared_norms(graph, outcome.poses)[graph.is_loop] <= bound
+    found = Truncated(outcome.poses, kept, outcome.iterations, bound)
+    if kept.all() or kept.mean() < _MOSTLY:
+        return found
+    return _settle(_Problem(graph), outcome.poses, bound, config.max_iterations)
+
+
 def unit_variance(graph: PoseGraph, result: Truncated) -> float:
     """Chi2 of the inliers per degree of freedom: 1 where the stated noise is the true one; 1 where there is no redundancy."""
     inlier = np.ones(graph.n_edges, dtype=bool)
@@ -210,6 +223,8 @@ class GncBackend(GraphBackend):
         if config.gnc.start == "batch":
             return {"batch": lambda: graduate(graph, graph.initial, config, _PATIENT)}
         attempts: dict[str, Callable[[], Truncated]] = {}
+        if config.gnc.start == "auto":
+            attempts["least squares"] = lambda: trusting(graph, config)
         if driven is not None:
             attempts["drive"] = lambda: graduate(graph, driven, config, _PATIENT)
         attempts["grown"] = lambda: grow(graph, config, _PATIENT)

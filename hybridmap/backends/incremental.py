@@ -44,7 +44,7 @@ class Smoother:
         slots = list(result.getNewFactorsIndices())[-new.n_edges :] if new.n_edges else []
         self._slots.update(zip(new.edge_ids.tolist(), slots, strict=True))
         self.graph = graph
-        extra = self._settle if change.closes else 0
+        extra = self._settle if known == 0 or len(change.removed) else 0
         for _ in range(extra):
             self._isam.update()
         return 1 + extra

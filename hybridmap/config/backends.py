@@ -62,7 +62,7 @@ class Isam2Config(Section):
     relinearize_threshold: float = Field(default=0.01, gt=0)
     """Largest step of a variable (m, rad) before it is linearised anew."""
     settle_updates: int = Field(default=3, ge=0)
-    """Empty updates after a loop edge was added or removed."""
+    """Empty updates after the first one and after an edge was removed."""
 
 
 class BackendsConfig(Section):
