@@ -60,6 +60,8 @@ class PnpConfig(Section):
 
     min_inliers: int = Field(default=12, ge=4)
     """Fewest keypoints that agree."""
+    min_inliers_alone: int = Field(default=30, ge=4)
+    """Fewest where there is too little depth in common view to refine on."""
     reprojection_px: float = Field(default=3.0, gt=0)
     """An inlier's largest reprojection error, pixels (at the working width)."""
     iterations: int = Field(default=200, ge=1)

@@ -56,9 +56,9 @@ class RgbdFrontEnd:
         self._images: deque[tuple[int, RgbdFrame]] = deque(maxlen=rgbd.held_images)
         keys = itertools.count()
         self._tracker = Tracker(self._keyframes, rgbd, self._camera, keys.__next__)
-        verifier = Verifier(self._camera, rgbd.pnp, rgbd.features, rgbd.registration, seed)
-        self._posture = Posture(rgbd.tilt, camera.T_base_camera, verifier.solver, rgbd.features.ratio)
-        self._closer = LoopCloser(self._keyframes, matching, rgbd, verifier, self._yaw_of_shift, keys.__next__)
+        self._verifier = Verifier(self._camera, rgbd.pnp, rgbd.features, rgbd.registration, seed)
+        self._posture = Posture(rgbd.tilt, camera.T_base_camera, self._verifier.solver, rgbd.features.ratio)
+        self._closer = LoopCloser(self._keyframes, matching, rgbd, self._verifier, self._yaw_of_shift, keys.__next__)
         self._frame: RgbdFrame | None = None
         self._image: WorkingImage | None = None
 

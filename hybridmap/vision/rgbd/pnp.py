@@ -118,9 +118,7 @@ class Verifier:
             start = from_planar(flat.delta)
             fit = register(source.surface, target.surface, start, rough, self._registration, pairs)
         if fit is None:
-            sigma = 0.05 / np.sqrt(max(len(first), 1) / 12.0)
-            loose = RelativePose(flat.delta, np.diag([sigma, sigma, np.deg2rad(1.0)]) ** 2)
-            return Verification(with_floor(loose, *self._floors()), "features agree", scores)
+            return self._features_alone(flat, len(first), scores)
         gap = between(flat.delta, fit.relative.delta)
         scores |= {"depth_inliers": fit.inliers, "depth_residual_m": fit.residual_m, "overlap": fit.overlap}
         if np.hypot(gap[0], gap[1]) > 3.0 * self._pnp.agree_m or abs(wrap_angle(gap[2])) > np.deg2rad(
@@ -130,6 +128,14 @@ class Verifier:
         if fit.inliers < self._registration.min_inliers:
             return Verification(None, f"only {fit.inliers:.0%} of the depth in common view fits", scores)
         return Verification(with_floor(fit.relative, *self._floors()), "features and depth agree", scores)
+
+    def _features_alone(self, flat: FloorPose, inliers: int, scores: dict[str, float]) -> Verification:
+        """No depth to refine on or to object: many features must agree, and the edge is looser."""
+        if inliers < self._pnp.min_inliers_alone:
+            return Verification(None, f"only {inliers} features, and too little depth in common view", scores)
+        sigma = 0.1 * np.sqrt(self._pnp.min_inliers_alone / inliers)
+        loose = RelativePose(flat.delta, np.diag([sigma, sigma, np.deg2rad(1.5)]) ** 2)
+        return Verification(with_floor(loose, *self._floors()), "features agree", scores)
 
     def _floors(self) -> tuple[float, float]:
         return self._pnp.translation_floor_m, self._pnp.rotation_floor_deg

@@ -8,7 +8,7 @@ from hybridmap.config.rgbd import RegistrationConfig, RgbdClosingConfig, RgbdCon
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import RelativePose, between, compose
-from hybridmap.streams.base import LaserScan, Rig
+from hybridmap.streams.base import LaserScan, RgbdFrame, Rig
 from hybridmap.vision import create_front_end
 from hybridmap.vision.base import Belief, Verdict
 from hybridmap.vision.rgbd.front_end import RgbdFrontEnd
@@ -135,6 +135,45 @@ def test_another_place_is_refused(poses, frames):
     loops = [p for p in proposals.values() if p.kind == "loop"]
     assert loops
     assert not any(p.verdict is Verdict.ACCEPTED for p in loops)
+
+
+def test_the_end_joins_by_depth_what_features_cannot(poses):
+    """The second lap in other wallpaper: features see nothing, walls and the cupboard are the same."""
+    papers = textures(1), textures(2)
+    config = VisionConfig(rgbd=RgbdConfig(closing=RgbdClosingConfig(min_age_s=8.0)))
+    repapered = [render(VIEW, p, papers[i >= PER_LAP], i * 10**9) for i, p in enumerate(poses)]
+    front_end, proposals, odometry = drive(config, poses, np.deg2rad(0.1), repapered)
+    assert not any(p.verdict is Verdict.ACCEPTED for p in proposals.values() if p.kind == "loop")
+    found = [
+        p for p in front_end.finish(belief_of(odometry)) if p.verdict is Verdict.ACCEPTED and p.target < PER_LAP <= p.source
+    ]
+    assert len({p.source for p in found}) > 4
+    assert all("depth agrees with the map" in p.reason for p in found)
+    assert errors(found, poses)[:, 0].max() < 0.05
+
+
+def test_a_wrong_map_is_not_confirmed_by_depth(poses, frames):
+    front_end, _, _ = drive(VisionConfig(), poses[:PER_LAP], 0.0, frames[:PER_LAP])
+    keyframes = front_end._keyframes
+    true = between(poses[5], poses[6])
+    there = RelativePose(true, np.diag([0.15, 0.15, 0.05]) ** 2)
+    assert front_end._verifier.verify_on_map(keyframes[5], keyframes[6], there).relative is not None
+    wrong = RelativePose(true + np.array([0.0, 1.0, 0.6]), np.diag([0.15, 0.15, 0.05]) ** 2)
+    refused = front_end._verifier.verify_on_map(keyframes[5], keyframes[6], wrong)
+    assert refused.relative is None
+    assert refused.reason
+
+
+def test_frames_without_depth_make_nodes_and_no_edges():
+    front_end = RgbdFrontEnd(VisionConfig(), VIEW, seed=0)
+    blind = RgbdFrame(0, np.full((VIEW.height_px, VIEW.width_px, 3), 90, np.uint8), np.full((180, 240), np.nan, np.float32))
+    step = RelativePose(np.array([0.2, 0.0, 0.0]), np.diag([0.02, 0.02, 0.02]) ** 2)
+    for node in range(3):
+        front_end.add_node(node, front_end.observe(blind, np.zeros(3)))
+        found = front_end.track(node, step if node else None)
+        assert all(p.verdict is Verdict.REJECTED for p in found)
+    assert front_end.close(2, belief_of(np.zeros((3, 3)))) == []
+    assert front_end.finish(belief_of(np.zeros((3, 3)))) == []
 
 
 @pytest.mark.parametrize("mode", ["literal", "ratio", "signed", "plain", "four-band"])
