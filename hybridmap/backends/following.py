@@ -120,7 +120,7 @@ class GraphBackend(ABC):
         started = time.process_time()
         change = difference(self._graph, graph)
         placed = self._admit(graph, change)
-        start = extend(graph, placed)
+        start = self._extend(graph, placed)
         if self._must_work(change):
             outcome = self._guarded(graph, start, change)
         else:
@@ -162,6 +162,9 @@ class GraphBackend(ABC):
         """What `update` does when the graph asks for work."""
         del change
         return self._optimise(graph, start)
+
+    def _extend(self, graph: PoseGraph, placed: Array) -> Array:
+        return extend(graph, placed)
 
     def _must_work(self, change: Change) -> bool:
         return change.closes

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from hybridmap.cli.graphs import GraphSource
 
 _DEFAULT = "odometry,relaxation-ratslam,gtsam-lm,gtsam-cauchy,gtsam-gnc"
-_WIDTH = 120  # columns of a table that goes into a file
+_WIDTH = 140  # columns of a table that goes into a file
 
 
 def compare(

@@ -155,3 +155,15 @@ def test_isam2_takes_a_kernel_on_loops_when_told_so():
     robust = backends.create("gtsam-isam2", config).solve(graph)
     assert set(robust.report.weights) == set(graph.edge_ids[graph.is_loop].tolist())
     assert robust.report.chi2 >= chi2(graph, backends.create("gtsam-lm").solve(graph).poses)
+
+
+def test_odometry_stays_odometry_where_registrations_know_better():
+    graph, _ = laps(np.random.default_rng(0), nodes=12)
+    chain_kinds = graph.kinds.copy()
+    chain_kinds[4:] = EdgeKind.REGISTRATION  # odometry edges from node 4 on were dropped
+    deltas = graph.deltas.copy()
+    deltas[4:, 0] += 0.3
+    refined = replace(graph, kinds=chain_kinds, deltas=deltas)
+    assert np.allclose(backends.create("odometry").solve(refined).poses, graph.initial)
+    *_, last = backends.replay(backends.create("odometry"), refined)
+    assert np.allclose(last.poses, graph.initial)
