@@ -63,6 +63,7 @@ def data_folder() -> Path:
 def run(study: Study) -> dict[str, Any]:
     """Run the steps of a study in an empty folder; what each of its figures came to."""
     rows: list[dict[str, Any]] = []
+    where = machine()
     with tempfile.TemporaryDirectory() as folder:
         hashes: list[str] = []
         for step in study.steps:
@@ -71,7 +72,7 @@ def run(study: Study) -> dict[str, Any]:
             done = execute(step, Path(folder))
             elapsed_s = time.perf_counter() - started
             rows += read(step, done, elapsed_s, hashes)
-    return {"rows": rows, "machine": machine(), "day": time.strftime("%Y-%m-%d", time.gmtime())}
+    return {"rows": rows, "machine": where, "day": time.strftime("%Y-%m-%d", time.gmtime())}
 
 
 def execute(step: Step, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -129,7 +130,8 @@ def machine() -> str:
         names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
         model = names[0] if names else model
     libraries = ", ".join(f"{name} {version(name)}" for name in ("gtsam", "open3d", "numpy"))
-    return f"{os.cpu_count()} cores of {model}, {platform.system()}, Python {platform.python_version()}, {libraries}"
+    system = f"{platform.system()}, Python {platform.python_version()}, {libraries}"
+    return f"{os.cpu_count()} cores of {model} (load {os.getloadavg()[0]:.1f} from other work), {system}"
 
 
 def page(found: dict[str, Any]) -> str:
