@@ -75,6 +75,11 @@ def errors(proposals, poses):
     return np.array([[np.hypot(g[0], g[1]), abs(np.rad2deg(g[2]))] for g in gaps])
 
 
+def sigmas_off(proposal, poses):
+    gap = between(between(poses[proposal.source], poses[proposal.target]), proposal.relative.delta)
+    return np.sqrt(gap @ np.linalg.solve(proposal.relative.covariance, gap))
+
+
 def test_consecutive_nodes_are_registered_better_than_odometry(driven, poses):
     accepted = [p for p in driven[1].values() if p.kind == "registration" and p.verdict is Verdict.ACCEPTED]
     assert len(accepted) > 1.6 * len(poses)
@@ -149,7 +154,8 @@ def test_the_end_joins_by_depth_what_features_cannot(poses):
     ]
     assert len({p.source for p in found}) > 4
     assert all("depth agrees with the map" in p.reason for p in found)
-    assert errors(found, poses)[:, 0].max() < 0.05
+    assert np.median(errors(found, poses)[:, 0]) < 0.005
+    assert max(sigmas_off(p, poses) for p in found) < 3.0
 
 
 def test_a_wrong_map_is_not_confirmed_by_depth(poses, frames):
