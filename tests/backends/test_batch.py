@@ -18,8 +18,10 @@ from hybridmap.graph.io import read_graph
 LEAST_SQUARES = ["gtsam-lm", "gtsam-gn", "gtsam-dogleg", "gtsam-isam2"]
 
 
-def oracle(graph):
-    """The optimum by scipy, node 0 fixed."""
+@pytest.fixture(scope="module")
+def solved_by_scipy():
+    """A graph, and its optimum by scipy with node 0 fixed."""
+    graph, _ = laps(np.random.default_rng(3), nodes=24, per_lap=10)
     root = np.linalg.cholesky(graph.information).transpose(0, 2, 1)
 
     def cost(free):
@@ -27,13 +29,12 @@ def oracle(graph):
         return np.einsum("eij,ej->ei", root, residuals(graph, poses)).ravel()
 
     found = least_squares(cost, graph.initial[1:].ravel(), xtol=1e-14, ftol=1e-14, gtol=1e-12)
-    return np.concatenate([graph.initial[:1], found.x.reshape(-1, 3)]), 2.0 * found.cost
+    return graph, np.concatenate([graph.initial[:1], found.x.reshape(-1, 3)]), 2.0 * found.cost
 
 
 @pytest.mark.parametrize("name", LEAST_SQUARES)
-def test_least_squares_back_ends_find_what_scipy_finds(name):
-    graph, _ = laps(np.random.default_rng(3), nodes=40)
-    poses, best = oracle(graph)
+def test_least_squares_back_ends_find_what_scipy_finds(solved_by_scipy, name):
+    graph, poses, best = solved_by_scipy
     solution = backends.create(name).solve(graph)
     assert solution.report.status == "converged"
     assert solution.report.chi2 == pytest.approx(best, rel=1e-4)
