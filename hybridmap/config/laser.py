@@ -95,6 +95,8 @@ class ProbeConfig(Section):
     """Width of the gate's heading beside that, degrees."""
     window_m: float = Field(default=3.5, gt=0)
     """A target is searched this far about its anchor; the next anchors take over beyond it, m."""
+    targets: int = Field(default=16, ge=1)
+    """Old submaps that are searched more closely, the likeliest."""
     modes_per_target: int = Field(default=2, ge=1)
     """Separated modes that a target may keep."""
     modes: int = Field(default=6, ge=1)
@@ -120,16 +122,14 @@ class CommitmentConfig(Section):
 
     wait_m: float = Field(default=32.0, gt=0)
     """Travel after which a hypothesis that found no cluster is given up, m."""
-    probes: int = Field(default=4, ge=1)
+    probes: int = Field(default=3, ge=1)
     """Distinct probes that a cluster needs."""
-    span_m: float = Field(default=9.0, ge=0)
-    """Travel that they must cover, m."""
-    sure_sigma_m: float = Field(default=0.8, ge=0)
-    """Below this standard deviation of the gate fewer are enough, m."""
-    sure_probes: int = Field(default=2, ge=1)
-    """Distinct probes that are enough then."""
-    sure_span_m: float = Field(default=3.0, ge=0)
-    """Travel that they must cover then, m."""
+    span_m: float = Field(default=3.0, ge=0)
+    """Travel that they must cover, m, and more in a wide gate, where more places look alike."""
+    sure_sigma_m: float = Field(default=0.8, gt=0)
+    """Below this standard deviation of the gate one probe less is enough; above it more travel is needed, m."""
+    span_per_efold_m: float = Field(default=1.0, ge=0)
+    """Travel that they must cover beside that for each factor e by which the gate is wider, m."""
     rival: float = Field(default=0.75, gt=0, le=1)
     """The best rival cluster must score less than this share of the cluster."""
     heading_deg_per_sqrt_m: float = Field(default=0.45, gt=0)

@@ -69,19 +69,23 @@ class Commitment:
         self._queue.append(Waiting(key, hypothesis))
 
     def settle(self, travel_m: float, belief: Belief) -> list[Settled]:
-        """Commit the best cluster if it is good enough, with all that agrees with it; give up what waited too long."""
-        out: list[Settled] = []
-        while (cluster := self._ripe(belief)) is not None:
-            out += self._commit(cluster)
+        """Give up what waited too long; commit the best cluster if it is good enough, with all that agrees with it."""
         old = [w for w in self._queue if travel_m - self._travel(w.hypothesis.probe) > self._config.wait_m]
-        out += [Settled(w.key, w.hypothesis, False, f"no cluster within {self._config.wait_m:g} m of travel") for w in old]
+        out = [Settled(w.key, w.hypothesis, False, f"no cluster within {self._config.wait_m:g} m of travel") for w in old]
         self._keep([i for i, w in enumerate(self._queue) if w not in old])
+        return out + self._commit_all(belief, self._config.span_per_efold_m)
+
+    def flush(self, belief: Belief) -> list[Settled]:
+        """At the end, when no more evidence will come: commit by the rule for a narrow gate and give up the rest."""
+        out = self._commit_all(belief, 0.0)
+        out += [Settled(w.key, w.hypothesis, False, "no cluster by the end") for w in self._queue]
+        self._keep([])
         return out
 
-    def flush(self) -> list[Settled]:
-        """Give up everything that waits."""
-        out = [Settled(w.key, w.hypothesis, False, "no cluster by the end") for w in self._queue]
-        self._keep([])
+    def _commit_all(self, belief: Belief, span_per_efold_m: float) -> list[Settled]:
+        out: list[Settled] = []
+        while (cluster := self._ripe(belief, span_per_efold_m)) is not None:
+            out += self._commit(cluster)
         return out
 
     def _keep(self, positions: list[int]) -> None:
@@ -89,22 +93,22 @@ class Commitment:
         self._consistent = self._consistent[np.ix_(known, known)]
         self._queue = [self._queue[p] for p in positions]
 
-    def _ripe(self, belief: Belief) -> Cluster | None:
+    def _ripe(self, belief: Belief, span_per_efold_m: float) -> Cluster | None:
         self._extend(belief)
         clusters = self._clusters()
         if not clusters:
             return None
         best = clusters[0]
-        if not self._enough(best):
+        if not self._enough(best, span_per_efold_m):
             return None
         rival = max((c.score for c in clusters[1:] if self._rivals(best, c)), default=0.0)
         return best if rival < self._config.rival * best.score else None
 
-    def _enough(self, cluster: Cluster) -> bool:
+    def _enough(self, cluster: Cluster, span_per_efold_m: float) -> bool:
         c = self._config
-        if cluster.probes >= c.probes and cluster.span_m >= c.span_m:
-            return True
-        return cluster.sigma_m < c.sure_sigma_m and cluster.probes >= c.sure_probes and cluster.span_m >= c.sure_span_m
+        wider = max(0.0, float(np.log(max(cluster.sigma_m, 1e-9) / c.sure_sigma_m)))
+        probes = c.probes if wider > 0.0 else max(c.probes - 1, 1)
+        return cluster.probes >= probes and cluster.span_m >= c.span_m + span_per_efold_m * wider
 
     def _commit(self, cluster: Cluster) -> list[Settled]:
         """Accept everything that agrees with all members; refuse what contradicts most of them."""

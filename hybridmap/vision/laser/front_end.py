@@ -21,6 +21,9 @@ from hybridmap.vision.laser.submap import Atlas
 from hybridmap.vision.laser.tracking import Step, Tracker
 from hybridmap.vision.profile import laser_profile
 
+LAST_PROBE_M = 0.5
+"""Travel since the last probe after which the end of the drive is worth one of its own."""
+
 MOST_BETWEEN = 30
 """Scans between two nodes that a weak registration is retried with, at most."""
 
@@ -88,7 +91,11 @@ class LaserFrontEnd:
         travel_m = self._atlas.travel_m[node]
         if travel_m - self._last_probe_m < self._config.probes.every_m:
             return []
-        self._last_probe_m = travel_m
+        out = self._probe(node, belief)
+        return out + [_settled(s) for s in self._commitment.settle(travel_m, belief)]
+
+    def _probe(self, node: int, belief: Belief) -> list[Proposal]:
+        self._last_probe_m = self._atlas.travel_m[node]
         out = []
         for hypothesis in self._prober.probe(node, belief):
             key = self._next_key()
@@ -97,11 +104,14 @@ class LaserFrontEnd:
             else:
                 self._commitment.add(key, hypothesis)
                 out.append(_loop(key, hypothesis, Verdict.PENDING, "waits for a cluster"))
-        return out + [_settled(s) for s in self._commitment.settle(travel_m, belief)]
+        return out
 
     def finish(self, belief: Belief) -> list[Proposal]:
-        """Give up what still waits; register nodes that came near each other on the optimised map."""
-        out = [_settled(s) for s in self._commitment.flush()]
+        """Probe from where the robot ended, settle all that waits; register nodes that came near each other on the map."""
+        last, out = len(self._atlas) - 1, []
+        if last >= 0 and self._atlas.travel_m[last] - self._last_probe_m > LAST_PROBE_M:
+            out = self._probe(last, belief)
+        out += [_settled(s) for s in self._commitment.flush(belief)]
         for hypothesis in self._reviser.round(belief):
             verdict = Verdict.REJECTED if hypothesis.refusal else Verdict.ACCEPTED
             out.append(_loop(self._next_key(), hypothesis, verdict, hypothesis.refusal or "near on the optimised map"))

@@ -11,11 +11,12 @@ from hybridmap.geometry import Array, RelativePose, between, inverse, invert_rel
 from hybridmap.streams.base import Laser
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.registration import Alignment, align, second_mode
-from hybridmap.vision.laser.search import STEP_DEG, STEP_M, search, spaced, square
-from hybridmap.vision.laser.submap import Atlas, Submap, Target
+from hybridmap.vision.laser.search import STEP_DEG, STEP_M, Start, sharpened, spaced, square, survivors
+from hybridmap.vision.laser.submap import Atlas, Field, Submap
 from hybridmap.vision.laser.visibility import violation
 
 REGISTERED_POINTS = 400
+UNKNOWN = 1e8
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +54,20 @@ class _Gate:
 
 
 @dataclass(frozen=True, slots=True)
+class _Candidate:
+    """A target inside the gate with its best starts, the best first."""
+
+    gate: _Gate
+    target: Submap
+    starts: list[Start]
+
+
+@dataclass(frozen=True, slots=True)
 class _Mode:
     """A promising start: pose (3,) of the probe in the target's frame and its score."""
 
     gate: _Gate
-    target: Target
+    target: Submap
     pose: Array
     score: float
 
@@ -76,9 +86,11 @@ class Prober:
         c, atlas = self._config.probes, self._atlas
         recent = atlas.along(atlas.travel_m[node] - c.length_m, atlas.travel_m[node])
         recent = recent[recent <= node]
-        center = int(recent[len(recent) // 2])
-        probe = atlas.submap(center, recent)
-        modes = [m for gate in self._gates(center, int(recent[0]), belief) for m in self._modes(gate, probe)]
+        middle = 0.5 * (atlas.travel_m[int(recent[0])] + atlas.travel_m[node])
+        probe = atlas.submap(int(recent[np.searchsorted(np.asarray(atlas.travel_m)[recent], middle)]), recent)
+        candidates = [self._candidate(gate, probe) for gate in self._gates(probe.anchor, int(recent[0]), belief)]
+        candidates = sorted((k for k in candidates if k.starts), key=lambda k: -k.starts[0].score)
+        modes = [mode for candidate in candidates[: c.targets] for mode in self._modes(candidate, probe)]
         modes.sort(key=lambda m: -m.score)
         found = [self._verify(mode, probe) for mode in modes[: c.modes]]
         return _distinct(found)
@@ -100,7 +112,7 @@ class Prober:
         anchors = [a for a in self._anchors if atlas.travel_m[a] < limit]
         if not anchors:
             return []
-        covariance = belief.covariance_from(center)[anchors]
+        covariance = np.nan_to_num(belief.covariance_from(center)[anchors], posinf=UNKNOWN)
         sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:, :2, :2])[:, 1])
         radius = c.gate_sigmas * sigma_m + c.gate_m
         heading = c.gate_sigmas * np.sqrt(covariance[:, 2, 2]) + np.deg2rad(c.gate_deg)
@@ -111,28 +123,32 @@ class Prober:
             for i in np.flatnonzero(inside)
         ]
 
-    def _modes(self, gate: _Gate, probe: Submap) -> list[_Mode]:
-        """Separated maxima of the likelihood over the part of the gate that this target answers for."""
-        c, atlas = self._config.probes, self._atlas
+    def _candidate(self, gate: _Gate, probe: Submap) -> _Candidate:
+        """The best starts on the part of the gate that this target answers for."""
+        c = self._config.probes
+        target = self._atlas.around(gate.anchor, c.target_half_m)
         offsets = square(c.window_m, 2.0 * STEP_M)
         inside = (np.hypot(offsets[:, 0], offsets[:, 1]) <= c.window_m) & (
             np.hypot(*(offsets - gate.expected[:2]).T) <= gate.radius_m
         )
-        offsets = offsets[inside]
-        if len(offsets) == 0:
-            return []
-        travel = atlas.travel_m[gate.anchor]
-        nodes = atlas.along(travel - c.target_half_m, travel + c.target_half_m)
-        target = atlas.target(gate.anchor, nodes, c.window_m + STEP_M)
+        if not inside.any():
+            return _Candidate(gate, target, [])
         headings = gate.expected[2] + np.deg2rad(spaced(np.rad2deg(gate.heading_rad), 2.0 * STEP_DEG))
-        points = probe.cloud.thinned(c.points).points
-        starts = search(target.wide, target.sharp, points, offsets, headings, c.modes_per_target)
-        return [_Mode(gate, target, start.pose, start.score) for start in starts]
+        points = probe.cloud.thinned(c.points // 2).points
+        wide = self._atlas.scoring_field(target, Field.WIDE)
+        return _Candidate(gate, target, survivors(wide, points, offsets[inside], headings))
+
+    def _modes(self, candidate: _Candidate, probe: Submap) -> list[_Mode]:
+        """Separated maxima of the likelihood on one target."""
+        c = self._config.probes
+        sharp = self._atlas.scoring_field(candidate.target, Field.SHARP)
+        starts = sharpened(sharp, probe.cloud.thinned(c.points).points, candidate.starts, c.modes_per_target)
+        return [_Mode(candidate.gate, candidate.target, start.pose, start.score) for start in starts]
 
     def _verify(self, mode: _Mode, probe: Submap) -> Hypothesis:
         c = self._config.probes
-        cloud = probe.cloud.thinned(REGISTERED_POINTS)
-        alignment = align(mode.target.fine, cloud, mode.pose[None], self._config.registration)
+        cloud, field = probe.cloud.thinned(REGISTERED_POINTS), self._atlas.fine_field(mode.target)
+        alignment = align(field, cloud, mode.pose[None], self._config.registration)
         pose = alignment.poses[0]
         scores = {
             "start": mode.score,
@@ -144,10 +160,10 @@ class Prober:
         }
         covariance = alignment.covariance(0, self._config.registration, c.floor_m, np.deg2rad(c.floor_deg))
         scores["loosest_m"] = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1]))
-        scores["ambiguity"] = second_mode(mode.target.fine, cloud, alignment)
+        scores["ambiguity"] = second_mode(field, cloud, alignment)
         refusal = self._refusal(mode, alignment, scores)
         if not refusal:
-            refusal = self._free_space(mode.target.submap, probe, pose, scores)
+            refusal = self._free_space(mode.target, probe, pose, scores)
         relative = invert_relative(RelativePose(pose, covariance))
         quality = scores["near"] * scores["fit"]
         return Hypothesis(probe.anchor, mode.gate.anchor, relative, quality, mode.gate.sigma_m, scores, refusal)

@@ -13,7 +13,7 @@ from hybridmap.vision.laser.hypotheses import Hypothesis
 from hybridmap.vision.laser.likelihood import score_starts
 from hybridmap.vision.laser.registration import Prior, align, second_mode
 from hybridmap.vision.laser.search import spaced, square
-from hybridmap.vision.laser.submap import Atlas, Submap
+from hybridmap.vision.laser.submap import Atlas, Field, Submap
 from hybridmap.vision.laser.visibility import violation
 
 
@@ -60,25 +60,21 @@ class Reviser:
                 chosen.append(other)
         return [o for o in chosen[: c.partners] if (node, o) not in self._done]
 
-    def _submap(self, node: int, half_m: float) -> NDArray[np.int64]:
-        travel = self._atlas.travel_m[node]
-        return self._atlas.along(travel - half_m, travel + half_m)
-
     def _register(self, node: int, other: int, poses: Array) -> Hypothesis:
         c, settings = self._config.revisits, self._config.registration
-        target = self._atlas.target(other, self._submap(other, c.target_half_m), 0.5)
-        probe = self._atlas.submap(node, self._submap(node, c.probe_half_m))
+        target, probe = self._atlas.around(other, c.target_half_m), self._atlas.around(node, c.probe_half_m)
+        sharp, fine = self._atlas.scoring_field(target, Field.SHARP), self._atlas.fine_field(target)
         expected = between(poses[other], poses[node])
         offsets = square(c.search_m, 0.15)
         headings = expected[2] + np.deg2rad(spaced(c.search_deg, 1.5))
-        scores = score_starts(target.sharp, probe.cloud.thinned(100).points, expected[:2], headings, offsets)
+        scores = score_starts(sharp, probe.cloud.thinned(100).points, expected[:2], headings, offsets)
         h, t = np.unravel_index(int(np.argmax(scores)), scores.shape)
         start = np.array([*(expected[:2] + offsets[t]), headings[h]])
         prior = Prior(expected, 1.0 / np.array([1.0, 1.0, 0.2]) ** 2)
-        alignment = align(target.fine, probe.cloud.thinned(300), start[None], settings, prior)
+        alignment = align(fine, probe.cloud.thinned(300), start[None], settings, prior)
         covariance = alignment.covariance(0, settings, c.floor_m, np.deg2rad(c.floor_deg))
         pose = alignment.poses[0]
-        doubt = second_mode(target.fine, probe.cloud, alignment)
+        doubt = second_mode(fine, probe.cloud, alignment)
         if doubt > self._config.probes.ambiguity_max:
             weakest = alignment.weakest_direction(0)
             covariance[:2, :2] += c.ambiguous_m**2 * np.outer(weakest, weakest)
@@ -89,7 +85,7 @@ class Reviser:
             "off_m": float(np.hypot(*(pose - expected)[:2])),
             "off_deg": float(np.rad2deg(abs(wrap_angle(pose[2] - expected[2])))),
         }
-        refusal = self._refusal(figures) or self._free_space(target.submap, probe, pose, figures)
+        refusal = self._refusal(figures) or self._free_space(target, probe, pose, figures)
         relative = invert_relative(RelativePose(pose, covariance))
         return Hypothesis(node, other, relative, figures["near"] * figures["fit"], 0.0, figures, refusal)
 

@@ -25,24 +25,32 @@ class Start:
     score: float
 
 
-def search(
-    wide: LikelihoodField, sharp: LikelihoodField, points: Array, offsets_m: Array, headings_rad: Array, count: int
-) -> list[Start]:
-    """The best separated starts of a grid.
+def survivors(wide: LikelihoodField, points: Array, offsets_m: Array, headings_rad: Array) -> list[Start]:
+    """The best starts of a grid, whether separated or not, the best first.
 
     Args:
         wide: the target's field with a likelihood as wide as the steps of the grid.
-        sharp: the target's field with half that width.
         points: (P, 2) in the moving frame.
         offsets_m: (T, 2) positions of the grid, twice `STEP_M` apart.
         headings_rad: (H,) headings of the grid, twice `STEP_DEG` apart.
+    """
+    scores = score_starts(wide, points, np.zeros(2), headings_rad, offsets_m)
+    best = np.argsort(-scores, axis=None, kind="stable")[:SURVIVORS]
+    h, t = np.unravel_index(best, scores.shape)
+    poses = np.column_stack([offsets_m[t], headings_rad[h]])
+    return [Start(pose, float(score)) for pose, score in zip(poses, scores[h, t], strict=True)]
+
+
+def sharpened(sharp: LikelihoodField, points: Array, starts: list[Start], count: int) -> list[Start]:
+    """The best separated poses about some starts.
+
+    Args:
+        sharp: the target's field with half the width of that which found the starts.
+        points: (P, 2) in the moving frame.
+        starts: what is left of the grid.
         count: how many at most.
     """
-    rough = score_starts(wide, points[::2], np.zeros(2), headings_rad, offsets_m)
-    best = np.argsort(-rough, axis=None, kind="stable")[:SURVIVORS]
-    h, t = np.unravel_index(best, rough.shape)
-    poses = np.column_stack([offsets_m[t], headings_rad[h]])
-    poses = (poses[:, None] + _star()[None]).reshape(-1, 3)
+    poses = (np.array([start.pose for start in starts])[:, None] + _star()[None]).reshape(-1, 3)
     return separated(poses, score_poses(sharp, points, poses), count)
 
 

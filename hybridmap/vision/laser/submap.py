@@ -1,10 +1,12 @@
-"""Old submaps as targets of registration, built once from the chain and kept while there is room."""
+"""The clouds of all nodes along the chain, and submaps of them with their fields, kept while there is room."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import Enum
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +16,12 @@ from hybridmap.geometry import Array, between
 from hybridmap.vision.laser.cloud import Cloud, merged
 from hybridmap.vision.laser.likelihood import LikelihoodField, build_field
 
-WIDE = (0.2, 0.8, 0.4)
-SHARP = (0.1, 0.5, 0.2)
+SEARCH_M = 4.5
+"""Starts may lie this far from the anchor of a submap."""
+
+Span = tuple[int, int, int]
+Key = TypeVar("Key")
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,23 +46,42 @@ class Submap:
         return np.unique(np.linspace(0, n - 1, min(count, n)).round().astype(np.int64))
 
 
-@dataclass(frozen=True, slots=True)
-class Target:
-    """A submap with its fields: a wide and a sharp one to score starts on, a fine one to register to."""
+class Field(Enum):
+    """Which likelihood field of a submap: cell, reach and width of the likelihood, m; how many are kept."""
 
-    submap: Submap
-    wide: LikelihoodField
-    sharp: LikelihoodField
-    fine: LikelihoodField
+    WIDE = (0.2, 0.8, 0.4, 800)
+    SHARP = (0.1, 0.5, 0.2, 160)
+
+
+FINE_KEPT = 40
+SUBMAPS_KEPT = 1000
+
+
+class _Recent(Generic[Key, Value]):
+    """A bounded dictionary that forgets what was not asked for longest."""
+
+    def __init__(self, kept: int) -> None:
+        self._kept = kept
+        self._items: OrderedDict[Key, Value] = OrderedDict()
+
+    def get(self, key: Key, make: Callable[[], Value]) -> Value:
+        if key in self._items:
+            self._items.move_to_end(key)
+            return self._items[key]
+        self._items[key] = value = make()
+        while len(self._items) > self._kept:
+            self._items.popitem(last=False)
+        return value
 
 
 class Atlas:
     """The clouds of all nodes with the chain of refined poses; makes submaps and targets of them."""
 
-    def __init__(self, config: LaserConfig, targets_kept: int = 160) -> None:
+    def __init__(self, config: LaserConfig) -> None:
         self._config = config
-        self._kept = targets_kept
-        self._targets: OrderedDict[tuple[int, int, int, float], Target] = OrderedDict()
+        self._submaps: _Recent[Span, Submap] = _Recent(SUBMAPS_KEPT)
+        self._fine: _Recent[Span, LikelihoodField] = _Recent(FINE_KEPT)
+        self._scoring: dict[Field, _Recent[Span, LikelihoodField]] = {kind: _Recent(kind.value[3]) for kind in Field}
         self.clouds: list[Cloud] = []
         self.ranges: list[NDArray[np.float32]] = []
         self.chain: list[Array] = []
@@ -86,20 +111,27 @@ class Atlas:
         cloud = merged([self.clouds[i].moved(p) for i, p in zip(numbers, poses, strict=True)], self._config.scan.cell_m)
         return Submap(anchor, numbers, poses, cloud)
 
-    def target(self, anchor: int, nodes: NDArray[np.int64], search_m: float) -> Target:
-        """The submap of those nodes with its fields, from the cache if it is there."""
-        key = (anchor, int(nodes[0]), int(nodes[-1]), search_m)
-        if key in self._targets:
-            self._targets.move_to_end(key)
-            return self._targets[key]
-        submap, settings = self.submap(anchor, nodes), self._config.registration
-        target = Target(
-            submap,
-            build_field(submap.cloud, *WIDE, search_m),
-            build_field(submap.cloud, *SHARP, search_m),
-            build_field(submap.cloud, self._config.scan.cell_m, settings.reach_m, settings.field_sigma_m),
+    def around(self, anchor: int, half_m: float) -> Submap:
+        """The submap of the nodes within so many metres of travel of an anchor; kept for the next time."""
+        travel = self.travel_m[anchor]
+        nodes = self.along(travel - half_m, travel + half_m)
+        return self._submaps.get(_span(anchor, nodes), lambda: self.submap(anchor, nodes))
+
+    def scoring_field(self, target: Submap, kind: Field) -> LikelihoodField:
+        """A field of a submap on which starts up to `SEARCH_M` from its anchor are scored."""
+        cell_m, reach_m, sigma_m, _ = kind.value
+        return self._scoring[kind].get(
+            _span(target.anchor, target.nodes), lambda: build_field(target.cloud, cell_m, reach_m, sigma_m, SEARCH_M)
         )
-        self._targets[key] = target
-        while len(self._targets) > self._kept:
-            self._targets.popitem(last=False)
-        return target
+
+    def fine_field(self, target: Submap) -> LikelihoodField:
+        """The field of a submap to which clouds are registered."""
+        settings, cell_m = self._config.registration, self._config.scan.cell_m
+        return self._fine.get(
+            _span(target.anchor, target.nodes),
+            lambda: build_field(target.cloud, cell_m, settings.reach_m, settings.field_sigma_m),
+        )
+
+
+def _span(anchor: int, nodes: NDArray[np.int64]) -> Span:
+    return anchor, int(nodes[0]), int(nodes[-1])

@@ -29,16 +29,36 @@ def commitment():
 
 
 def test_waits_until_enough_probes_over_enough_travel_agree(commitment):
-    for key, probe in enumerate((200, 206, 212)):
+    for key, probe in enumerate((200, 203)):
         commitment.add(key, hypothesis(probe, 20 + key))
         assert commitment.settle(TRAVEL[probe], BELIEF) == []
-    commitment.add(3, hypothesis(214, 22))
-    assert commitment.settle(TRAVEL[214], BELIEF) == []
-    commitment.add(4, hypothesis(219, 24))
-    settled = commitment.settle(TRAVEL[219], BELIEF)
-    assert [s.key for s in settled] == [0, 1, 2, 3, 4]
+    commitment.add(2, hypothesis(206, 22))
+    assert commitment.settle(TRAVEL[206], BELIEF) == []
+    commitment.add(3, hypothesis(210, 24))
+    settled = commitment.settle(TRAVEL[210], BELIEF)
+    assert [s.key for s in settled] == [0, 1, 2, 3]
     assert all(s.accepted for s in settled)
-    assert "5 probes over 9.5 m" in settled[0].reason
+    assert "4 probes over 5.0 m" in settled[0].reason
+
+
+def test_a_wider_gate_asks_for_more_travel():
+    def travel_needed(sigma_m):
+        commitment = Commitment(CommitmentConfig(), TRAVEL.__getitem__, CHAIN.__getitem__)
+        for key, probe in enumerate(range(200, 240, 2)):
+            commitment.add(key, hypothesis(probe, 20, sigma_m=sigma_m))
+            if commitment.settle(TRAVEL[probe], BELIEF):
+                return TRAVEL[probe] - TRAVEL[200]
+        return np.inf
+
+    needed = [travel_needed(s) for s in (0.3, 5.0, 50.0)]
+    assert needed == [3.0, 5.0, 8.0]
+
+
+def test_at_the_end_the_rule_of_a_narrow_gate_holds_for_all(commitment):
+    for key, probe in enumerate((200, 203, 206)):
+        commitment.add(key, hypothesis(probe, 20, sigma_m=50.0))
+    assert commitment.settle(TRAVEL[206], BELIEF) == []
+    assert [s.accepted for s in commitment.flush(BELIEF)] == [True, True, True]
 
 
 def test_fewer_are_enough_where_the_gate_is_narrow(commitment):
@@ -68,8 +88,8 @@ def test_single_hypotheses_that_agree_with_nothing_are_given_up(commitment):
     late = commitment.settle(TRAVEL[200] + 33.0, BELIEF)
     assert [(s.key, s.accepted) for s in late] == [(0, False)]
     assert "32 m" in late[0].reason
-    assert [s.key for s in commitment.flush()] == [1, 2, 3]
-    assert commitment.flush() == []
+    assert [(s.key, s.accepted) for s in commitment.flush(BELIEF)] == [(1, False), (2, False), (3, False)]
+    assert commitment.flush(BELIEF) == []
 
 
 def test_several_hypotheses_of_one_probe_count_once(commitment):
