@@ -18,8 +18,8 @@ from hybridmap.backends.base import Solution, SolveStatus
 from hybridmap.backends.batch import run
 from hybridmap.backends.factors import NoiseModels, anchor, factor_graph, factors, poses_of, values
 from hybridmap.backends.following import Change, GraphBackend, Outcome, prefix
-from hybridmap.backends.initial import best_start
-from hybridmap.backends.objective import squared_norms
+from hybridmap.backends.initial import best_start, trusted_start
+from hybridmap.backends.objective import squared_norms, truncated_cost
 from hybridmap.backends.robust import WarmKernel, gate_of, with_kernel
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
@@ -88,12 +88,6 @@ def truncated_weights(squared: Array, mu: float, bound: float) -> Array:
     between_ = np.sqrt(bound * mu * (mu + 1.0) / np.maximum(squared, 1e-300)) - mu
     inside, outside = squared <= bound * mu / (mu + 1.0), squared >= bound * (mu + 1.0) / mu
     return np.asarray(np.where(inside, 1.0, np.where(outside, 0.0, np.clip(between_, 0.0, 1.0))))
-
-
-def truncated_cost(graph: PoseGraph, poses: Array, bound: float) -> float:
-    """What is minimised: chi2 with the squared residual of each loop cut off at the bound."""
-    every = squared_norms(graph, poses)
-    return float(np.where(graph.is_loop, np.minimum(every, bound), every).sum())
 
 
 def graduate(graph: PoseGraph, start: Array, config: BackendsConfig, negligible: float) -> Truncated:
@@ -221,7 +215,7 @@ class GncBackend(GraphBackend):
     def _attempts(self, graph: PoseGraph, driven: Array | None) -> dict[str, Callable[[], Truncated]]:
         config = self._config
         if config.gnc.start == "batch":
-            return {"batch": lambda: graduate(graph, graph.initial, config, _PATIENT)}
+            return {"batch": lambda: graduate(graph, trusted_start(graph, gate_of(config)), config, _PATIENT)}
         attempts: dict[str, Callable[[], Truncated]] = {}
         if config.gnc.start == "auto":
             attempts["least squares"] = lambda: trusting(graph, config)

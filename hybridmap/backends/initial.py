@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 
-from hybridmap.backends.objective import chi2
+from hybridmap.backends.objective import chi2, truncated_cost
 from hybridmap.geometry import Array
+from hybridmap.graph.connectivity import extend
 from hybridmap.graph.pose_graph import PoseGraph
 
 
@@ -20,6 +21,15 @@ def best_start(graph: PoseGraph) -> Array:
     if angular is None or chi2(graph, graph.initial) <= chi2(graph, angular):
         return graph.initial
     return angular
+
+
+def trusted_start(graph: PoseGraph, bound: float) -> Array:
+    """The graph's `initial` or the chain of its best consecutive edges, by chi2 with loops cut off at `bound`; (N, 3).
+
+    For back-ends that must not trust loops. In a map `initial` is odometry alone, and registrations know better.
+    """
+    chained = extend(graph, graph.initial[:1])
+    return min((graph.initial, chained), key=lambda poses: truncated_cost(graph, poses, bound))
 
 
 def angular_start(graph: PoseGraph) -> Array | None:

@@ -30,3 +30,9 @@ def chi2(graph: PoseGraph, poses: Array) -> float:
     with np.errstate(invalid="ignore", over="ignore"):
         total = float(squared_norms(graph, poses).sum())
     return total if np.isfinite(total) else float("inf")
+
+
+def truncated_cost(graph: PoseGraph, poses: Array, bound: float) -> float:
+    """Chi2 with the squared residual of each loop cut off at a bound: what judges poses where loops may be false."""
+    every = squared_norms(graph, poses)
+    return float(np.where(graph.is_loop, np.minimum(every, bound), every).sum())

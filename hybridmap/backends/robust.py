@@ -13,6 +13,7 @@ from scipy.stats import chi2 as chi2_law
 from hybridmap.backends.batch import WarmStart, run
 from hybridmap.backends.factors import NoiseModels, factor_graph
 from hybridmap.backends.following import Change, GraphBackend, Outcome
+from hybridmap.backends.initial import trusted_start
 from hybridmap.backends.objective import squared_norms
 from hybridmap.config.backends import BackendsConfig, RobustConfig
 from hybridmap.geometry import Array
@@ -78,3 +79,6 @@ class KernelBackend(GraphBackend):
 
     def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
         return with_kernel(self._name, graph, start, self._config)
+
+    def _solve_whole(self, graph: PoseGraph) -> Outcome:
+        return self._optimise(graph, trusted_start(graph, gate_of(self._config)))
