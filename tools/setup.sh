@@ -120,7 +120,7 @@ install_libraries() {
   if ((${#packages[@]})) && can_apt; then
     say "installing system libraries: ${packages[*]}"
     as_root apt-get update -qq || say "apt-get update failed; trying with the lists at hand"
-    as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${packages[@]}" >&2 ||
+    as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${packages[@]}" >/dev/null ||
       say "apt-get install failed (see above)"
     missing="$(missing_libraries)"
     [[ -z "$missing" ]] && return 0
