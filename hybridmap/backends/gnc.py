@@ -28,6 +28,7 @@ from hybridmap.graph.pose_graph import PoseGraph
 
 _STEP = 0.5  # of a quantised weight's logarithm to the base 2
 _PATIENT, _NEAR_FIRST = 1e-4, 3e-2  # least weight of a loop that takes part in a round
+_QUICK = 15  # iterations: least squares needs fewer where loops agree, and is of no use where they do not
 _MOSTLY = 0.9  # share of loops that least squares must agree with to be worth going on from
 _SLACK = 4.0  # of the bound over the unit variance, where files overstate their noise
 
@@ -124,7 +125,8 @@ def graduate(graph: PoseGraph, start: Array, config: BackendsConfig, negligible:
 def trusting(graph: PoseGraph, config: BackendsConfig) -> Truncated:
     """Least squares with all loops, then the loops within the gate: right where there is hardly a false one."""
     bound = gate_of(config)
-    outcome = run("lm", factor_graph(graph, NoiseModels()), best_start(graph), config.max_iterations)
+    limit = min(_QUICK, config.max_iterations)
+    outcome = run("lm", factor_graph(graph, NoiseModels()), best_start(graph), limit)
     kept = squared_norms(graph, outcome.poses)[graph.is_loop] <= bound
     found = Truncated(outcome.poses, kept, outcome.iterations, bound)
     if kept.all() or kept.mean() < _MOSTLY:
