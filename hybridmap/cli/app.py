@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from hybridmap.cli.calibrate import calibrate
 from hybridmap.cli.compare import compare
 from hybridmap.cli.demo import demo
 from hybridmap.cli.evaluate import evaluate
@@ -55,6 +56,7 @@ app.command("evaluate")(evaluate)
 app.command("export")(export)
 app.command("optimize")(optimize)
 app.command("compare")(compare)
+app.command("calibrate")(calibrate)
 app.command("simulate")(simulate)
 app.command("inspect")(inspect)
 

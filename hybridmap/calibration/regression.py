@@ -1,0 +1,184 @@
+"""Regression of odometry on known poses: the robust estimate of gain, turn gain, heading bias and delay.
+
+Two things make it differ from a plain least-squares fit. Legs are long and overlap: drift is what counts, while the noise
+of each pose (and the choice of nodes by the very odometry that is calibrated) matters less the longer a leg is. And the
+delay between odometry and the views is estimated along: a scan that is stamped 0.1 s late looks like an error of 10 deg in
+heading at each end of a fast turn.
+
+Only two components of a leg are used: the heading at its end, linear in turn gain, bias and delay, and its length along the
+measured chord, linear in the gain. What is seen sideways depends on the mounting of the sensor and on *where* on the leg the
+heading went wrong, and would bias the estimate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.calibration.estimate import Estimate
+from hybridmap.calibration.gains import NEUTRAL, Gains
+from hybridmap.calibration.legs import Legs, Motion
+from hybridmap.errors import EvaluationError
+from hybridmap.geometry import Array, between, wrap_angle
+
+LEG_M = (1.0, 16.0)
+"""Shortest and longest leg, m; the longest is about the window over which dead reckoning is judged."""
+INDEPENDENT_LEGS = 16.0
+"""Legs are so short that the way holds this many one after the other, as far as the limits allow."""
+
+_ROUNDS = 40
+_CAUCHY = 2.0  # in robust standard deviations: 89 % efficiency for Gaussian noise
+_FLOOR_RAD = np.radians(0.5)
+_WALK_RAD = np.radians(1.0)  # per sqrt(m)
+_PER_TURN = 0.03  # per sqrt(rad)
+_FLOOR_M, _WALK_M = 0.02, 0.03
+_STRAIGHT = 0.3  # a leg shorter than this share of its way says little about lengths
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """A drive with known poses.
+
+    Attributes:
+        motion: raw odometry.
+        stamps_ns: (N,) int64 instants at which poses are known, increasing.
+        poses: (N, 3) the poses there, in any frame, m and rad.
+    """
+
+    motion: Motion
+    stamps_ns: NDArray[np.int64]
+    poses: Array
+
+
+@dataclass(frozen=True, slots=True)
+class _Drive:
+    legs: Legs
+    measured: Array  # (L, 3)
+    travel_m: float
+
+
+def regress(sightings: Sequence[Sighting], leg_m: float | None = None) -> Estimate:
+    """Estimate the calibration that one or more drives have in common.
+
+    Args:
+        sightings: drives of one robot (or of robots of one kind).
+        leg_m: length of the legs, m; default: a sixteenth of the mean drive, within `LEG_M`.
+
+    Raises:
+        EvaluationError: too little travel between known poses.
+    """
+    ways = [_travel_at(sighting) for sighting in sightings]
+    total = float(sum(way[-1] - way[0] for way in ways))
+    length = leg_m or float(np.clip(total / len(ways) / INDEPENDENT_LEGS, *LEG_M))
+    drives = [cut(sighting, way, length) for sighting, way in zip(sightings, ways, strict=True)]
+    count = sum(len(drive.legs) for drive in drives)
+    if total < 4.0 * length or count < 8:
+        raise EvaluationError(
+            f"calibration: found {total:.1f} m of odometry between known poses, expected at least {4.0 * length:.1f} m; "
+            f"give a longer drive, or shorter legs"
+        )
+    return _solve(drives, length, total)
+
+
+def cut(sighting: Sighting, travel_m: Array, leg_m: float) -> _Drive:
+    """Legs of a length from every known pose on; a gap of known poses that makes one twice as long leaves it out."""
+    last = np.searchsorted(travel_m, travel_m + leg_m)
+    first = np.flatnonzero(last < len(travel_m))
+    last = last[first]
+    near = travel_m[last] - travel_m[first] < 2.0 * leg_m
+    first, last = first[near], last[near]
+    legs = Legs(sighting.motion, sighting.stamps_ns[first], sighting.stamps_ns[last])
+    measured = between(sighting.poses[first], sighting.poses[last])
+    return _Drive(legs, measured, float(travel_m[-1] - travel_m[0]))
+
+
+def _travel_at(sighting: Sighting) -> Array:
+    motion = sighting.motion
+    return np.asarray(np.interp(sighting.stamps_ns, motion.stamps_ns, motion.travel_m))
+
+
+def _solve(drives: list[_Drive], leg_m: float, total_m: float) -> Estimate:
+    travel = np.concatenate([drive.legs.travel_m for drive in drives])
+    turned = np.concatenate([drive.legs.turned_rad for drive in drives])
+    overlap = max(1.0, float(travel.sum()) / total_m)
+    heading = _fit_heading(drives, np.sqrt(_FLOOR_RAD**2 + _WALK_RAD**2 * travel + _PER_TURN**2 * turned), overlap)
+    turn_gain, bias, delay_s = heading.values
+    length = _fit_length(drives, Gains(1.0, turn_gain, bias), delay_s, travel, overlap)
+    covariance = np.zeros((4, 4))
+    covariance[0, 0] = length.covariance[0, 0]
+    covariance[1:, 1:] = heading.covariance
+    return Estimate(
+        gains=Gains(float(length.values[0]), float(turn_gain), float(bias)),
+        delay_s=float(delay_s),
+        covariance=covariance,
+        leg_m=leg_m,
+        legs=len(travel) / overlap,
+        travel_m=total_m,
+        unit_variance=heading.unit_variance,
+        downweighted=float(np.mean(heading.weights < 0.5)),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    values: Array  # (K,)
+    covariance: Array  # (K, K)
+    unit_variance: float
+    weights: Array  # (L,)
+
+
+def _fit_heading(drives: list[_Drive], sigma: Array, overlap: float) -> _Fit:
+    """Turn gain, bias and delay from the headings at the legs' ends, by Gauss-Newton with Cauchy weights."""
+    values = np.array([NEUTRAL.turn_gain, NEUTRAL.heading_bias_rad_m, 0.0])
+    measured = np.concatenate([drive.measured[:, 2] for drive in drives])
+    for _ in range(_ROUNDS):
+        gains, delay_s = Gains(1.0, values[0], values[1]), float(values[2])
+        predicted = np.concatenate([drive.legs.predict(gains, delay_s)[:, 2] for drive in drives])
+        slope = np.concatenate([drive.legs.jacobian(gains, delay_s)[:, 2, 1:] for drive in drives])
+        fit = _weigh(wrap_angle(predicted - measured) / sigma, slope / sigma[:, None], overlap)
+        values = values - fit.values
+        if np.all(np.abs(fit.values) < 1e-3 * np.sqrt(np.diag(fit.covariance))):
+            break
+    return _Fit(values, fit.covariance, fit.unit_variance, fit.weights)
+
+
+def _fit_length(drives: list[_Drive], gains: Gains, delay_s: float, travel_m: Array, overlap: float) -> _Fit:
+    """The gain from the legs' lengths along the measured chords; `gains` has a gain of one."""
+    measured = np.concatenate([drive.measured[:, :2] for drive in drives])
+    predicted = np.concatenate([drive.legs.predict(gains, delay_s)[:, :2] for drive in drives])
+    length = np.hypot(measured[:, 0], measured[:, 1])
+    straight = length > _STRAIGHT * travel_m
+    if np.count_nonzero(straight) < 4:
+        return _Fit(np.array([1.0]), np.array([[1.0]]), 1.0, np.ones(len(length)))
+    along = np.sum(predicted * measured, axis=1)[straight] / length[straight]
+    sigma = np.sqrt(_FLOOR_M**2 + _WALK_M**2 * travel_m[straight])
+    gain = 1.0
+    for _ in range(_ROUNDS):
+        fit = _weigh((gain * along - length[straight]) / sigma, (along / sigma)[:, None], overlap)
+        gain -= float(fit.values[0])
+        if abs(fit.values[0]) < 1e-3 * np.sqrt(fit.covariance[0, 0]):
+            break
+    return _Fit(np.array([gain]), fit.covariance, fit.unit_variance, fit.weights)
+
+
+def _weigh(residual: Array, slope: Array, overlap: float) -> _Fit:
+    """One step of iteratively reweighted least squares; `values` is what to subtract.
+
+    Cauchy weights with the scale of the residuals' median. Overlapping legs count once: the information is divided by how
+    many legs cover a place, and scaled by the weighted mean square of the residuals.
+    """
+    scale = max(float(np.median(np.abs(residual))) * 1.4826, 1e-9)
+    weights = 1.0 / (1.0 + (residual / (_CAUCHY * scale)) ** 2)
+    information = slope.T @ (weights[:, None] * slope)
+    try:
+        inverse = np.linalg.inv(information)
+    except np.linalg.LinAlgError:
+        raise EvaluationError("calibration: the drive tells neither turn nor way apart; expected one that turns") from None
+    independent = len(residual) / overlap
+    freedom = max(independent - slope.shape[1], 1.0)
+    unit_variance = float(weights @ residual**2 / weights.sum()) * independent / freedom
+    step = inverse @ (slope.T @ (weights * residual))
+    return _Fit(step, inverse * overlap * unit_variance, unit_variance, weights)

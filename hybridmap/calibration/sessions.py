@@ -1,0 +1,209 @@
+"""Calibration of recorded sessions: from their closed loops, or from a reference trajectory."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from hybridmap.calibration.estimate import Estimate
+from hybridmap.calibration.gains import GAIN_KEYS, Gains, remove
+from hybridmap.calibration.legs import Legs, Motion
+from hybridmap.calibration.regression import Sighting, regress
+from hybridmap.config import Config
+from hybridmap.errors import EvaluationError
+from hybridmap.geometry import Array, between
+from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.store import MapStore, SessionFolder
+from hybridmap.trajectory import NS_PER_S, Trajectory
+
+log = logging.getLogger(__name__)
+
+GAIN_CHANGES = "gain_changes"
+"""Under this key of the map file: `[stamp_ns, gain, turn_gain, heading_bias_rad_m]` for each change made while driving."""
+
+ESTIMATORS = ("alternating",)
+
+_MAX_GAP_S = 1.0
+_KEY_M, _KEY_RAD = 0.25, 0.35  # travel or turn between two instants at which a reference is used
+_ROUNDS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """What a session folder holds that a calibration needs.
+
+    Attributes:
+        name: the folder.
+        motion: raw odometry, i.e. with the gains of the session's configuration taken out again.
+        graph: the accepted edges.
+        stamps_ns: (N,) of the nodes.
+        poses: (N, 3) of the nodes by the primary back-end.
+        config: of the session, as far as a calibration needs it: gains and back-ends.
+        config_tree: all of it, as it stands in the map file.
+    """
+
+    name: str
+    motion: Motion
+    graph: PoseGraph
+    stamps_ns: NDArray[np.int64]
+    poses: Array
+    config: Config
+    config_tree: dict[str, Any]
+
+
+def read_drive(folder: Path) -> Drive:
+    """Read a session folder.
+
+    Raises:
+        StoreError: no session there.
+        ConfigError: its gains or back-ends are none.
+        EvaluationError: it holds no odometry.
+    """
+    SessionFolder(folder).require()
+    with MapStore.open(folder) as store:
+        track, experiences, solutions = store.track(), store.map(), store.solutions()
+        tree = yaml.safe_load(store.config_yaml) or {}
+        config = _understood(tree, f"{store.path}: configuration")
+        changes, primary = store.info(GAIN_CHANGES) or [], store.primary
+    if len(track) < 2:
+        raise EvaluationError(f"{folder}: holds no odometry to calibrate")
+    steps = between(track.poses_odom[:-1], track.poses_odom[1:])
+    motion = Motion(track.stamps_ns, _raw(steps, track.stamps_ns[:-1], Gains.of(config.neural), changes))
+    graph = experiences.pose_graph()
+    poses = solutions[primary].poses if primary in solutions else graph.initial
+    stamps = np.array([node.stamp_ns for node in experiences.nodes], dtype=np.int64)
+    return Drive(str(folder), motion, graph, stamps, poses, config, tree)
+
+
+def estimate_of(
+    drives: Sequence[Drive], references: Sequence[Trajectory], estimator: str, leg_m: float | None = None
+) -> Estimate:
+    """Calibrate drives on references, one a drive, or without any on their own maps.
+
+    Args:
+        drives: of one robot, or of robots of one kind.
+        references: none, or one a drive.
+        estimator: `alternating` or `joint`; unused with references.
+        leg_m: length of the legs, m; None: by the drive.
+
+    Raises:
+        EvaluationError: unknown estimator, wrong number of references, or too little to go by.
+        BackendError: a map cannot be optimised.
+    """
+    if references:
+        if len(references) != len(drives):
+            raise EvaluationError(f"found {len(references)} references for {len(drives)} sessions, expected one each")
+        return by_reference(drives, references, leg_m)
+    if estimator not in ESTIMATORS:
+        raise EvaluationError(f"unknown estimator {estimator!r}; there are {', '.join(ESTIMATORS)}")
+    return alternating(drives, leg_m)
+
+
+def by_reference(drives: Sequence[Drive], references: Sequence[Trajectory], leg_m: float | None = None) -> Estimate:
+    """Calibrate drives against known trajectories of `base_link`, one a drive.
+
+    Raises:
+        EvaluationError: too little in common.
+    """
+    return regress([_seen(drive, truth) for drive, truth in zip(drives, references, strict=True)], leg_m)
+
+
+def alternating(drives: Sequence[Drive], leg_m: float | None = None) -> Estimate:
+    """Calibrate drives on their own maps: regress odometry on the map, correct the odometry edges, optimise, and again.
+
+    Raises:
+        EvaluationError: a map holds nothing but odometry, or too little travel.
+        BackendError: a map cannot be optimised.
+    """
+    for drive in drives:
+        require_closures(drive)
+    poses = [drive.poses for drive in drives]
+    estimate = _regress_on(drives, poses, leg_m)
+    for _ in range(_ROUNDS):
+        poses = [_optimise(drive, estimate) for drive in drives]
+        before, estimate = estimate, _regress_on(drives, poses, leg_m)
+        if np.all(np.abs(estimate.off(before.gains)) < 0.1):
+            break
+    return estimate
+
+
+def require_closures(drive: Drive) -> None:
+    """Refuse a map that would only give back the odometry it was made of.
+
+    Raises:
+        EvaluationError: there is no edge besides odometry.
+    """
+    if not np.any(drive.graph.kinds != EdgeKind.ODOMETRY):
+        raise EvaluationError(
+            f"{drive.name}: its map holds odometry alone, nothing that would contradict it; give --reference GT.tum, "
+            f"or a session with loop closures"
+        )
+
+
+def corrected(drive: Drive, gains: Gains, delay_s: float) -> PoseGraph:
+    """The graph with its odometry edges as calibrated odometry would have made them; uncertainties stay."""
+    graph = drive.graph
+    own = np.flatnonzero((graph.kinds == EdgeKind.ODOMETRY) & (graph.targets == graph.sources + 1))
+    deltas = graph.deltas.copy()
+    legs = Legs(drive.motion, drive.stamps_ns[graph.sources[own]], drive.stamps_ns[graph.targets[own]])
+    deltas[own] = legs.predict(gains, delay_s)
+    return replace(graph, deltas=deltas)
+
+
+def _regress_on(drives: Sequence[Drive], poses: Sequence[Array], leg_m: float | None) -> Estimate:
+    sightings = [Sighting(drive.motion, drive.stamps_ns, on_map) for drive, on_map in zip(drives, poses, strict=True)]
+    return regress(sightings, leg_m)
+
+
+def _optimise(drive: Drive, estimate: Estimate) -> Array:
+    from hybridmap import backends
+
+    graph = corrected(drive, estimate.gains, estimate.delay_s)
+    name = drive.config.backends.names[0]
+    solver = backends.create("gtsam-gnc" if name == "odometry" else name, drive.config.backends)
+    return solver.solve(graph).poses
+
+
+def _understood(tree: dict[str, Any], origin: str) -> Config:
+    """The gains and back-ends of a session's configuration; the rest may be of another version."""
+    gains = {key: value for key, value in (tree.get("neural") or {}).items() if key in GAIN_KEYS}
+    backends = {"backends": tree["backends"]} if "backends" in tree else {}
+    return Config.from_tree({"neural": gains, **backends}, origin)
+
+
+def _raw(steps: Array, stamps_ns: NDArray[np.int64], gains: Gains, changes: Sequence[Sequence[float]]) -> Array:
+    """Take the gains out again that were in use at each step."""
+    begin = [int(stamps_ns[0]), *(int(change[0]) for change in changes)]
+    used = [gains, *(Gains.from_array(change[1:]) for change in changes)]
+    parts = np.searchsorted(stamps_ns, begin)
+    ends = [*parts[1:], len(steps)]
+    return np.concatenate([remove(steps[a:b], g) for a, b, g in zip(parts, ends, used, strict=True)])
+
+
+def _seen(drive: Drive, truth: Trajectory) -> Sighting:
+    """Where the reference knows the robot, at instants a little apart."""
+    motion = drive.motion
+    known = np.flatnonzero(_known(truth, motion.stamps_ns))
+    if len(known) < 2:
+        raise EvaluationError(
+            f"{drive.name}: {len(known)} stamps in common with the reference, expected many; are they of the same recording "
+            f"and on the same clock?"
+        )
+    mark = np.floor(motion.travel_m / _KEY_M + motion.turned_rad / _KEY_RAD)[known]
+    keys = known[np.flatnonzero(np.diff(mark, prepend=-1.0) > 0)]
+    stamps = motion.stamps_ns[keys]
+    return Sighting(motion, stamps, truth.at(stamps))
+
+
+def _known(truth: Trajectory, stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which stamps lie between two poses of the reference that are not far apart in time."""
+    right = np.clip(np.searchsorted(truth.stamps_ns, stamps_ns), 1, max(len(truth) - 1, 1))
+    gap = truth.stamps_ns[np.minimum(right, len(truth) - 1)] - truth.stamps_ns[right - 1]
+    return truth.covers(stamps_ns) & (gap <= _MAX_GAP_S * NS_PER_S)

@@ -1,0 +1,55 @@
+"""`hybridmap calibrate`: odometry gains from the closed loops of sessions, or from a reference."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def calibrate(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(metavar="DIR...", help="Session folder; several of one robot (or kind of robot) are fitted together."),
+    ],
+    reference: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="GT.tum", help="True trajectory of base_link, one a session, in the same order."),
+    ] = None,
+    estimator: Annotated[
+        str, typer.Option(metavar="NAME", help="Without a reference: `alternating` or `joint`.")
+    ] = "alternating",
+    leg: Annotated[float | None, typer.Option(help="Length of the compared legs, m. Default: by the drive, 1 to 16.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE.yaml", help="Write the session's configuration with the gains.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+) -> None:
+    """Linear gain, turn gain and heading bias (rad/m) of odometry, with standard deviations.
+
+    What is written differs from the configuration in use only if the estimate does, by more than three sigma.
+    """
+    from hybridmap.calibration.figures import metrics_of, verdict, with_gains
+    from hybridmap.calibration.gains import Gains
+    from hybridmap.calibration.sessions import estimate_of, read_drive
+    from hybridmap.cli.show import emit
+    from hybridmap.trajectory import read_tum, write_text_atomic
+
+    drives = [read_drive(folder) for folder in folders]
+    truths = [read_tum(path) for path in reference or []]
+    estimate = estimate_of(drives, truths, estimator, leg)
+    in_use = Gains.of(drives[0].config.neural)
+    significant = estimate.differs(in_use)
+    if out is not None:
+        write_text_atomic(out, with_gains(drives[0].config_tree, estimate.gains if significant else in_use))
+    how = "reference" if truths else estimator
+    head = {
+        "sessions": [str(folder) for folder in folders],
+        "estimator": how,
+        "significant": significant,
+        "message": verdict(estimate, in_use),
+    }
+    emit(head, metrics_of(estimate, in_use), as_json=as_json, title=f"{', '.join(map(str, folders))}: {how}")
+    if not as_json:
+        typer.echo(head["message"])
