@@ -19,6 +19,7 @@ from hybridmap.cli.inspect import inspect
 from hybridmap.cli.map import map_source
 from hybridmap.cli.optimize import optimize
 from hybridmap.cli.simulate import simulate
+from hybridmap.cli.verify import verify
 from hybridmap.errors import HybridMapError
 
 app = typer.Typer(
@@ -59,6 +60,7 @@ app.command("compare")(compare)
 app.command("calibrate")(calibrate)
 app.command("simulate")(simulate)
 app.command("inspect")(inspect)
+app.command("verify")(verify)
 
 
 def main() -> None:

@@ -26,8 +26,8 @@ class PlaceConfig(Section):
     """A cell is recruited where no other responds above this share of its peak."""
     inhibition: float = Field(default=0.6, ge=0, lt=1)
     """C_inh_p, as a share of a field's peak drive; larger means narrower fields."""
-    learning_period_steps: int = Field(default=4, ge=1)
-    """Moving steps between two learning steps (four at 30 Hz: the theta rhythm)."""
+    theta_hz: float = Field(default=7.5, gt=0)
+    """Learning steps a second of motion: the theta rhythm."""
     max_cells: int = Field(default=32768, ge=1)
     """No more place cells than this are recruited; the log says when it is reached."""
     attractor_input: float = Field(default=0.0, ge=0, lt=1)

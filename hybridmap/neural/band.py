@@ -33,8 +33,8 @@ class BandRings:
     displacement is alpha + l/2. No running integral d is kept: the ring feeds its rates back through cosine weights that the
     velocity along its orientation shifts, the net input h is normalised (divisive inhibition), and the transfer function
     h -> exp(-(l arccos(h) / 2 pi)^2 / (2 r^2)) gives back the printed stripe, which is the attractor of the ring.
-    Periods are l = lambda sqrt(3)/2. On the square metric (for comparison) the bands are at 0 and 90 degrees with period lambda,
-    and the ring between them, which drives no sheet, is their sum at 45 degrees.
+    Periods are l = lambda sqrt(3)/2. On the square metric (for comparison) the bands are at 0 and 90 degrees with period
+    lambda, and the ring between them, which drives no sheet, is their sum at 45 degrees.
 
     Attributes:
         activity: (M, 3, n) rates 0..1 in the order of `ORIENTATIONS_DEG`; the whole state.

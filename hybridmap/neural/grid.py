@@ -136,7 +136,7 @@ class GridModules:
 
     def _what_happens(self, change: float, again: float, peak: float) -> str:
         """Name the instability from the changes over one and over two steps and the peak after settling."""
-        zero, largest = float(self._gains[self._centre, 0, 0]), float(self._gains.max())
+        zero, most = float(self._gains[self._centre, 0, 0]), float(self._gains.max())
         if not peak < 1e6:
             found = f"the activity grows without bound (peak {peak:.3g} after 300 steps)"
         elif again <= 1e-3 * max(peak, change):
@@ -144,8 +144,8 @@ class GridModules:
         else:
             found = f"no pattern becomes stationary (change {change:.3g} at a peak of {peak:.3g} after 300 steps)"
         return (
-            f"{found}; the recurrent weights have the Fourier gain {zero:.3g} at mode zero and {largest:.3g} at most, where one "
-            "step of dt = tau needs about -1 and 1.4: set kernel to 'two-amplitudes', or lower kernel_gain_first or kernel_widths"
+            f"{found}; the recurrent weights have Fourier gain {zero:.3g} at mode zero and {most:.3g} at most, where one step "
+            "of dt = tau needs about -1 and 1.4: take two amplitudes (kernel), or lower kernel_gain_first or kernel_widths"
         )
 
     def step(self, band_advance: NDArray[np.floating], band_phasors: NDArray[np.complexfloating]) -> None:
@@ -165,7 +165,7 @@ class GridModules:
     def _band_input(self, phasors: NDArray[np.complexfloating]) -> NDArray[np.complexfloating]:
         """Modes (2K+1, M, K+1) of the stripes of the bands."""
         drive = np.ascontiguousarray(phasors, dtype=self._complex).view(self._gains.dtype) @ self._stripes
-        return drive.view(self._complex).reshape(len(drive), len(self.modes.first), -1).swapaxes(0, 1)
+        return np.asarray(drive.view(self._complex)).reshape(len(drive), len(self.modes.first), -1).swapaxes(0, 1)
 
     def _stripe_weights(self, band_drive: float, side: int, metric: Metric) -> NDArray[np.floating]:
         """Weights (6, 2 * modes) from the phasors of three bands to their stripes' modes, all as (real, imaginary)."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridmap.config.neural import NeuralConfig
-from hybridmap.errors import StreamError
+from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import Array
 from hybridmap.neural.attractor import PlaceAttractor
 from hybridmap.neural.band import BandRings
@@ -60,7 +60,8 @@ class PathIntegrator:
         self._rng = np.random.default_rng(config.neuron_noise_seed) if rng is None else rng
         self._decoder = PhaseDecoder(self.bands.wave_vectors, config.decode_box_m)
         self._last_decoded_m: Array = np.zeros(2)
-        self._moves = 0
+        self._since_theta_s = 0.0
+        self._since_decoding_m = 0.0
         self._warned = False
         self.place.learn(self.grid.activity)
 
@@ -70,7 +71,8 @@ class PathIntegrator:
         Args:
             delta_robot: (3,) pose of the robot now in the frame of the robot at the last step, m and rad (`geometry.between`
                 of two odometry poses). Its chord is turned to the mid-point heading, so a gain on the turn bends the path.
-            dt_s: seconds since the last step; the sheets' time constant is one step, so their dynamics do not need it.
+            dt_s: seconds since the last step; it sets the theta rhythm. The sheets' time constant is one step, so their
+                dynamics do not need it.
 
         Raises:
             StreamError: the displacement is not finite, or more than a kilometre.
@@ -93,7 +95,7 @@ class PathIntegrator:
         if config.neuron_noise > 0.0:
             self._disturb()
         if dx != 0.0 or dy != 0.0:
-            self._translate(np.array([c * forward - s * left, s * forward + c * left]))
+            self._translate(np.array([c * forward - s * left, s * forward + c * left]), dt_s)
 
     def step_velocity(self, v_m_s: float, omega_rad_s: float, dt_s: float) -> None:
         """Integrate constant speed and turn rate over `dt_s`, by the mid-point heading."""
@@ -122,6 +124,7 @@ class PathIntegrator:
             )
             self._warned = True
         self._last_decoded_m = decoded.position_m
+        self._since_decoding_m = 0.0
         return decoded
 
     def module_phases(self) -> NDArray[np.float64]:
@@ -200,20 +203,22 @@ class PathIntegrator:
         """Where the attractor's bump may be, (S, 2), m: nearest to the last decoded position first."""
         return self.attractor.unwrapped_m(self._last_decoded_m) + _WRAPS * self.attractor.extent_m
 
-    def _translate(self, displacement_m: Array) -> None:
+    def _translate(self, displacement_m: Array, dt_s: float) -> None:
         """Move the network; a jump is taken in parts, so that the read-out sees each turn of the attractor's wrap."""
-        parts = math.ceil(math.hypot(*displacement_m) / (_PART_OF_WRAP * self.attractor.extent_m))
+        way_m, most_m = math.hypot(*displacement_m), _PART_OF_WRAP * self.attractor.extent_m
+        parts = math.ceil(way_m / most_m)
+        part = displacement_m if parts == 1 else displacement_m / parts
         for _ in range(parts):
-            self._translate_part(displacement_m / parts)
-
-    def _translate_part(self, displacement_m: Array) -> None:
-        motion = self.bands.step(displacement_m)
-        self.grid.step(motion.advance, motion.phasors)
-        self.attractor.step(displacement_m)
-        self._moves += 1
-        if self._moves % self.config.place.learning_period_steps == 0:
+            motion = self.bands.step(part)
+            self.grid.step(motion.advance, motion.phasors)
+            self.attractor.step(part)
+            self._since_decoding_m += way_m / parts
+            if self._since_decoding_m >= most_m:
+                self.decode()
+        self._since_theta_s += dt_s
+        if self._since_theta_s >= 1.0 / self.config.place.theta_hz - 1e-9:
+            self._since_theta_s = 0.0
             self._learn()
-            self.decode()
 
     def _learn(self) -> None:
         """Let the place cells learn, and the attractor receive their input where it is configured."""

@@ -40,7 +40,8 @@ class LowModes:
     def forward(self, stack: NDArray[np.floating]) -> NDArray[np.complexfloating]:
         """Return the modes of a contiguous stack of sheets (N, M, N)."""
         half, modes, _ = self._buffers_of(stack.shape[1])
-        np.dot(stack.reshape(-1, self.side), self._columns, out=half.view(self._rows.dtype).reshape(stack.size // self.side, -1))
+        real = half.view(self._rows.dtype).reshape(-1, self._columns.shape[1])
+        np.dot(stack.reshape(-1, self.side), self._columns, out=real)
         np.dot(self._left, half, out=modes)
         return modes.reshape(len(self.first), -1, len(self.second))
 
@@ -48,9 +49,8 @@ class LowModes:
         """Return the stack of sheets (N, M, N) that have these modes, contiguous, and no others."""
         half = self._buffers_of(modes.shape[1])[2]
         np.dot(self._right, modes.reshape(len(self.first), -1), out=half)
-        return np.dot(half.view(self._rows.dtype).reshape(-1, 2 * len(self.second)), self._rows).reshape(
-            self.side, -1, self.side
-        )
+        real = half.view(self._rows.dtype).reshape(-1, self._columns.shape[1])
+        return np.asarray(np.dot(real, self._rows)).reshape(self.side, -1, self.side)
 
     def _buffers_of(self, modules: int) -> tuple[NDArray[np.complexfloating], ...]:
         """Work space: half-transformed sheets, modes, half-transformed modes."""

@@ -1,0 +1,94 @@
+"""Drives of the verification: increments for the network, and the exact path that they make."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridmap import geometry
+from hybridmap.geometry import Array
+
+_ROOM_M = (10.0, 3.0)
+_MARGIN_M = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """A drive.
+
+    Attributes:
+        deltas: (N, 3) pose after each step in the frame of the robot before it, m and rad.
+        poses: (N, 3) exact poses after each step, from the origin.
+        distance_m: (N,) driven so far.
+        hz: steps a second.
+    """
+
+    deltas: Array
+    poses: Array
+    distance_m: Array
+    hz: float
+
+
+def wander(rng: np.random.Generator, distance_m: float, hz: float) -> Drive:
+    """Wander through a 10 x 3 m room at 0.3 to 1.1 m/s, turning away from its walls."""
+    half = np.array(_ROOM_M) / 2 - _MARGIN_M
+    dt = 1.0 / hz
+    x = y = yaw = omega = driven = 0.0
+    v = 0.7
+    keep, kick = np.exp(-dt / 0.5), np.sqrt(1.0 - np.exp(-2.0 * dt / 0.5))
+    motions: list[tuple[float, float]] = []
+    while driven < distance_m:
+        noise = rng.standard_normal(2)
+        omega = keep * omega + 0.7 * kick * noise[0]
+        v = float(np.clip(0.7 + keep * (v - 0.7) + 0.15 * kick * noise[1], 0.3, 1.1))
+        if abs(x) > half[0] or abs(y) > half[1]:
+            omega = 2.0 * float(np.clip(geometry.wrap_angle(np.arctan2(-y, -x) - yaw), -1.0, 1.0))
+        motions.append((v * dt, omega * dt))
+        x += v * dt * np.cos(yaw + 0.5 * omega * dt)
+        y += v * dt * np.sin(yaw + 0.5 * omega * dt)
+        yaw += omega * dt
+        driven += v * dt
+    return _along(np.array(motions), hz)
+
+
+def corridor(rng: np.random.Generator, hz: float, length_m: float = 16.8) -> Drive:
+    """Drive down a corridor at 0.5 m/s, swaying a little."""
+    steps = round(length_m / 0.5 * hz)
+    sway = 0.05 * np.sin(np.arange(steps + 1) / hz * 2.0 * np.pi / 6.0 + rng.uniform(0.0, 2.0 * np.pi))
+    return _along(np.stack([np.full(steps, 0.5 / hz), np.diff(sway)], axis=1), hz)
+
+
+def raster(side_m: float, pitch_m: float, angle_rad: float, *, upright: bool = False) -> Drive:
+    """Drive along the lines of a square arena around the origin, to and fro, one step a pixel.
+
+    The first step leads to the corner. Pixel (i, j) of a map is at `pixel_order`; `upright` drives along y instead of x.
+    """
+    count = round(side_m / pitch_m)
+    ticks = (np.arange(count) - 0.5 * (count - 1)) * pitch_m
+    order = pixel_order(count, upright=upright)
+    points = np.stack([ticks[order[:, 0]], ticks[order[:, 1]]], axis=1)
+    turn = np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
+    path = np.concatenate([np.zeros((1, 2)), points @ turn.T])
+    ways = np.diff(path, axis=0)
+    poses = np.column_stack([path, np.concatenate([[0.0], np.arctan2(ways[:, 1], ways[:, 0])])])
+    deltas = geometry.between(poses[:-1], poses[1:])
+    return Drive(deltas, poses[1:], np.cumsum(np.linalg.norm(ways, axis=1)), 30.0)
+
+
+def pixel_order(count: int, *, upright: bool = False) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+    """The pixels (count^2, 2), (x index, y index), in the order in which `raster` comes to them."""
+    lines = np.repeat(np.arange(count), count)
+    along = np.tile(np.concatenate([np.arange(count), np.arange(count)[::-1]]), -(-count // 2))[: count * count]
+    return np.stack([lines, along] if upright else [along, lines], axis=1)
+
+
+def _along(motions: Array, hz: float) -> Drive:
+    """The drive of steps (N, 2): distance and turn, by the mid-point heading."""
+    distance, turn = motions.T
+    yaw = np.cumsum(turn)
+    middle = yaw - 0.5 * turn
+    position = np.cumsum(distance[:, None] * np.stack([np.cos(middle), np.sin(middle)], axis=1), axis=0)
+    deltas = np.column_stack([distance * np.cos(0.5 * turn), distance * np.sin(0.5 * turn), turn])
+    poses = np.column_stack([position, geometry.wrap_angle(yaw)])
+    return Drive(deltas, poses, np.cumsum(distance), hz)

@@ -1,0 +1,84 @@
+"""The verification's folder: `metrics.json` and one self-contained page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from hybridmap.errors import StoreError
+from hybridmap.evaluate.cells import Verification
+from hybridmap.evaluate.cells.rows import recurrence_verdict
+from hybridmap.metrics import Metric, to_json
+from hybridmap.report import tables, verify_figures
+from hybridmap.trajectory import write_text_atomic
+
+PAGE, METRICS = "verify.html", "metrics.json"
+_TEMPLATE = "verify.html.j2"
+
+
+def prepare_folder(folder: Path, *, overwrite: bool = False) -> None:
+    """Check that a verification may be written into a folder, before anything is run; makes nothing.
+
+    Raises:
+        StoreError: it is a file, holds something else, or holds a verification and `overwrite` is not given.
+    """
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise StoreError(f"{folder}: is a file; expected a folder that is empty or does not exist")
+    found = sorted(entry.name for entry in folder.iterdir())
+    other = [name for name in found if name not in (PAGE, METRICS)]
+    if other:
+        raise StoreError(f"{folder}: not empty and no verification (it holds {other[0]!r}); choose another folder")
+    if found and not overwrite:
+        raise StoreError(f"{folder}: holds a verification already; choose another folder or give --overwrite")
+
+
+def write_verification(folder: Path, head: dict[str, Any], rows: Sequence[Metric], result: Verification) -> Path:
+    """Write `metrics.json` and `verify.html`; returns the page.
+
+    Raises:
+        StoreError: the folder cannot be written to.
+    """
+    text = _render(head, rows, result)
+    try:
+        write_text_atomic(folder / METRICS, to_json(head, rows) + "\n")
+        write_text_atomic(folder / PAGE, text)
+    except OSError as error:
+        raise StoreError(f"{folder}: cannot be written to: {error.strerror}") from None
+    return folder / PAGE
+
+
+def _render(head: dict[str, Any], rows: Sequence[Metric], result: Verification) -> str:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("hybridmap", "report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    named = {row.name.removeprefix("verify/"): row for row in rows}
+    first = next(iter(result.room.values()))
+    return environment.get_template(_TEMPLATE).render(
+        head=head,
+        rows=[(row.name.removeprefix("verify/"), tables.number(row.value), tables.unit(row), row) for row in rows],
+        value={name: tables.number(row.value) for name, row in named.items()},
+        judged=sum(row.passed is not None for row in rows),
+        drives=len(first),
+        distance=f"{first[0].distance_m[-1]:.0f}",
+        verdict=recurrence_verdict(result.place),
+        heading=verify_figures.heading_figure(result.head_direction),
+        stripes=verify_figures.stripes_figure(result.lattice),
+        grid=verify_figures.grid_figure(result.lattice),
+        square=verify_figures.grid_figure(result.square),
+        place=verify_figures.place_figure(result.place),
+        phase=verify_figures.phase_figure(result),
+        modules=verify_figures.module_figure(first, result.lattice.spacings_m),
+        noise=verify_figures.noise_figure(result),
+        printed_kernel=result.printed_kernel,
+        version=version("hybridmap"),
+    )

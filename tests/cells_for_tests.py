@@ -1,0 +1,21 @@
+"""A verification of the cells that runs in seconds."""
+
+from hybridmap.evaluate.cells import Scale
+
+TINY = Scale(
+    paths=1,
+    distance_m=3.0,
+    heading_steps=2000,
+    still_steps=2000,
+    overwrites=4,
+    arena_m=1.2,
+    lattice_pitch_m=0.03,
+    lattice_cells=1,
+    place_pitch_m=0.03,
+    place_cells=64,
+    place_epochs=1,
+    noise=(0.02, 0.1),
+    noise_repeats=1,
+    noise_distance_m=3.0,
+    workers=1,
+)
