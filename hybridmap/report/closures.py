@@ -22,6 +22,7 @@ _NEIGHBOURS = 6
 _MAX_POINTS = 3000
 _SIMILAR_HEADING_RAD = np.radians(40.0)
 _APART_S = 20.0
+_OVERLAY_SHAPE = 1.345  # width over height of its axes
 _NEW, _OLD = style.PRIMARY, style.ODOMETRY
 
 
@@ -145,12 +146,17 @@ def _overlay(scene: Scene, edge: Edge, points_of: Mapping[int, Array]) -> str | 
     placed = transform_points(delta, old)
     with style.figure(3.8, 3.4, margins=(0.15, 0.98, 0.23, 0.92)) as picture:
         axes = picture.add_subplot()
+        style.metric_axes(axes, adjustable="box")
         dots: dict[str, Any] = {"linestyle": "none", "marker": ".", "markeredgewidth": 0, "rasterized": True}
         axes.plot(placed[:, 0], placed[:, 1], color=_OLD, markersize=4.0, alpha=0.6, label="older", **dots)
         axes.plot(new[:, 0], new[:, 1], color=_NEW, markersize=2.6, alpha=0.8, label="newer", **dots)
         _draw_robot(axes, delta, _OLD)
         _draw_robot(axes, np.zeros(3), _NEW)
-        style.metric_axes(axes)
+        low, high = np.percentile(np.concatenate([placed, new]), [1.0, 99.0], axis=0)
+        center, half = (low + high) / 2.0, (high - low) / 2.0 + 0.5
+        half_width = max(half[0], half[1] * _OVERLAY_SHAPE)
+        axes.set_xlim(center[0] - half_width, center[0] + half_width)
+        axes.set_ylim(center[1] - half_width / _OVERLAY_SHAPE, center[1] + half_width / _OVERLAY_SHAPE)
         how = "by the measured pose" if edge.relative is not None else "as the map has them (nothing was measured)"
         axes.set_title(f"laid over each other {how}", fontsize=8.5)
         legend = picture.legend(loc="lower center", ncols=2, markerscale=3.0)

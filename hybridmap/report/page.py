@@ -109,7 +109,9 @@ def _tile(metric: Metric, label: str) -> Tile:
         return Tile(*tables.length(metric.value), label)
     if metric.unit == "s/min":
         return Tile(f"{metric.value:.3g}", "s", label)
-    return Tile(f"{metric.value:.0f}" if metric.unit == "1" else f"{metric.value:.3g}", tables.unit(metric), label)
+    if metric.unit == "s":
+        return Tile(*tables.duration(metric.value), label)
+    return Tile(tables.number(metric.value), tables.unit(metric), label)
 
 
 def _remarks(scene: Scene) -> list[str]:

@@ -71,6 +71,11 @@ def length(value_m: float) -> tuple[str, str]:
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.2g}" if abs(value) < 10 else f"{value:.3g}", name
 
 
+def duration(value_s: float) -> tuple[str, str]:
+    """A time as people say it: (digits, unit), beyond two minutes in minutes."""
+    return (f"{value_s:.0f}", "s") if not value_s > 120.0 else (f"{value_s / 60.0:.1f}", "min")
+
+
 def unit(metric: Metric) -> str:
     """The unit; nothing for a plain number."""
     return "" if metric.unit == "1" else metric.unit

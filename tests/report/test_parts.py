@@ -125,3 +125,8 @@ def test_tables_put_back_ends_side_by_side() -> None:
 )
 def test_lengths_are_said_as_people_say_them(value: float, said: tuple[str, str]) -> None:
     assert tables.length(value) == said
+
+
+@pytest.mark.parametrize(("value", "said"), [(37.5, ("38", "s")), (1060.0, ("17.7", "min")), (float("nan"), ("nan", "s"))])
+def test_times_are_said_as_people_say_them(value: float, said: tuple[str, str]) -> None:
+    assert tables.duration(value) == said
