@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,8 @@ from hybridmap.vision.rgbd.pnp import Verification, Verifier
 from hybridmap.vision.templates import MODERATE_THRESHOLD, Matcher
 
 Indices = NDArray[np.int64]
+SURE = 4.0
+"""While driving, depth alone is trusted only where the map's own uncertainty is below this many `repropose_sigma`."""
 
 
 @dataclass(slots=True)
@@ -74,6 +76,9 @@ class LoopCloser:
         """Look for loops of one node, and settle what was pending."""
         gated = self._gate(node, belief)
         changed = self._try_candidates(node, self._ranked(node, gated), belief) if len(gated) else []
+        if self._config.verify != "none" and not any(p.verdict is Verdict.ACCEPTED for p in changed):
+            near = self._nearest(node, set(), 1, belief)
+            changed += self._try_again(node, near, belief, {j for j in near if self._is_sure(node, j, belief)})
         return [*changed, *self._give_up(before=node - self._closing.pending_nodes)]
 
     def finish(self, belief: Belief) -> list[Proposal]:
@@ -85,8 +90,14 @@ class LoopCloser:
             closed = Counter(source for source, _ in settled)
             for node in range(len(self._keyframes)):
                 if closed[node] < self._closing.accept:
-                    out += self._try_again(node, self._nearest(node, settled, belief), belief)
+                    near = self._nearest(node, settled, self._closing.repropose_per_node, belief)
+                    out += self._try_again(node, near, belief, near)
         return [*out, *self._give_up(before=len(self._keyframes))]
+
+    def _is_sure(self, node: int, target: int, belief: Belief) -> bool:
+        """The map knows well enough where a node lies to be a guess for depth alone."""
+        sigma = np.sqrt(np.diag(belief.covariance_from(node)[target]))
+        return bool(np.all(sigma <= SURE * np.sqrt(np.diag(self._map_covariance))))
 
     def _gate(self, node: int, belief: Belief) -> Indices:
         """Nodes old enough, within reach of the drift since the last closure, and looking the same way."""
@@ -135,18 +146,21 @@ class LoopCloser:
             out += changed
         return out
 
-    def _try_again(self, node: int, near: dict[int, dict[str, float]], belief: Belief) -> list[Proposal]:
-        """Measure pairs that the map puts side by side: by features if that was not tried, else by depth alone."""
+    def _try_again(
+        self, node: int, near: dict[int, dict[str, float]], belief: Belief, by_depth: Collection[int]
+    ) -> list[Proposal]:
+        """Measure pairs that the map puts side by side: by features if that was not tried, else some by depth."""
         out: list[Proposal] = []
         for target, scores in near.items():
             found: Verification | None = None
             if (node, target) not in self._tried:
                 self._tried.add((node, target))
                 found = self._verifier.verify(self._keyframes[node], self._keyframes[target])
-            if found is None or found.relative is None:
+            if (found is None or found.relative is None) and target in by_depth:
                 guess = RelativePose(between(belief.poses_map_node[node], belief.poses_map_node[target]), self._map_covariance)
                 found = self._verifier.verify_on_map(self._keyframes[node], self._keyframes[target], guess)
-            out += self._file(node, target, scores, found, belief)
+            if found is not None:
+                out += self._file(node, target, scores, found, belief)
         return out
 
     def _file(self, node: int, target: int, scores: dict[str, float], found: Verification, belief: Belief) -> list[Proposal]:
@@ -198,7 +212,7 @@ class LoopCloser:
             h.proposal = replace(h.proposal, verdict=Verdict.REJECTED, reason="no other edge supports it")
         return [h.proposal for h in late]
 
-    def _nearest(self, node: int, settled: set[tuple[int, int]], belief: Belief) -> dict[int, dict[str, float]]:
+    def _nearest(self, node: int, settled: set[tuple[int, int]], most: int, belief: Belief) -> dict[int, dict[str, float]]:
         """Earlier nodes, not joined to this one, that look at the same place from nearly the same pose, nearest first."""
         poses = belief.poses_map_node
         gap = np.hypot(*(poses[:node, :2] - poses[node, :2]).T)
@@ -213,7 +227,7 @@ class LoopCloser:
                 continue
             if all(abs(target - other) >= self._closing.separation for other in chosen):
                 chosen[target] = {"map_distance_m": float(gap[i])}
-            if len(chosen) == self._closing.repropose_per_node:
+            if len(chosen) == most:
                 break
         return chosen
 

@@ -27,7 +27,7 @@ def lap_poses():
     return poses
 
 
-def drive(config, poses, bias=0.0, frames=None):
+def drive(config, poses, bias=0.0, frames=None, sigma=1.0):
     """Run the front-end over poses with biased odometry; returns it, every proposal by key, and odometry poses."""
     rng = np.random.default_rng(8)
     front_end = RgbdFrontEnd(config, VIEW, seed=0)
@@ -41,16 +41,17 @@ def drive(config, poses, bias=0.0, frames=None):
             relative = RelativePose(step, np.diag([0.02, 0.02, np.deg2rad(1.5)]) ** 2)
             odometry.append(compose(odometry[-1], step))
         front_end.add_node(node, front_end.observe(frame, np.zeros(3)))
-        found = front_end.track(node, relative) + front_end.close(node, belief_of(odometry))
+        found = front_end.track(node, relative) + front_end.close(node, belief_of(odometry, sigma))
         proposals |= {p.key: p for p in found}
     return front_end, proposals, np.array(odometry)
 
 
-def belief_of(poses):
+def belief_of(poses, sigma=1.0):
+    """A map that says it may be off by `sigma`, m and rad."""
     poses = np.array(poses)
     steps = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
     return Belief(
-        poses, np.arange(float(len(poses))), np.cumsum(steps), lambda _: np.tile(np.eye(3) * 0.01, (len(poses), 1, 1))
+        poses, np.arange(float(len(poses))), np.cumsum(steps), lambda _: np.tile(np.eye(3) * sigma**2, (len(poses), 1, 1))
     )
 
 
@@ -156,6 +157,15 @@ def test_the_end_joins_by_depth_what_features_cannot(poses):
     assert all("depth agrees with the map" in p.reason for p in found)
     assert np.median(errors(found, poses)[:, 0]) < 0.005
     assert max(sigmas_off(p, poses) for p in found) < 3.0
+
+
+@pytest.mark.parametrize(("sigma", "joins"), [(0.1, True), (1.0, False)])
+def test_while_driving_depth_alone_joins_only_where_the_map_is_sure(sigma, joins, poses):
+    papers = textures(1), textures(2)
+    repapered = [render(VIEW, p, papers[i >= PER_LAP], i * 10**9) for i, p in enumerate(poses[: PER_LAP + 5])]
+    _, proposals, _ = drive(VisionConfig(), poses[: PER_LAP + 5], 0.0, repapered, sigma)
+    accepted = [p for p in proposals.values() if p.kind == "loop" and p.verdict is Verdict.ACCEPTED]
+    assert bool(accepted) == joins
 
 
 def test_a_wrong_map_is_not_confirmed_by_depth(poses, frames):
