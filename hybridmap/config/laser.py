@@ -35,8 +35,21 @@ class RegistrationConfig(Section):
     """Standard deviation of a point's residual at least, m."""
     spurious: float = Field(default=0.04, ge=0, lt=1)
     """Share of the inliers whose information along any direction is not believed: normals err by some 10 degrees."""
-    correlation: float = Field(default=6.0, ge=1)
+    correlation: float = Field(default=3.0, ge=1)
     """Points that share one independent piece of information: neighbours on a wall err together."""
+
+
+class SearchConfig(Section):
+    """A grid of starts about the odometry, and how sure the odometry is taken to be."""
+
+    half_m: float = Field(gt=0)
+    """Half-width of the grid, m."""
+    half_deg: float = Field(gt=0, le=180)
+    """Half-width of the grid, degrees."""
+    prior_m: float = Field(gt=0)
+    """Standard deviation of the odometry's translation as prior of the registration, m."""
+    prior_deg: float = Field(gt=0)
+    """Standard deviation of the odometry's heading as prior of the registration, degrees."""
 
 
 class TrackingConfig(Section):
@@ -44,22 +57,16 @@ class TrackingConfig(Section):
 
     submap_nodes: int = Field(default=25, ge=1)
     """Nodes in the submap."""
-    narrow_m: float = Field(default=0.2, gt=0)
-    """First search: half-width of the grid of starts about the odometry, m."""
-    narrow_deg: float = Field(default=8.0, gt=0)
-    """First search: half-width of the grid of starts about the odometry, degrees."""
-    wide_m: float = Field(default=0.45, gt=0)
-    """Second search, when the first fails or contradicts the odometry: half-width, m."""
-    wide_deg: float = Field(default=40.0, gt=0, le=180)
-    """Second search: half-width, degrees (drop-outs of wheel odometry are mostly of heading)."""
-    prior_m: float = Field(default=0.1, gt=0)
-    """Standard deviation of the odometry's translation as prior of the registration, m."""
-    prior_deg: float = Field(default=5.0, gt=0)
-    """Standard deviation of the odometry's heading as prior of the first search, degrees."""
-    wide_prior_deg: float = Field(default=40.0, gt=0)
-    """The same for the second search, where the heading is nearly free, degrees."""
+    narrow: SearchConfig = SearchConfig(half_m=0.2, half_deg=8.0, prior_m=0.1, prior_deg=5.0)
+    """First search."""
+    wide: SearchConfig = SearchConfig(half_m=0.45, half_deg=40.0, prior_m=0.1, prior_deg=40.0)
+    """Second search, when the first is weak or contradicts the odometry: drop-outs of wheels are mostly of heading."""
+    lost: SearchConfig = SearchConfig(half_m=1.0, half_deg=60.0, prior_m=0.7, prior_deg=60.0)
+    """Last search, when the scans between the nodes did not help either."""
     inliers_min: float = Field(default=0.6, gt=0, le=1)
     """Least share of inliers of a good registration."""
+    inliers_sure: float = Field(default=0.75, gt=0, le=1)
+    """Least share of inliers at which a registration may contradict the odometry without further search."""
     inliers_weak: float = Field(default=0.45, gt=0, le=1)
     """Least share of inliers at which a registration still becomes an edge."""
     translation_max_m: float = Field(default=0.4, gt=0)

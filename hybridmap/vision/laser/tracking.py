@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridmap.config.laser import LaserConfig
+from hybridmap.config.laser import LaserConfig, SearchConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, wrap_angle
 from hybridmap.vision.laser.cloud import Cloud, merged
 from hybridmap.vision.laser.likelihood import LikelihoodField, build_field, score_starts
@@ -16,6 +16,7 @@ from hybridmap.vision.laser.search import spaced, square
 from hybridmap.vision.laser.submap import Atlas
 
 SCORED_POINTS = 90
+WIDE_GAIN, LOST_GAIN = 0.03, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +54,19 @@ class Tracker:
             odometry: its pose in the frame of the last node.
             between_nodes: gives, in order, the scans between the two: motion since the last node and cloud.
         """
-        field = self._field()
-        alignment = self._search(field, cloud, odometry.delta)
-        if alignment.inliers[0] < self._config.tracking.inliers_min:
+        c, field = self._config.tracking, self._field()
+        best = self._search(field, cloud, odometry.delta)
+        if self._doubtful(best, odometry.delta):
             stepped = self._step_by_step(field, cloud, odometry.delta, between_nodes())
-            if stepped.inliers[0] > alignment.inliers[0]:
-                alignment = stepped
-        return self._judge(alignment, odometry)
+            best = _better(best, stepped, 0.0)
+        if self._doubtful(best, odometry.delta):
+            best = _better(best, self._grid(field, cloud, odometry.delta, c.lost), LOST_GAIN)
+        return self._judge(best, odometry)
+
+    def _doubtful(self, alignment: Alignment, expected: Array) -> bool:
+        """Whether a registration is weak, or contradicts the odometry without being very good."""
+        c, inliers = self._config.tracking, alignment.inliers[0]
+        return bool(inliers < c.inliers_min or (inliers < c.inliers_sure and self._contradicts(alignment.poses[0], expected)))
 
     def _field(self, extra: Sequence[Cloud] = ()) -> LikelihoodField:
         settings, n = self._config.registration, len(self._atlas)
@@ -67,30 +74,26 @@ class Tracker:
         cloud = self._atlas.submap(n - 1, nodes).cloud
         if extra:
             cloud = merged([cloud, *extra], self._config.scan.cell_m)
-        search = self._config.tracking.wide_m + 2 * self._config.scan.cell_m
+        search = self._config.tracking.lost.half_m + 2 * self._config.scan.cell_m
         return build_field(cloud, self._config.scan.cell_m, settings.reach_m, settings.field_sigma_m, search)
 
     def _search(self, field: LikelihoodField, cloud: Cloud, expected: Array) -> Alignment:
         """Narrow first; wide when that is weak or disagrees with the odometry, and then whichever has more inliers."""
         c = self._config.tracking
-        narrow = self._grid(field, cloud, expected, c.narrow_m, c.narrow_deg, c.prior_deg)
+        narrow = self._grid(field, cloud, expected, c.narrow)
         if narrow.inliers[0] >= c.inliers_min and not self._contradicts(narrow.poses[0], expected):
             return narrow
-        wide = self._grid(field, cloud, expected, c.wide_m, c.wide_deg, c.wide_prior_deg)
-        return wide if wide.inliers[0] > narrow.inliers[0] + 0.03 else narrow
+        return _better(narrow, self._grid(field, cloud, expected, c.wide), WIDE_GAIN)
 
-    def _grid(
-        self, field: LikelihoodField, cloud: Cloud, expected: Array, half_m: float, half_deg: float, prior_deg: float
-    ) -> Alignment:
-        c = self._config.tracking
-        headings = np.deg2rad(spaced(half_deg, 2.0))
-        offsets = square(half_m, 0.1)
+    def _grid(self, field: LikelihoodField, cloud: Cloud, expected: Array, window: SearchConfig) -> Alignment:
+        sigma_m, sigma_rad = window.prior_m, np.deg2rad(window.prior_deg)
+        headings, offsets = np.deg2rad(spaced(window.half_deg, 2.0)), square(window.half_m, 0.1)
         scores = score_starts(field, cloud.thinned(SCORED_POINTS).points, expected[:2], expected[2] + headings, offsets)
-        scores -= 0.05 * (headings[:, None] / np.deg2rad(prior_deg)) ** 2
-        scores -= 0.05 * ((offsets / (2 * c.prior_m)) ** 2).sum(axis=1)[None]
+        scores -= 0.05 * (headings[:, None] / sigma_rad) ** 2
+        scores -= 0.05 * ((offsets / (2.0 * sigma_m)) ** 2).sum(axis=1)[None]
         h, t = np.unravel_index(int(np.argmax(scores)), scores.shape)
         start = np.array([*(expected[:2] + offsets[t]), expected[2] + headings[h]])
-        prior = Prior(expected, 1.0 / np.array([c.prior_m, c.prior_m, np.deg2rad(prior_deg)]) ** 2)
+        prior = Prior(expected, 1.0 / np.array([sigma_m, sigma_m, sigma_rad]) ** 2)
         return align(field, cloud, start[None], self._config.registration, prior)
 
     def _step_by_step(
@@ -121,8 +124,13 @@ class Tracker:
         if off_m > c.translation_max_m and inliers < c.inliers_min:
             return Step(odometry, False, False, inliers, fit, f"{off_m:.2f} m from the odometry > {c.translation_max_m} m")
         covariance = alignment.covariance(0, self._config.registration, c.floor_m, np.deg2rad(c.floor_deg))
-        if inliers < c.inliers_min:
+        if self._doubtful(alignment, odometry.delta):
             covariance = covariance + np.diag([0.05**2, 0.05**2, np.deg2rad(1.5) ** 2])
         wrong = inliers >= c.inliers_min and self._contradicts(pose, odometry.delta)
         reason = "contradicts the odometry" if wrong else "agrees with the odometry"
         return Step(RelativePose(pose, covariance), True, wrong, inliers, fit, f"inliers {inliers:.2f}, {reason}")
+
+
+def _better(first: Alignment, second: Alignment, gain: float) -> Alignment:
+    """The second registration if it has more inliers by that much, else the first."""
+    return second if second.inliers[0] > first.inliers[0] + gain else first
