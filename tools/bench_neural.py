@@ -19,32 +19,43 @@ from hybridmap.neural import PathIntegrator
 from hybridmap.neural.grid import kernel_spectrum
 
 ODOMETRY_HZ = 100.0
+STEP_M = 0.005  # 0.5 m/s
+NODE_M = 0.25
 
 
 class PlainSheets:
     """The baseline: the same dynamics by one `rfft2` and one `irfft2` over the whole stack a step."""
 
     def __init__(self, integrator: PathIntegrator) -> None:
-        grid = integrator.grid
+        grid, config = integrator.grid, integrator.config
         side = grid.activity.shape[-1]
-        self.activity = grid.activity.copy()
+        self.activity = np.ascontiguousarray(grid.activity)
         p, q = np.fft.fftfreq(side, 1.0 / side)[:, None], np.arange(side // 2 + 1)
-        near = (np.abs(p) <= integrator.config.fourier_modes) & (q <= integrator.config.fourier_modes)
+        near = (np.abs(p) <= config.fourier_modes) & (q <= config.fourier_modes)
         squared = (p * p + q * q - p * q)[near].astype(np.int64)
-        config = integrator.config
         gains = np.zeros(near.shape, dtype=self.activity.dtype)
         gains[near] = kernel_spectrum(squared, config.kernel_gain_first, config.kernel_gain_zero, config.kernel_widths)
         self._gains, self._p, self._q = gains, p[:, 0].astype(gains.dtype), q.astype(gains.dtype)
+        self._stripe = 0.5 * config.band_drive * side**2
+        self._softplus = config.softplus_sharpness if config.rectifier == "softplus" else None
 
-    def step(self, shift_cycles: NDArray[np.floating]) -> None:
-        """Advance the sheets by shifts (M, 2), cycles."""
+    def step(self, shift_cycles: NDArray[np.floating], phasors: NDArray[np.complexfloating]) -> None:
+        """Advance the sheets by shifts (M, 2), cycles, with the stripes of bands at phasors (M, 3)."""
         turn = np.exp(-2j * np.pi * shift_cycles[:, 0, None] * self._p)[:, :, None]
         turn = turn * np.exp(-2j * np.pi * shift_cycles[:, 1, None] * self._q)[:, None, :]
         modes = np.fft.rfft2(self.activity) * (turn * self._gains)
-        self.activity = np.maximum(np.fft.irfft2(modes) + 1.0, 0.0).astype(self.activity.dtype)
+        stripes = self._stripe * phasors.conj()
+        modes[:, 1, 0] += stripes[:, 0]
+        modes[:, -1, 0] += stripes[:, 0].conj()
+        modes[:, 1, 1] += stripes[:, 1]
+        modes[:, 0, 1] += stripes[:, 2]
+        drive = np.fft.irfft2(modes) + 1.0
+        beta = self._softplus
+        rates = np.maximum(drive, 0.0) if beta is None else np.logaddexp(0.0, beta * drive) / beta
+        self.activity = rates.astype(self.activity.dtype, copy=False)
 
 
-def rate(step: Callable[[], None], steps: int, repeats: int = 9) -> float:
+def rate(step: Callable[[], None], steps: int, repeats: int = 25) -> float:
     """Steps per CPU-second, the best of some repeats."""
     best = np.inf
     for _ in range(repeats):
@@ -62,26 +73,37 @@ def measure(dtype: str, rectifier: str, steps: int) -> dict[str, float]:
     plain = PlainSheets(integrator)
     motion = integrator.bands.step(np.array([0.005, 0.002]))
     shift = motion.advance[:, ::2].astype(dtype)
+    for _ in range(20):
+        integrator.grid.step(motion.advance, motion.phasors)
+        plain.step(shift, motion.phasors)
+    apart = float(np.abs(integrator.grid.activity - plain.activity).max() / plain.activity.max())
     sheets = rate(lambda: integrator.grid.step(motion.advance, motion.phasors), steps)
-    baseline = rate(lambda: plain.step(shift), max(steps // 4, 1))
+    baseline = rate(lambda: plain.step(shift, motion.phasors), max(steps // 4, 1))
     whole = PathIntegrator(config)
-    rng = np.random.default_rng(0)
-    turns = iter(np.cumsum(rng.normal(0.0, 1e-3, 10 * steps)))
-    front = rate(lambda: whole.step((0.005, 0.0, float(next(turns))), 1.0 / ODOMETRY_HZ), steps)
-    with_pose = rate(lambda: _step_and_read(whole), steps)
+    front = rate(Driving(whole, NODE_M), steps)
     return {
         "baseline": baseline,
         "sheets": sheets,
         "sheets / baseline": sheets / baseline,
+        "apart after 20 steps": apart,
         "front-end": front,
-        "front-end and pose": with_pose,
         "x real time at 100 Hz": front / ODOMETRY_HZ,
+        "with the pose every step": rate(Driving(whole, STEP_M), steps),
     }
 
 
-def _step_and_read(integrator: PathIntegrator) -> None:
-    integrator.step((0.005, 0.0, 0.003), 1.0 / ODOMETRY_HZ)
-    _ = integrator.pose
+class Driving:
+    """Steps of 5 mm on a circle; the pose and the place code are read once every `node_m`, as at a node."""
+
+    def __init__(self, integrator: PathIntegrator, node_m: float) -> None:
+        self._integrator, self._node_steps, self._steps = integrator, max(1, round(node_m / STEP_M)), 0
+
+    def __call__(self) -> None:
+        """Take one step."""
+        self._integrator.step((STEP_M, 0.0, 0.003), 1.0 / ODOMETRY_HZ)
+        self._steps += 1
+        if self._steps % self._node_steps == 0:
+            _ = self._integrator.pose, self._integrator.place_code
 
 
 def main() -> None:
@@ -100,7 +122,7 @@ def main() -> None:
         return
     print(f"{'steps per CPU-second':24s}" + "".join(f"{name:>24s}" for name in next(iter(rows.values()))))
     for name, row in rows.items():
-        print(f"{name:24s}" + "".join(f"{value:24.1f}" for value in row.values()))
+        print(f"{name:24s}" + "".join(f"{value:24.4g}" for value in row.values()))
 
 
 if __name__ == "__main__":

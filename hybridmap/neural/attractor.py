@@ -31,7 +31,7 @@ class PlaceAttractor:
         self._wave = wave.astype(dtype)
         self._kernel = np.concatenate([gain[:, None] * np.cos(angle), gain[:, None] * np.sin(angle)]).astype(dtype)
         offset = np.arange(side)[:, None] - np.arange(side)
-        self._circulant = [(offset - whole) % side for whole in range(side)]
+        self._circulant = np.stack([offset % side, offset % side + side])  # of both axes, in the two lines laid end to end
         self._silent = np.zeros((side, side), dtype=dtype)
         self._phasors = np.exp(1j * angle[1])
         self._remappings: dict[tuple[int, int], NDArray[np.int64]] = {}
@@ -48,9 +48,12 @@ class PlaceAttractor:
         """Move the bump by a displacement (2,) in the world, m, and let the cells compete once."""
         whole, residual = split_shift(displacement_m / self.cell_m)
         phase = np.multiply.outer(residual.astype(self._wave.dtype), self._wave)
-        kernels = np.concatenate([np.cos(phase), np.sin(phase)], axis=1) @ self._kernel
-        along_x, along_y = (kernels[axis].take(self._circulant[int(whole[axis]) % self._side]) for axis in (0, 1))
-        spread = np.maximum(along_x @ self.activity @ along_y.T, self._silent)
+        lines = np.dot(np.concatenate([np.cos(phase), np.sin(phase)], axis=1), self._kernel)
+        if whole.any():
+            lines = np.stack([np.roll(line, cells) for line, cells in zip(lines, whole, strict=True)])
+        along_x, along_y = lines.take(self._circulant)
+        spread = np.dot(np.dot(along_x, self.activity), along_y.T)
+        np.maximum(spread, self._silent, out=spread)
         spread *= spread
         spread /= spread.sum()
         self.activity = spread

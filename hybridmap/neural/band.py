@@ -57,7 +57,7 @@ class BandRings:
         self.periods_m: NDArray[np.float64] = spacings_m[:, None] * period
         self.orientations_rad: NDArray[np.float64] = angles
         self.wave_vectors: NDArray[np.float64] = np.stack([np.cos(angles), np.sin(angles)], axis=-1) / self.periods_m[..., None]
-        self._turn = 2j * np.pi * self.wave_vectors
+        self._turn = _turning_weights(self.wave_vectors)
         preferred = 2.0 * np.pi * (np.arange(cells) / cells + 0.5)
         self._weights = np.stack([np.cos(preferred), np.sin(preferred)], axis=1).astype(dtype)
         self._sharpness = -1.0 / (2.0 * (2.0 * np.pi * width) ** 2)
@@ -68,7 +68,7 @@ class BandRings:
 
     def phasors(self) -> NDArray[np.complexfloating]:
         """Return the unit phasors exp(2 pi i phi), (M, 3), decoded from the activity."""
-        vector = self.activity.reshape(-1, self._weights.shape[0]) @ self._weights
+        vector = np.dot(self.activity.reshape(-1, self._weights.shape[0]), self._weights)
         z = vector.view(self._complex).reshape(self.activity.shape[:2])
         return np.asarray(z / np.abs(z))
 
@@ -83,16 +83,28 @@ class BandRings:
     def step(self, displacement_m: NDArray[np.float64]) -> BandMotion:
         """Move every ring by a displacement (2,) in the world, m; says what the rings tell the sheets."""
         before = self.phasors()
-        turn = np.exp(self._turn @ displacement_m).astype(self._complex, copy=False)
-        self.activity = self._rates(before * turn)
+        turn = np.cos(np.dot(np.append(displacement_m, 1.0), self._turn)).astype(self._weights.dtype, copy=False)
+        self.activity = self._rates(before * turn.view(self._complex).reshape(before.shape))
         after = self.phasors()
-        return BandMotion(np.angle(after * before.conj()) * (0.5 / np.pi), after)
+        moved = after * before.conj()
+        advance = np.arctan2(moved.imag, moved.real)
+        advance *= 0.5 / np.pi
+        return BandMotion(advance, after)
 
     def _rates(self, phasors: NDArray[np.complexfloating]) -> NDArray[np.floating]:
         vector = np.ascontiguousarray(phasors).reshape(-1, 1).view(self._weights.dtype)
-        offset = vector @ self._tuning
+        offset = np.dot(vector, self._tuning)
         np.arccos(offset, out=offset)
         offset *= offset
         offset *= self._sharpness
         np.exp(offset, out=offset)
         return np.asarray(offset.reshape(*phasors.shape, -1))
+
+
+def _turning_weights(wave_vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrix (3, 6 M) from a displacement and a one to angles: their cosines are the turns of the rings, (real, imaginary)."""
+    turn = 2.0 * np.pi * wave_vectors.reshape(-1, 2)
+    angles = np.zeros((3, len(turn), 2))
+    angles[:2] = turn.T[:, :, None]
+    angles[2, :, 1] = -0.5 * np.pi
+    return angles.reshape(3, -1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -15,8 +16,15 @@ Rectifier = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 
 
 def relu(drive: NDArray[np.floating]) -> NDArray[np.floating]:
-    """The paper's rectifying linear f."""
-    return np.asarray(np.maximum(drive, np.zeros_like(drive)))  # an array of zeros is several times faster than a scalar
+    """The paper's rectifying linear f; works in place."""
+    np.maximum(drive, _zeros(drive.shape, drive.dtype), out=drive)
+    return drive
+
+
+@cache
+def _zeros(shape: tuple[int, ...], dtype: np.dtype[np.floating]) -> NDArray[np.floating]:
+    """An array of zeros, which `maximum` takes several times faster than the number."""
+    return np.zeros(shape, dtype=dtype)
 
 
 def softplus(sharpness: float) -> Rectifier:
@@ -93,13 +101,17 @@ class GridModules:
         Raises:
             ConfigError: with these gains no stationary pattern forms; says what happens instead.
         """
-        self.modes = LowModes(side, fourier_modes, dtype)
-        self._gains = gains.astype(dtype)[:, None, :]
+        self.modes = LowModes(side, fourier_modes, modules, dtype)
+        self._dtype = np.dtype(dtype)
+        self._complex = np.result_type(self._dtype, np.complex64)
         self._rectifier = rectifier
         self._centre = fourier_modes
-        self._complex = np.result_type(self._gains.dtype, np.complex64)
+        self._gains = np.repeat(gains[:, None], modules, axis=1).astype(self._complex)
         self._stripes = self._stripe_weights(band_drive, side, metric)
-        self._uniform = side**2
+        self._phasors = np.ones((modules, 4), dtype=self._complex)
+        self._phasors_real, self._phasors_given = self._phasors.view(self._dtype), self._phasors[:, :3]
+        self._drive = np.empty((modules, self._stripes.shape[1]), dtype=self._dtype)
+        self._drive_modes = self._drive.view(self._complex).reshape(modules, 3, -1).swapaxes(0, 1)
         wave = 2.0 * np.pi * np.arange(side) / side
         seed = np.cos(wave[:, None]) + np.cos(wave)
         if metric == "hexagonal":
@@ -114,7 +126,7 @@ class GridModules:
 
     @activity.setter
     def activity(self, rates: NDArray[np.floating]) -> None:
-        self._stack = np.ascontiguousarray(rates.swapaxes(0, 1), dtype=self._gains.dtype)
+        self._stack = np.ascontiguousarray(rates.swapaxes(0, 1), dtype=self._dtype)
 
     def _settle(self, modules: int) -> None:
         """Let the pattern form, with every band at phase zero.
@@ -136,7 +148,7 @@ class GridModules:
 
     def _what_happens(self, change: float, again: float, peak: float) -> str:
         """Name the instability from the changes over one and over two steps and the peak after settling."""
-        zero, most = float(self._gains[self._centre, 0, 0]), float(self._gains.max())
+        zero, most = float(self._gains[self._centre, 0, 0].real), float(self._gains.real.max())
         if not peak < 1e6:
             found = f"the activity grows without bound (peak {peak:.3g} after 300 steps)"
         elif again <= 1e-3 * max(peak, change):
@@ -156,27 +168,30 @@ class GridModules:
             band_phasors: (M, 3) unit phasors of where the band rings are after it.
         """
         modes = self.modes.forward(self._stack)
-        modes *= self.modes.shift(band_advance[:, ::2])
-        modes *= self._gains
-        modes += self._band_input(band_phasors)
-        modes[self._centre, :, 0] += self._uniform
+        factors = self.modes.shift(band_advance[:, ::2])
+        factors *= self._gains
+        modes *= factors
+        near = modes[self._centre - 1 : self._centre + 2]
+        near += self._band_input(band_phasors)
         self._stack = self._rectifier(self.modes.inverse(modes))
 
     def _band_input(self, phasors: NDArray[np.complexfloating]) -> NDArray[np.complexfloating]:
-        """Modes (2K+1, M, K+1) of the stripes of the bands."""
-        drive = np.ascontiguousarray(phasors, dtype=self._complex).view(self._gains.dtype) @ self._stripes
-        return np.asarray(drive.view(self._complex)).reshape(len(drive), len(self.modes.first), -1).swapaxes(0, 1)
+        """Modes p = -1..1 (3, M, K+1) of I_BC: the stripes of the bands and uniform excitation."""
+        self._phasors_given[...] = phasors
+        np.dot(self._phasors_real, self._stripes, out=self._drive)
+        return self._drive_modes
 
     def _stripe_weights(self, band_drive: float, side: int, metric: Metric) -> NDArray[np.floating]:
-        """Weights (6, 2 * modes) from the phasors of three bands to their stripes' modes, all as (real, imaginary)."""
+        """Weights (8, 6 (K+1)) from the phasors of three bands and a one to modes p = -1..1, all as (real, imaginary)."""
         k, stripe = self._centre, 0.5 * band_drive * side**2
-        weights = np.zeros((3, 2, 2 * k + 1, k + 1, 2))
-        for band, mode, sign in ((0, (k + 1, 0), -1.0), (0, (k - 1, 0), 1.0), (1, (k + 1, 1), -1.0), (2, (k, 1), -1.0)):
+        weights = np.zeros((4, 2, 3, k + 1, 2))
+        for band, mode, sign in ((0, (2, 0), -1.0), (0, (0, 0), 1.0), (1, (2, 1), -1.0), (2, (1, 1), -1.0)):
             if band == 1 and metric == "square":
                 continue
             weights[band, 0][mode][0] = stripe
             weights[band, 1][mode][1] = sign * stripe
-        return weights.reshape(6, -1).astype(self._gains.dtype)
+        weights[3, 0, 1, 0, 0] = side**2
+        return weights.reshape(8, -1).astype(self._dtype)
 
     def band_phases(self) -> NDArray[np.float64]:
         """Return the phases (M, 3) of the modes (1,0), (1,1) and (0,1) of the activity, cycles in [-0.5, 0.5]."""

@@ -15,10 +15,10 @@ class LowModes:
 
     The stack has a sheet's first axis first, then the module, then the sheet's second axis: so each transform of all modules is
     two small matrix products. Modes are p = -K..K on the first axis, q = 0..K on the last; the half plane suffices because
-    sheets are real. Both transforms work in buffers of their own and return arrays that the next call overwrites.
+    sheets are real. Modes and factors are returned in buffers that the next call overwrites.
     """
 
-    def __init__(self, side: int, modes: int, dtype: DTypeLike = np.float64) -> None:
+    def __init__(self, side: int, modes: int, modules: int = 1, dtype: DTypeLike = np.float64) -> None:
         self.side = side
         self.first: NDArray[np.int64] = np.arange(-modes, modes + 1)
         self.second: NDArray[np.int64] = np.arange(modes + 1)
@@ -31,43 +31,44 @@ class LowModes:
         self._rows = np.ascontiguousarray(rows).astype(dtype)
         self._left = np.exp(-1j * angle_p).astype(complex_type)
         self._right = np.ascontiguousarray(np.exp(1j * angle_p).T).astype(complex_type)
-        self._complex = complex_type
-        self._angles = np.zeros((2, len(self.first) + len(self.second)), dtype=dtype)
-        self._angles[0, : len(self.first)] = -2.0 * np.pi * self.first
-        self._angles[1, len(self.first) :] = -2.0 * np.pi * self.second
-        self._buffers: dict[int, tuple[NDArray[np.complexfloating], ...]] = {}
+        shape = (len(self.first), modules, len(self.second))
+        self._half, self._back = (np.empty((side, modules * shape[2]), dtype=complex_type) for _ in range(2))
+        self._half_real, self._back_real = (a.view(dtype).reshape(-1, 2 * shape[2]) for a in (self._half, self._back))
+        self._modes = np.empty(shape, dtype=complex_type)
+        self._modes_flat = self._modes.reshape(shape[0], -1)
+        self._angles = self._angles_of_shifts(shape).astype(dtype)
+        self._shifts = np.ones(2 * modules + 1, dtype=dtype)
+        self._shift_pairs = self._shifts[:-1].reshape(modules, 2)
+        self._cosines = np.empty(self._angles.shape[1], dtype=dtype)
+        self._factors = self._cosines.view(complex_type).reshape(shape)
 
     def forward(self, stack: NDArray[np.floating]) -> NDArray[np.complexfloating]:
         """Return the modes of a contiguous stack of sheets (N, M, N)."""
-        half, modes, _ = self._buffers_of(stack.shape[1])
-        real = half.view(self._rows.dtype).reshape(-1, self._columns.shape[1])
-        np.dot(stack.reshape(-1, self.side), self._columns, out=real)
-        np.dot(self._left, half, out=modes)
-        return modes.reshape(len(self.first), -1, len(self.second))
+        np.dot(stack.reshape(-1, self.side), self._columns, out=self._half_real)
+        np.dot(self._left, self._half, out=self._modes_flat)
+        return self._modes
 
     def inverse(self, modes: NDArray[np.complexfloating]) -> NDArray[np.floating]:
-        """Return the stack of sheets (N, M, N) that have these modes, contiguous, and no others."""
-        half = self._buffers_of(modes.shape[1])[2]
-        np.dot(self._right, modes.reshape(len(self.first), -1), out=half)
-        real = half.view(self._rows.dtype).reshape(-1, self._columns.shape[1])
-        return np.asarray(np.dot(real, self._rows)).reshape(self.side, -1, self.side)
-
-    def _buffers_of(self, modules: int) -> tuple[NDArray[np.complexfloating], ...]:
-        """Work space: half-transformed sheets, modes, half-transformed modes."""
-        if modules not in self._buffers:
-            width = modules * len(self.second)
-            rows = (self.side, len(self.first), self.side)
-            self._buffers[modules] = tuple(np.empty((count, width), dtype=self._complex) for count in rows)
-        return self._buffers[modules]
+        """Return the stack of sheets (N, M, N) that have these modes and no others: a new array."""
+        np.dot(self._right, modes.reshape(self._modes_flat.shape), out=self._back)
+        return np.asarray(np.dot(self._back_real, self._rows)).reshape(self.side, -1, self.side)
 
     def shift(self, shift_cycles: NDArray[np.floating]) -> NDArray[np.complexfloating]:
         """Return the factors (2K+1, M, K+1) that move sheets by shifts (M, 2), cycles of the sheet."""
-        angle = shift_cycles.astype(self._angles.dtype) @ self._angles
-        factors = np.empty(angle.shape, dtype=self._complex)
-        np.cos(angle, out=factors.real)
-        np.sin(angle, out=factors.imag)
-        split = len(self.first)
-        return np.asarray(factors[:, :split].T[:, :, None] * factors[:, split:])
+        self._shift_pairs[...] = shift_cycles
+        np.dot(self._shifts, self._angles, out=self._cosines)
+        np.cos(self._cosines, out=self._cosines)
+        return self._factors
+
+    def _angles_of_shifts(self, shape: tuple[int, int, int]) -> NDArray[np.float64]:
+        """Matrix from the shifts of all modules and a one to angles: their cosines are the factors, as (real, imaginary)."""
+        modules = shape[1]
+        angles = np.zeros((modules, 2, *shape, 2))
+        for module in range(modules):
+            angles[module, 0, :, module] = -2.0 * np.pi * self.first[:, None, None]
+            angles[module, 1, :, module] = -2.0 * np.pi * self.second[:, None]
+        quarter = np.broadcast_to([0.0, -0.5 * np.pi], (*shape, 2))
+        return np.concatenate([angles.reshape(2 * modules, -1), quarter.reshape(1, -1)])
 
     def squared_wave_number(self, metric: Metric = "hexagonal") -> NDArray[np.int64]:
         """Return |k|^2 (2K+1, K+1).

@@ -13,27 +13,27 @@ def stack_of(sheets):
 
 def smooth_sheets(seed: int) -> np.ndarray:
     """A stack (N, M, N)."""
-    modes = LowModes(32, 4)
+    modes = LowModes(32, 4, 3)
     return modes.inverse(modes.forward(np.random.default_rng(seed).normal(size=(32, 3, 32))))
 
 
 def test_transforms_are_those_of_numpy():
     sheets = np.random.default_rng(0).normal(size=(3, 32, 32))
     full = np.fft.fft2(sheets)
-    modes = LowModes(32, 4).forward(stack_of(sheets))
+    modes = LowModes(32, 4, 3).forward(stack_of(sheets))
     assert modes.swapaxes(0, 1) == pytest.approx(full[:, np.arange(-4, 5)][:, :, np.arange(5)])
 
 
 def test_inverse_undoes_forward_on_low_modes():
     sheets = smooth_sheets(1)
-    modes = LowModes(32, 4)
+    modes = LowModes(32, 4, 3)
     assert modes.inverse(modes.forward(sheets)) == pytest.approx(sheets, abs=1e-12)
 
 
 @settings(max_examples=20, deadline=None)
 @given(whole=hnp.arrays(np.int64, (3, 2), elements=st.integers(-40, 40)), seed=st.integers(0, 9))
 def test_a_shift_by_whole_cells_is_a_roll(whole, seed):
-    stack, modes = smooth_sheets(seed), LowModes(32, 4)
+    stack, modes = smooth_sheets(seed), LowModes(32, 4, 3)
     sheets = stack.swapaxes(0, 1)
     expected = np.stack([np.roll(s, w, axis=(0, 1)) for s, w in zip(sheets, whole, strict=True)])
     factors = modes.shift(whole / 32)
