@@ -29,8 +29,10 @@ LEG_M = (1.0, 16.0)
 INDEPENDENT_LEGS = 16.0
 """Legs are so short that the way holds this many one after the other, as far as the limits allow."""
 
+CAUCHY = 2.0
+"""Scale of the Cauchy weights, in robust standard deviations: about 95 % efficiency for Gaussian noise."""
+
 _ROUNDS = 40
-_CAUCHY = 2.0  # in robust standard deviations: 89 % efficiency for Gaussian noise
 _FLOOR_RAD = np.radians(0.5)
 _WALK_RAD = np.radians(1.0)  # per sqrt(m)
 _PER_TURN = 0.03  # per sqrt(rad)
@@ -72,7 +74,7 @@ def regress(sightings: Sequence[Sighting], leg_m: float | None = None) -> Estima
     """
     ways = [_travel_at(sighting) for sighting in sightings]
     total = float(sum(way[-1] - way[0] for way in ways))
-    length = leg_m or float(np.clip(total / len(ways) / INDEPENDENT_LEGS, *LEG_M))
+    length = leg_m or leg_length(total / len(ways))
     drives = [cut(sighting, way, length) for sighting, way in zip(sightings, ways, strict=True)]
     count = sum(len(drive.legs) for drive in drives)
     if total < 4.0 * length or count < 8:
@@ -81,6 +83,18 @@ def regress(sightings: Sequence[Sighting], leg_m: float | None = None) -> Estima
             f"give a longer drive, or shorter legs"
         )
     return _solve(drives, length, total)
+
+
+def leg_length(travel_m: float) -> float:
+    """Length of the legs for a drive of some travel, m."""
+    return float(np.clip(travel_m / INDEPENDENT_LEGS, *LEG_M))
+
+
+def leg_sigmas(legs: Legs) -> tuple[Array, Array]:
+    """Assumed standard deviations (L,) of the legs' lengths (m) and of the headings at their ends (rad)."""
+    travel, turned = legs.travel_m, legs.turned_rad
+    length = np.sqrt(_FLOOR_M**2 + _WALK_M**2 * travel)
+    return length, np.sqrt(_FLOOR_RAD**2 + _WALK_RAD**2 * travel + _PER_TURN**2 * turned)
 
 
 def cut(sighting: Sighting, travel_m: Array, leg_m: float) -> _Drive:
@@ -102,11 +116,12 @@ def _travel_at(sighting: Sighting) -> Array:
 
 def _solve(drives: list[_Drive], leg_m: float, total_m: float) -> Estimate:
     travel = np.concatenate([drive.legs.travel_m for drive in drives])
-    turned = np.concatenate([drive.legs.turned_rad for drive in drives])
+    sigmas = [leg_sigmas(drive.legs) for drive in drives]
+    sigma_m, sigma_rad = (np.concatenate([pair[which] for pair in sigmas]) for which in (0, 1))
     overlap = max(1.0, float(travel.sum()) / total_m)
-    heading = _fit_heading(drives, np.sqrt(_FLOOR_RAD**2 + _WALK_RAD**2 * travel + _PER_TURN**2 * turned), overlap)
+    heading = _fit_heading(drives, sigma_rad, overlap)
     turn_gain, bias, delay_s = heading.values
-    length = _fit_length(drives, Gains(1.0, turn_gain, bias), delay_s, travel, overlap)
+    length = _fit_length(drives, Gains(1.0, turn_gain, bias), delay_s, sigma_m, travel, overlap)
     covariance = np.zeros((4, 4))
     covariance[0, 0] = length.covariance[0, 0]
     covariance[1:, 1:] = heading.covariance
@@ -145,7 +160,7 @@ def _fit_heading(drives: list[_Drive], sigma: Array, overlap: float) -> _Fit:
     return _Fit(values, fit.covariance, fit.unit_variance, fit.weights)
 
 
-def _fit_length(drives: list[_Drive], gains: Gains, delay_s: float, travel_m: Array, overlap: float) -> _Fit:
+def _fit_length(drives: list[_Drive], gains: Gains, delay_s: float, sigma_m: Array, travel_m: Array, overlap: float) -> _Fit:
     """The gain from the legs' lengths along the measured chords; `gains` has a gain of one."""
     measured = np.concatenate([drive.measured[:, :2] for drive in drives])
     predicted = np.concatenate([drive.legs.predict(gains, delay_s)[:, :2] for drive in drives])
@@ -154,7 +169,7 @@ def _fit_length(drives: list[_Drive], gains: Gains, delay_s: float, travel_m: Ar
     if np.count_nonzero(straight) < 4:
         return _Fit(np.array([1.0]), np.array([[1.0]]), 1.0, np.ones(len(length)))
     along = np.sum(predicted * measured, axis=1)[straight] / length[straight]
-    sigma = np.sqrt(_FLOOR_M**2 + _WALK_M**2 * travel_m[straight])
+    sigma = sigma_m[straight]
     gain = 1.0
     for _ in range(_ROUNDS):
         fit = _weigh((gain * along - length[straight]) / sigma, (along / sigma)[:, None], overlap)
@@ -171,7 +186,7 @@ def _weigh(residual: Array, slope: Array, overlap: float) -> _Fit:
     many legs cover a place, and scaled by the weighted mean square of the residuals.
     """
     scale = max(float(np.median(np.abs(residual))) * 1.4826, 1e-9)
-    weights = 1.0 / (1.0 + (residual / (_CAUCHY * scale)) ** 2)
+    weights = 1.0 / (1.0 + (residual / (CAUCHY * scale)) ** 2)
     information = slope.T @ (weights[:, None] * slope)
     try:
         inverse = np.linalg.inv(information)

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 GAIN_CHANGES = "gain_changes"
 """Under this key of the map file: `[stamp_ns, gain, turn_gain, heading_bias_rad_m]` for each change made while driving."""
 
-ESTIMATORS = ("alternating",)
+ESTIMATORS = ("alternating", "joint")
 
 _MAX_GAP_S = 1.0
 _KEY_M, _KEY_RAD = 0.25, 0.35  # travel or turn between two instants at which a reference is used
@@ -103,7 +103,23 @@ def estimate_of(
         return by_reference(drives, references, leg_m)
     if estimator not in ESTIMATORS:
         raise EvaluationError(f"unknown estimator {estimator!r}; there are {', '.join(ESTIMATORS)}")
-    return alternating(drives, leg_m)
+    return joint_of(drives) if estimator == "joint" else alternating(drives, leg_m)
+
+
+def joint_of(drives: Sequence[Drive]) -> Estimate:
+    """Calibrate one drive with its map, as variables of one graph.
+
+    Raises:
+        EvaluationError: more than one drive, or a map with nothing but odometry.
+        BackendError: GTSAM could not solve it.
+    """
+    from hybridmap.calibration import joint
+
+    if len(drives) != 1:
+        raise EvaluationError(f"the joint estimator takes one session, found {len(drives)}; use `alternating` for several")
+    drive = drives[0]
+    require_closures(drive)
+    return joint.solve(drive.graph, drive.motion, drive.stamps_ns, drive.config.backends).estimate
 
 
 def by_reference(drives: Sequence[Drive], references: Sequence[Trajectory], leg_m: float | None = None) -> Estimate:

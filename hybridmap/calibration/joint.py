@@ -1,0 +1,220 @@
+"""Joint calibration: gain, turn gain, heading bias and delay as one more variable of the GTSAM graph.
+
+A heading bias is no outlier: it is in every odometry edge, and no robust kernel takes it out. As a variable it bends the whole
+chain, so that loops which a drifted chain contradicts fit again. The problem has local minima (another winding number of
+the chain), so several starts of the bias are tried, each from poses that an incremental relaxation has grown along the
+chain made with that bias; the lowest cost of odometry wins.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap import backends
+from hybridmap.backends.factors import NoiseModels, anchor, factors, poses_of
+from hybridmap.backends.following import with_edges
+from hybridmap.calibration.estimate import Estimate
+from hybridmap.calibration.gains import NEUTRAL, Gains
+from hybridmap.calibration.legs import Motion
+from hybridmap.calibration.odometry_terms import OdometryTerms, own_edges, terms_of
+from hybridmap.calibration.regression import CAUCHY
+from hybridmap.config.backends import BackendsConfig
+from hybridmap.errors import BackendError
+from hybridmap.geometry import Array, between, compose, inverse
+from hybridmap.graph.connectivity import chain
+from hybridmap.graph.pose_graph import PoseGraph
+
+BIAS_STARTS_RAD_M = (0.0, -0.02, 0.02, -0.06, 0.06)
+"""Starts of the heading bias, rad/m; the drift of wheels seldom exceeds 3 deg/m."""
+
+_AGREEING_STARTS = 3
+_SAME_RAD_M = 2e-4
+_OPEN_WAY = 0.1  # share of the way that only odometry spans; below it no winding of the chain is in doubt
+_PRIOR = np.array([0.2, 0.2, 0.2, 0.2])  # so wide that it only holds what the drive leaves open
+_ITERATIONS = 60
+_MEDIAN_OF_NORM = {2: 1.1774, 3: 1.5382}  # median of the norm of so many standard normal components
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """The map and the calibration that explain each other.
+
+    Attributes:
+        poses: (N, 3) of the nodes.
+        estimate: the calibration.
+        odometry_cost: Cauchy cost of the whitened odometry residuals; the lowest of the starts.
+        bias_start_rad_m: from where it was found.
+    """
+
+    poses: Array
+    estimate: Estimate
+    odometry_cost: float
+    bias_start_rad_m: float
+
+
+def solve(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config: BackendsConfig) -> Joint:
+    """Optimise poses and calibration together.
+
+    Args:
+        graph: nodes and accepted edges.
+        motion: raw odometry.
+        stamps_ns: (N,) of the nodes.
+        config: settings of the relaxation and the kernels.
+
+    Raises:
+        BackendError: no start led to a solution.
+    """
+    problem = _Problem(graph, motion, stamps_ns, config)
+    found: list[Joint] = []
+    for bias in BIAS_STARTS_RAD_M if problem.open_way() > _OPEN_WAY else BIAS_STARTS_RAD_M[:1]:
+        start = Gains(heading_bias_rad_m=bias)
+        solution = problem.solve(problem.grown(start), np.append(start.to_array(), 0.0), 1.0, bias)
+        if solution is None:
+            continue
+        found.append(solution)
+        reached = solution.estimate.gains.heading_bias_rad_m
+        _logger.info("from %.3f rad/m: %.4f rad/m, odometry cost %.2f", bias, reached, solution.odometry_cost)
+        if len(found) == _AGREEING_STARTS and np.ptp([one.estimate.gains.heading_bias_rad_m for one in found]) < _SAME_RAD_M:
+            break  # the starts on either side of zero lead to the same map
+    if not found:
+        raise BackendError("calibration: GTSAM solved the graph from none of the starts of the heading bias")
+    best = min(found, key=lambda one: one.odometry_cost)
+    variable = np.append(best.estimate.gains.to_array(), best.estimate.delay_s)
+    scale = problem.scale(best.poses, variable)
+    return problem.solve(best.poses, variable, scale, best.bias_start_rad_m) or best
+
+
+class _Problem:
+    """One graph with its calibration variable, to be solved from several starts."""
+
+    def __init__(self, graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config: BackendsConfig) -> None:
+        self.graph, self.config = graph, config
+        self.motion, self.stamps_ns = motion, stamps_ns
+        self.own = own_edges(graph)
+        self.key = graph.n_nodes
+        self.terms = terms_of(graph, motion, stamps_ns, NEUTRAL)
+        self._evaluated: tuple[bytes, Array, Array] | None = None
+
+    def open_way(self) -> float:
+        """Share of the way on which nothing but odometry joins a node to the next."""
+        only = self.terms.components == 3
+        return float(np.sum(self.terms.legs.travel_m[only])) / max(float(self.motion.travel_m[-1]), 1e-9)
+
+    def grown(self, start: Gains) -> Array:
+        """Poses (N, 3) by relaxation as the graph grew, with odometry as this start has it."""
+        deltas = self.graph.deltas.copy()
+        legs = terms_of(self.graph, self.motion, self.stamps_ns, start, consecutive=True).legs
+        deltas[self.own] = legs.predict(start)
+        graph = chain(replace(self.graph, deltas=deltas))
+        poses = graph.initial
+        for solution in backends.replay(backends.create("relaxation-ratslam", self.config), graph):
+            poses = solution.poses
+        return poses
+
+    def solve(self, poses: Array, variable: Array, scale: float, bias_start_rad_m: float) -> Joint | None:
+        """From given poses (N, 3) and calibration (4,); None where GTSAM fails or the poses are not finite."""
+        gains = Gains.from_array(variable[:3])
+        self.terms = terms_of(self.graph, self.motion, self.stamps_ns, gains).scaled(scale)
+        self._evaluated = None
+        nonlinear, values = self._factors(), gtsam.Values()
+        for number, pose in enumerate(poses.tolist()):
+            values.insert(number, gtsam.Pose2(*pose))
+        values.insert(self.key, variable)
+        params = gtsam.LevenbergMarquardtParams()
+        params.setMaxIterations(_ITERATIONS)
+        params.setRelativeErrorTol(1e-6)
+        try:
+            solved = gtsam.LevenbergMarquardtOptimizer(nonlinear, values, params).optimize()
+            marginal = gtsam.Marginals(nonlinear, solved).marginalCovariance(self.key)
+        except RuntimeError as error:
+            _logger.info("from %.3f rad/m: %s", bias_start_rad_m, str(error).strip().splitlines()[:1])
+            return None
+        return self._result(solved, np.asarray(marginal), bias_start_rad_m)
+
+    def scale(self, poses: Array, variable: Array) -> float:
+        """How much larger than assumed the odometry residuals are, by their median."""
+        norms = np.linalg.norm(self._residuals(poses, variable), axis=1)
+        expected = np.array([_MEDIAN_OF_NORM[rows] for rows in self.terms.components])
+        return max(float(np.median(norms / expected)), 1e-3)
+
+    def _residuals(self, poses: Array, variable: Array) -> Array:
+        predicted, _ = self.evaluate(variable)
+        apart = between(poses[self.terms.sources], poses[self.terms.targets])
+        return np.asarray(np.einsum("eij,ej->ei", self.terms.whiten, compose(inverse(predicted), apart)))
+
+    def evaluate(self, variable: Array) -> tuple[Array, Array]:
+        """Displacements (E, 3) of all terms and their derivatives (E, 3, 4), computed once a value of the variable."""
+        mark = variable.tobytes()
+        if self._evaluated is None or self._evaluated[0] != mark:
+            gains, delay_s = Gains.from_array(variable[:3]), float(variable[3])
+            self._evaluated = (mark, self.terms.legs.predict(gains, delay_s), self.terms.legs.jacobian(gains, delay_s))
+        return self._evaluated[1], self._evaluated[2]
+
+    def _result(self, solved: Any, marginal: Array, bias_start_rad_m: float) -> Joint | None:
+        variable = np.asarray(solved.atVector(self.key))
+        solved.erase(self.key)
+        poses = poses_of(solved)
+        if not (np.isfinite(poses).all() and np.isfinite(variable).all()):
+            return None
+        squared = np.sum(self._residuals(poses, variable) ** 2, axis=1)
+        weights = 1.0 / (1.0 + squared / CAUCHY**2)
+        overlap = self.terms.overlap
+        unit_variance = float((weights * squared).sum() / (weights * self.terms.components).sum()) * overlap
+        estimate = Estimate(
+            gains=Gains.from_array(variable[:3]),
+            delay_s=float(variable[3]),
+            covariance=marginal * unit_variance,
+            leg_m=float(np.mean(self.terms.legs.travel_m)),
+            legs=len(self.terms.legs) / overlap,
+            travel_m=float(self.motion.travel_m[-1]),
+            unit_variance=unit_variance,
+            downweighted=float(np.mean(weights < 0.5)),
+        )
+        cost = float(np.sum(CAUCHY**2 * np.log1p(squared / CAUCHY**2)))
+        return Joint(poses, estimate, cost, bias_start_rad_m)
+
+    def _factors(self) -> Any:
+        loops = gtsam.noiseModel.mEstimator.Cauchy.Create(self.config.robust.cauchy_scale)
+        others = np.ones(self.graph.n_edges, dtype=bool)
+        others[self.own] = False
+        models = NoiseModels(lambda base: gtsam.noiseModel.Robust.Create(loops, base))
+        out = gtsam.NonlinearFactorGraph()
+        for factor in factors(with_edges(self.graph, others), models):
+            out.push_back(factor)
+        kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY)
+        unit = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Unit.Create(3))
+        ends = zip(self.terms.sources.tolist(), self.terms.targets.tolist(), strict=True)
+        for index, (source, target) in enumerate(ends):
+            out.push_back(gtsam.CustomFactor(unit, [source, target, self.key], _leg_error(self, self.terms, index)))
+        out.push_back(anchor(self.graph.initial[0]))
+        neutral = np.append(NEUTRAL.to_array(), 0.0)
+        out.push_back(gtsam.PriorFactorVector(self.key, neutral, gtsam.noiseModel.Diagonal.Sigmas(_PRIOR)))
+        return out
+
+
+def _leg_error(problem: _Problem, terms: OdometryTerms, index: int) -> Callable[[Any, Any, Any], Array]:
+    """Whitened error (3,) of one term: where the target is, seen from where calibrated odometry has it."""
+    source, target = int(terms.sources[index]), int(terms.targets[index])
+    whiten, key = terms.whiten[index], problem.key
+
+    def error(_this: Any, values: Any, jacobians: Any) -> Array:
+        predicted, slope = problem.evaluate(values.atVector(key))
+        apart = values.atPose2(source).between(values.atPose2(target))
+        off = gtsam.Pose2(*predicted[index]).between(apart)
+        if jacobians is not None:
+            turn = whiten.copy()
+            turn[:, :2] = whiten[:, :2] @ off.rotation().matrix()
+            jacobians[0] = -turn @ apart.inverse().AdjointMap()
+            jacobians[1] = turn
+            jacobians[2] = -turn @ off.inverse().AdjointMap() @ slope[index]
+        return np.asarray(whiten @ (off.x(), off.y(), off.theta()))
+
+    return error

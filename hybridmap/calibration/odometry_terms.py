@@ -1,0 +1,118 @@
+"""Which stretches of odometry enter the joint graph, and how sure each is.
+
+Between nodes that a registration joins, the map stands without odometry: there long, overlapping legs enter, by their heading
+and length, for the reasons that `regression.py` gives. Elsewhere every consecutive pair of nodes keeps its odometry edge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.calibration.gains import Gains
+from hybridmap.calibration.legs import Legs, Motion
+from hybridmap.calibration.regression import leg_length, leg_sigmas
+from hybridmap.geometry import Array
+from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+
+_OVERLAP = 4
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryTerms:
+    """Odometry between pairs of nodes.
+
+    Attributes:
+        legs: (E,) the odometry.
+        sources, targets: (E,) nodes at their ends.
+        whiten: (E, 3, 3) takes the pose of the target, seen from where odometry has it, to a residual of unit variance.
+        components: (E,) how many components the residual has.
+        overlap: how many terms cover a place of the way; their information is divided by it.
+    """
+
+    legs: Legs
+    sources: NDArray[np.int64]
+    targets: NDArray[np.int64]
+    whiten: Array
+    components: NDArray[np.int64]
+    overlap: float
+
+    def scaled(self, scale: float) -> OdometryTerms:
+        """The same with standard deviations larger by a factor."""
+        return replace(self, whiten=self.whiten / scale)
+
+
+def own_edges(graph: PoseGraph) -> NDArray[np.int64]:
+    """Odometry edges between consecutive nodes."""
+    return np.flatnonzero((graph.kinds == EdgeKind.ODOMETRY) & (graph.targets == graph.sources + 1))
+
+
+def terms_of(
+    graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], gains: Gains, *, consecutive: bool = False
+) -> OdometryTerms:
+    """The odometry terms of a graph.
+
+    Args:
+        graph: nodes and accepted edges.
+        motion: raw odometry.
+        stamps_ns: (N,) of the nodes.
+        gains: by which the direction of a long leg's chord is taken.
+        consecutive: one term for every odometry edge, whatever registrations there are.
+    """
+    own = own_edges(graph)
+    carried = np.zeros(graph.n_nodes, dtype=bool)  # node k: joined to k + 1 by a registration
+    if not consecutive:
+        near = (graph.kinds == EdgeKind.REGISTRATION) & (np.abs(graph.targets - graph.sources) == 1)
+        carried[np.minimum(graph.sources, graph.targets)[near]] = True
+    kept = own[~carried[graph.sources[own]]]
+    source, target = _long_legs(carried, stamps_ns, motion)
+    overlap = float(_OVERLAP) if len(source) else 1.0
+    legs = Legs(motion, stamps_ns[source], stamps_ns[target])
+    whiten = np.concatenate([_whiten_long(legs, gains) / np.sqrt(overlap), _whiten_edges(graph, kept)])
+    ends = np.concatenate([source, graph.sources[kept]]), np.concatenate([target, graph.targets[kept]])
+    return OdometryTerms(
+        legs=Legs(motion, stamps_ns[ends[0]], stamps_ns[ends[1]]),
+        sources=ends[0],
+        targets=ends[1],
+        whiten=whiten,
+        components=np.repeat([2, 3], [len(source), len(kept)]),
+        overlap=overlap,
+    )
+
+
+def _long_legs(
+    carried: NDArray[np.bool_], stamps_ns: NDArray[np.int64], motion: Motion
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Ends of legs that lie wholly on a stretch which registrations carry, four of them over each place."""
+    travel = np.interp(stamps_ns, motion.stamps_ns, motion.travel_m)
+    leg_m = leg_length(float(travel[-1] - travel[0]))
+    starts = np.searchsorted(travel, np.arange(travel[0], travel[-1], leg_m / _OVERLAP))
+    first = np.unique(starts)
+    last = np.searchsorted(travel, travel[first] + leg_m)
+    inside = last < len(travel)
+    first, last = first[inside], last[inside]
+    broken = np.concatenate([[0], np.cumsum(~carried)])
+    whole = (broken[last] == broken[first]) & (travel[last] - travel[first] < 2.0 * leg_m)
+    return first[whole], last[whole]
+
+
+def _whiten_long(legs: Legs, gains: Gains) -> Array:
+    """(L, 3, 3): length along the predicted chord, and heading."""
+    predicted = legs.predict(gains)
+    sigma_m, sigma_rad = leg_sigmas(legs)
+    length = np.maximum(np.hypot(predicted[:, 0], predicted[:, 1]), 1e-9)
+    straight = length > 0.3 * legs.travel_m
+    direction = (predicted[:, 0] + 1j * predicted[:, 1]) / length * np.exp(-1j * predicted[:, 2])
+    out = np.zeros((len(legs), 3, 3))
+    out[:, 0, 0], out[:, 0, 1] = direction.real * straight / sigma_m, direction.imag * straight / sigma_m
+    out[:, 2, 2] = 1.0 / sigma_rad
+    return out
+
+
+def _whiten_edges(graph: PoseGraph, edges: NDArray[np.int64]) -> Array:
+    """(E, 3, 3) upper Cholesky factors of the edges' information."""
+    if not len(edges):
+        return np.zeros((0, 3, 3))
+    return np.asarray(np.linalg.cholesky(graph.information[edges]).transpose(0, 2, 1))
