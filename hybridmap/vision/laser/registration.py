@@ -8,20 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.laser import RegistrationConfig
-from hybridmap.geometry import Array, between, compose
+from hybridmap.geometry import Array, compose, wrap_angle
 from hybridmap.vision.laser.cloud import Cloud
 from hybridmap.vision.laser.likelihood import LikelihoodField, ambiguity
 
-CONVERGED = 2e-4
+CONVERGED = 5e-4
 WEAKEST_INFORMATION = (1.0, 1.0, 4.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """Where the moving frame is expected: pose (3,), or (K, 3) one a start, with information (3,) of x, y, yaw."""
+    """Where the moving frame is expected: pose (3,), or (K, 3) one a start, and how surely, m and rad."""
 
     pose: Array
-    information: Array
+    sigma_m: float
+    sigma_rad: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,14 +145,13 @@ def _normal_equations(partners: _Partners, scale: float) -> tuple[Array, Array]:
 
 
 def _add_prior(hessian: Array, gradient: Array, poses: Array, prior: Prior) -> None:
-    error = between(prior.pose, poses)
-    cos, sin = np.cos(error[:, 2]), np.sin(error[:, 2])
-    jacobian = np.zeros_like(hessian)
-    jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 1, 0], jacobian[:, 1, 1] = cos, -sin, sin, cos
-    jacobian[:, 2, 2] = 1.0
-    weighted = jacobian * prior.information[None, :, None]
-    hessian += jacobian.transpose(0, 2, 1) @ weighted
-    gradient += np.einsum("kji,kj->ki", weighted, error)
+    off = poses - prior.pose
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    weight_m, weight_rad = prior.sigma_m**-2, prior.sigma_rad**-2
+    hessian[:, [0, 1, 2], [0, 1, 2]] += [weight_m, weight_m, weight_rad]
+    gradient[:, 0] += weight_m * (cos * off[:, 0] + sin * off[:, 1])
+    gradient[:, 1] += weight_m * (cos * off[:, 1] - sin * off[:, 0])
+    gradient[:, 2] += weight_rad * wrap_angle(off[:, 2])
 
 
 def _judge(partners: _Partners, poses: Array, config: RegistrationConfig) -> Alignment:

@@ -69,7 +69,7 @@ class Retracer:
         local = merged([self._atlas.clouds[i].moved(poses[i]) for i in near], cell)
         field = build_field(local, cell, settings.reach_m, settings.field_sigma_m)
         stack, counts = _stacked(clouds)
-        prior = Prior(expected, 1.0 / np.array([c.prior_m, c.prior_m, np.deg2rad(c.prior_deg)]) ** 2)
+        prior = Prior(expected, c.prior_m, float(np.deg2rad(c.prior_deg)))
         alignment = align(field, stack, expected, settings, prior)
         inliers = alignment.inliers * stack.points.shape[1] / np.maximum(counts, 1)
         off = between(expected, alignment.poses)

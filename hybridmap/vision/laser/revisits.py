@@ -70,7 +70,7 @@ class Reviser:
         scores = score_starts(sharp, probe.cloud.thinned(100).points, expected[:2], headings, offsets)
         h, t = np.unravel_index(int(np.argmax(scores)), scores.shape)
         start = np.array([*(expected[:2] + offsets[t]), headings[h]])
-        prior = Prior(expected, 1.0 / np.array([1.0, 1.0, 0.2]) ** 2)
+        prior = Prior(expected, 1.0, 0.2)
         alignment = align(fine, probe.cloud.thinned(300), start[None], settings, prior)
         covariance = alignment.covariance(0, settings, c.floor_m, np.deg2rad(c.floor_deg))
         pose = alignment.poses[0]

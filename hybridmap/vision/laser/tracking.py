@@ -93,7 +93,7 @@ class Tracker:
         scores -= 0.05 * ((offsets / (2.0 * sigma_m)) ** 2).sum(axis=1)[None]
         h, t = np.unravel_index(int(np.argmax(scores)), scores.shape)
         start = np.array([*(expected[:2] + offsets[t]), expected[2] + headings[h]])
-        prior = Prior(expected, 1.0 / np.array([sigma_m, sigma_m, sigma_rad]) ** 2)
+        prior = Prior(expected, sigma_m, float(sigma_rad))
         return align(field, cloud, start[None], self._config.registration, prior)
 
     def _step_by_step(

@@ -98,7 +98,7 @@ def test_the_prior_holds_what_the_walls_leave_free_and_is_no_part_of_the_covaria
     rng = np.random.default_rng(7)
     target = target_of(corridor(), np.zeros((1, 3)), rng)
     cloud = cloud_of_scan(cast(corridor(), np.array([0.0, 0.1, 0.0]), rng), LASER, ScanConfig())
-    prior = Prior(np.array([0.7, 0.0, 0.0]), np.array([1e4, 1e4, 1e2]))
+    prior = Prior(np.array([0.7, 0.0, 0.0]), 0.01, 0.1)
     held = align(target.fine, cloud, np.array([[0.5, 0.0, 0.05]]), SETTINGS, prior)
     assert held.poses[0, 0] == pytest.approx(0.7, abs=0.02)
     assert held.poses[0, 1] == pytest.approx(0.1, abs=0.05)
