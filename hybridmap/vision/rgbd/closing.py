@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
@@ -61,7 +61,9 @@ class LoopCloser:
         self._matcher = Matcher(config.matching, matching.mu_r, matching.mu_d, matching.max_shift, matching.g_bar)
         unverified = config.verify == "none"
         self._c_t = matching.c_t if matching.c_t is not None or not unverified else MODERATE_THRESHOLD[config.matching]
-        self._hypotheses: list[_Hypothesis] = []
+        self._hypotheses: defaultdict[int, list[_Hypothesis]] = defaultdict(list)
+        self._pending: list[_Hypothesis] = []
+        self._filed: set[tuple[int, int]] = set()
         self._tried: set[tuple[int, int]] = set()
         self._travel_at_closure = 0.0
         sigma_m, sigma_rad = config.closing.repropose_sigma_m, np.deg2rad(config.closing.repropose_sigma_deg)
@@ -77,7 +79,7 @@ class LoopCloser:
         gated = self._gate(node, belief)
         changed = self._try_candidates(node, self._ranked(node, gated), belief) if len(gated) else []
         if self._config.verify != "none" and not any(p.verdict is Verdict.ACCEPTED for p in changed):
-            near = self._nearest(node, set(), 1, belief)
+            near = self._nearest(node, 1, belief)
             changed += self._try_again(node, near, belief, {j for j in near if self._is_sure(node, j, belief)})
         return [*changed, *self._give_up(before=node - self._closing.pending_nodes)]
 
@@ -86,11 +88,10 @@ class LoopCloser:
         out: list[Proposal] = []
         if self._rounds_left > 0 and self._closing.repropose_m > 0 and self._config.verify != "none":
             self._rounds_left -= 1
-            settled = {(h.source, h.target) for h in self._hypotheses if h.proposal.verdict is Verdict.ACCEPTED}
-            closed = Counter(source for source, _ in settled)
             for node in range(len(self._keyframes)):
-                if closed[node] < self._closing.accept:
-                    near = self._nearest(node, settled, self._closing.repropose_per_node, belief)
+                accepted = sum(h.proposal.verdict is Verdict.ACCEPTED for h in self._hypotheses.get(node, ()))
+                if accepted < self._closing.accept:
+                    near = self._nearest(node, self._closing.repropose_per_node, belief)
                     out += self._try_again(node, near, belief, near)
         return [*out, *self._give_up(before=len(self._keyframes))]
 
@@ -174,11 +175,13 @@ class LoopCloser:
 
     def _raise(self, new: _Hypothesis, belief: Belief) -> list[Proposal]:
         """File a hypothesis; accept it and what it supports if another one agrees."""
-        near = [h for h in self._hypotheses if self._beside(new, h)]
+        near = self._beside(new)
         friends = [h for h in near if h.proposal.verdict is Verdict.PENDING and self._agrees(new, h, belief)]
         accepted = (h for h in near if h.proposal.verdict is Verdict.ACCEPTED)
         supported = bool(friends) or self._closing.support_nodes == 0 or any(self._agrees(new, h, belief) for h in accepted)
-        self._hypotheses.append(new)
+        self._hypotheses[new.source].append(new)
+        self._pending.append(new)
+        self._filed.add((new.source, new.target))
         if not supported:
             return [new.proposal]
         changed = [new, *friends]
@@ -187,10 +190,11 @@ class LoopCloser:
         self._travel_at_closure = max(self._travel_at_closure, float(belief.travel_m[new.source]))
         return [h.proposal for h in changed]
 
-    def _beside(self, a: _Hypothesis, b: _Hypothesis) -> bool:
-        """Two edges from different nodes near each other, to nodes near each other."""
-        apart = abs(a.source - b.source), abs(a.target - b.target)
-        return apart[0] > 0 and max(apart) <= self._closing.support_nodes
+    def _beside(self, new: _Hypothesis) -> list[_Hypothesis]:
+        """Edges from other nodes near its source, to nodes near its target."""
+        reach = self._closing.support_nodes
+        sources = (source for source in range(new.source - reach, new.source + reach + 1) if source != new.source)
+        return [h for source in sources for h in self._hypotheses.get(source, ()) if abs(h.target - new.target) <= reach]
 
     def _agrees(self, a: _Hypothesis, b: _Hypothesis, belief: Belief) -> bool:
         """Two edges give the same pose through the chain between them."""
@@ -207,13 +211,15 @@ class LoopCloser:
 
     def _give_up(self, before: int) -> list[Proposal]:
         """Reject what has waited for support too long."""
-        late = [h for h in self._hypotheses if h.proposal.verdict is Verdict.PENDING and h.source < before]
+        self._pending = [h for h in self._pending if h.proposal.verdict is Verdict.PENDING]
+        late = [h for h in self._pending if h.source < before]
         for h in late:
+            self._filed.discard((h.source, h.target))
             h.proposal = replace(h.proposal, verdict=Verdict.REJECTED, reason="no other edge supports it")
         return [h.proposal for h in late]
 
-    def _nearest(self, node: int, settled: set[tuple[int, int]], most: int, belief: Belief) -> dict[int, dict[str, float]]:
-        """Earlier nodes, not joined to this one, that look at the same place from nearly the same pose, nearest first."""
+    def _nearest(self, node: int, most: int, belief: Belief) -> dict[int, dict[str, float]]:
+        """Earlier nodes that see the same place from nearly the same pose and are not joined to this one yet, nearest first."""
         poses = belief.poses_map_node
         gap = np.hypot(*(poses[:node, :2] - poses[node, :2]).T)
         turned = np.abs(wrap_angle(poses[:node, 2] - poses[node, 2]))
@@ -223,7 +229,7 @@ class LoopCloser:
         chosen: dict[int, dict[str, float]] = {}
         for i in np.argsort(np.where(near, cost, np.inf), kind="stable")[: int(near.sum())]:
             target = int(i)
-            if (node, target) in settled:
+            if (node, target) in self._filed:
                 continue
             if all(abs(target - other) >= self._closing.separation for other in chosen):
                 chosen[target] = {"map_distance_m": float(gap[i])}

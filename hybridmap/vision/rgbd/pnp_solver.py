@@ -32,7 +32,7 @@ class PnpSolver:
     def __init__(self, camera: Camera, config: PnpConfig, seed: int) -> None:
         self._matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1.0]])
         self._config = config
-        self._seed = seed
+        self._seed = seed % 2**31
 
     def solve(self, points: Features, image: Features, of_points: NDArray[np.int64], of_image: NDArray[np.int64]) -> Pnp | None:
         """Points of one keyframe in the image of another; None without enough support.

@@ -243,3 +243,11 @@ def test_the_sensor_chooses_the_front_end():
 def test_weights_of_the_profiles_must_sum_to_one():
     with pytest.raises(ValueError, match="must be 1"):
         VisionConfig.model_validate({"matching": {"mu_r": 0.7, "mu_d": 0.5}})
+
+
+def test_no_two_edges_join_the_same_nodes(poses, frames):
+    front_end, proposals, odometry = drive(VisionConfig(), poses, 0.0, frames, sigma=0.1)
+    for _ in range(2):
+        proposals |= {p.key: p for p in front_end.finish(belief_of(odometry))}
+    joined = [(p.source, p.target) for p in proposals.values() if p.verdict is Verdict.ACCEPTED]
+    assert len(joined) == len(set(joined))
