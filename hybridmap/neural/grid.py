@@ -126,6 +126,7 @@ class GridModules:
 
     @activity.setter
     def activity(self, rates: NDArray[np.floating]) -> None:
+        """Overwrite the rates (M, N, N): the sheets then stand where the new activity says."""
         self._stack = np.ascontiguousarray(rates.swapaxes(0, 1), dtype=self._dtype)
 
     def _settle(self, modules: int) -> None:
