@@ -28,7 +28,9 @@ class PlaceAttractor:
         wave = 2.0 * np.pi * np.arange(side // 2) / side
         angle = np.outer(wave, np.arange(side))
         gain = np.exp(-0.5 * (width_cells * wave) ** 2) * np.where(wave == 0, 1.0, 2.0) / side
-        self._wave = wave.astype(dtype)
+        quarter = np.full(len(wave), -0.5 * np.pi)  # the cosine of an angle less a quarter is its sine
+        self._wave = np.stack([np.tile(wave, 2), np.concatenate([0.0 * wave, quarter])]).astype(dtype)
+        self._residuals = np.ones((2, 2), dtype=dtype)
         self._kernel = np.concatenate([gain[:, None] * np.cos(angle), gain[:, None] * np.sin(angle)]).astype(dtype)
         offset = np.arange(side)[:, None] - np.arange(side)
         self._circulant = np.stack([offset % side, offset % side + side])  # of both axes, in the two lines laid end to end
@@ -46,16 +48,19 @@ class PlaceAttractor:
 
     def step(self, displacement_m: NDArray[np.float64]) -> None:
         """Move the bump by a displacement (2,) in the world, m, and let the cells compete once."""
-        whole, residual = split_shift(displacement_m / self.cell_m)
-        phase = np.multiply.outer(residual.astype(self._wave.dtype), self._wave)
-        lines = np.dot(np.concatenate([np.cos(phase), np.sin(phase)], axis=1), self._kernel)
-        if whole.any():
-            lines = np.stack([np.roll(line, cells) for line, cells in zip(lines, whole, strict=True)])
+        x, y = displacement_m.tolist()
+        (whole_x, self._residuals[0, 0]), (whole_y, self._residuals[1, 0]) = (split_shift(d / self.cell_m) for d in (x, y))
+        phase = np.dot(self._residuals, self._wave)
+        np.cos(phase, out=phase)
+        lines = np.dot(phase, self._kernel)
+        if whole_x or whole_y:
+            lines = np.stack([np.roll(lines[0], whole_x), np.roll(lines[1], whole_y)])
         along_x, along_y = lines.take(self._circulant)
         spread = np.dot(np.dot(along_x, self.activity), along_y.T)
         np.maximum(spread, self._silent, out=spread)
+        total = float(np.vdot(spread, spread))
         spread *= spread
-        spread /= spread.sum()
+        spread *= 1.0 / total
         self.activity = spread
 
     def receive(self, place_input: NDArray[np.floating], share: float) -> None:

@@ -37,7 +37,8 @@ class BandRings:
     lambda, and the ring between them, which drives no sheet, is their sum at 45 degrees.
 
     Attributes:
-        activity: (M, 3, n) rates 0..1 in the order of `ORIENTATIONS_DEG`; the whole state.
+        activity: (M, 3, n) rates 0..1 in the order of `ORIENTATIONS_DEG`; the whole state. To be replaced, not written into:
+            the array that a step leaves is read-only, so that it need not be decoded twice.
         periods_m, orientations_rad: (M, 3).
         wave_vectors: (M, 3, 2) cycles per metre; the third is the second minus the first (phi60 = phi0 + phi120).
     """
@@ -57,20 +58,28 @@ class BandRings:
         self.periods_m: NDArray[np.float64] = spacings_m[:, None] * period
         self.orientations_rad: NDArray[np.float64] = angles
         self.wave_vectors: NDArray[np.float64] = np.stack([np.cos(angles), np.sin(angles)], axis=-1) / self.periods_m[..., None]
-        self._turn = _turning_weights(self.wave_vectors)
+        self._turn = _turning_weights(self.wave_vectors).astype(dtype)
+        self._displacement = np.ones(3, dtype=dtype)
         preferred = 2.0 * np.pi * (np.arange(cells) / cells + 0.5)
         self._weights = np.stack([np.cos(preferred), np.sin(preferred)], axis=1).astype(dtype)
         self._sharpness = -1.0 / (2.0 * (2.0 * np.pi * width) ** 2)
         self._complex = np.result_type(np.dtype(dtype), np.complex64)
         inside = 1.0 - 4.0 * float(np.finfo(self._weights.dtype).eps)  # keeps rounding out of arccos' way
         self._tuning = np.ascontiguousarray(self._weights.T) * self._weights.dtype.type(inside)
+        self._decoded: tuple[NDArray[np.floating] | None, NDArray[np.complexfloating]] = (None, np.empty(0, self._complex))
         self.activity: NDArray[np.floating] = self.rates_at(np.zeros((len(spacings_m), 3)))
 
     def phasors(self) -> NDArray[np.complexfloating]:
         """Return the unit phasors exp(2 pi i phi), (M, 3), decoded from the activity."""
+        rates, known = self._decoded
+        if rates is self.activity:
+            return known
         vector = np.dot(self.activity.reshape(-1, self._weights.shape[0]), self._weights)
         z = vector.view(self._complex).reshape(self.activity.shape[:2])
-        return np.asarray(z / np.abs(z))
+        z /= np.abs(z)
+        if not self.activity.flags.writeable:
+            self._decoded = self.activity, z
+        return np.asarray(z)
 
     def phases(self) -> NDArray[np.float64]:
         """Return the decoded phases (M, 3), cycles in [0, 1)."""
@@ -83,7 +92,9 @@ class BandRings:
     def step(self, displacement_m: NDArray[np.float64]) -> BandMotion:
         """Move every ring by a displacement (2,) in the world, m; says what the rings tell the sheets."""
         before = self.phasors()
-        turn = np.cos(np.dot(np.append(displacement_m, 1.0), self._turn)).astype(self._weights.dtype, copy=False)
+        self._displacement[:2] = displacement_m
+        turn = np.dot(self._displacement, self._turn)
+        np.cos(turn, out=turn)
         self.activity = self._rates(before * turn.view(self._complex).reshape(before.shape))
         after = self.phasors()
         moved = after * before.conj()
@@ -92,13 +103,15 @@ class BandRings:
         return BandMotion(advance, after)
 
     def _rates(self, phasors: NDArray[np.complexfloating]) -> NDArray[np.floating]:
-        vector = np.ascontiguousarray(phasors).reshape(-1, 1).view(self._weights.dtype)
+        vector = phasors.reshape(-1, 1).view(self._weights.dtype)
         offset = np.dot(vector, self._tuning)
         np.arccos(offset, out=offset)
         offset *= offset
         offset *= self._sharpness
         np.exp(offset, out=offset)
-        return np.asarray(offset.reshape(*phasors.shape, -1))
+        rates = offset.reshape(*phasors.shape, -1)
+        rates.flags.writeable = False
+        return np.asarray(rates)
 
 
 def _turning_weights(wave_vectors: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import numpy as np
@@ -88,7 +89,7 @@ def shift_sheets(sheets: NDArray[np.floating], shift_cycles: NDArray[np.float64]
     return np.asarray(np.fft.irfft2(np.fft.rfft2(sheets) * turn, s=(side, side)), dtype=sheets.dtype)
 
 
-def split_shift(shift_cells: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Split shifts into whole cells by floor and residuals in [0, 1) (paper eq. 10): -0.3 gives -1 and 0.7."""
-    whole = np.floor(shift_cells)
-    return whole.astype(np.int64), np.asarray(shift_cells - whole)
+def split_shift(shift_cells: float) -> tuple[int, float]:
+    """Split a shift into whole cells by floor and the residual in [0, 1) (paper eq. 10): -0.3 gives -1 and 0.7."""
+    whole = math.floor(shift_cells)
+    return whole, shift_cells - whole

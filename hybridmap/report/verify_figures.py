@@ -39,9 +39,8 @@ def heading_figure(heading: HeadDirectionResult) -> str:
     degrees = np.degrees(heading.preferred_rad)
     with style.figure(style.PAGE_WIDTH_IN, 2.7) as picture:
         ring, one = picture.subplots(1, 2)
-        for cell in range(0, len(degrees), len(degrees) // 6):
-            tuned = 1.0 + np.cos(heading.preferred_rad - heading.preferred_rad[cell])
-            ring.plot(degrees, tuned, linewidth=1.4, label=f"{degrees[cell]:.0f}°")
+        for rates in heading.tuning:
+            ring.plot(range(360), rates, linewidth=1.4)
         ring.set(title="Six cells of the ring", xlabel="heading (deg)", ylabel="rate")
         for number, (turn_rate, rates) in enumerate(zip(heading.turn_rates_rad_s, heading.rates, strict=True)):
             colour = _NOISE_COLOURS[::-1][number]

@@ -49,12 +49,12 @@ def test_the_first_shell_has_six_modes():
 
 @given(st.floats(-1e6, 1e6))
 def test_floor_and_residual(shift):
-    whole, residual = split_shift(np.array([shift]))
-    assert 0.0 <= residual[0] <= 1.0
-    assert whole[0] + residual[0] == pytest.approx(shift)
+    whole, residual = split_shift(shift)
+    assert 0.0 <= residual <= 1.0
+    assert whole + residual == pytest.approx(shift)
 
 
 def test_floor_of_a_negative_shift():
-    whole, residual = split_shift(np.array([-0.3, 0.3, -2.0]))
-    assert whole.tolist() == [-1, 0, -2]
-    assert residual == pytest.approx([0.7, 0.3, 0.0])
+    assert split_shift(-0.3) == (-1, pytest.approx(0.7))
+    assert split_shift(0.3) == (0, pytest.approx(0.3))
+    assert split_shift(-2.0) == (-2, 0.0)

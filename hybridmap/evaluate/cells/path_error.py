@@ -78,12 +78,14 @@ class HeadDirectionResult:
     Attributes:
         error_rad: error of the decoded heading after the last of the turns, by precision.
         preferred_rad: (m,) preferred directions.
+        tuning: (6, 360) rates of six cells at headings of 0 to 359 degrees.
         turn_rates_rad_s: (R,) turn rates of `rates`.
         rates: (R, m) rates at those turn rates.
     """
 
     error_rad: dict[str, float]
     preferred_rad: Array
+    tuning: Array
     turn_rates_rad_s: Array
     rates: Array
 
@@ -97,9 +99,14 @@ def head_direction(seed: np.random.SeedSequence, steps: int) -> HeadDirectionRes
         for turn in turns:
             ring.turn(float(turn))
         errors[dtype] = abs(float(geometry.wrap_angle(ring.heading_rad - turns.sum())))
+    ring = HeadDirectionRing(NeuralConfig().head_direction_cells)
+    tuning = []
+    for _ in range(360):
+        tuning.append(ring.activity[:: len(ring.activity) // 6][:6].copy())
+        ring.turn(np.radians(1.0))
     turn_rates = np.array([0.0, 0.5, 1.0, 2.0])
     rates = np.array([ring.rates(float(rate)) for rate in turn_rates])
-    return HeadDirectionResult(errors, ring.preferred_rad, turn_rates, rates)
+    return HeadDirectionResult(errors, ring.preferred_rad, np.array(tuning).T, turn_rates, rates)
 
 
 @dataclass(frozen=True, slots=True)
