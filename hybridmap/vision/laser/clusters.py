@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,7 @@ class Commitment:
         self._travel = travel_of
         self._chain = chain_of
         self._queue: list[Waiting] = []
+        self._given_up: list[Waiting] = []
         self._consistent: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
 
     def add(self, key: int, hypothesis: Hypothesis) -> None:
@@ -70,17 +72,35 @@ class Commitment:
 
     def settle(self, travel_m: float, belief: Belief) -> list[Settled]:
         """Give up what waited too long; commit the best cluster if it is good enough, with all that agrees with it."""
-        old = [w for w in self._queue if travel_m - self._travel(w.hypothesis.probe) > self._config.wait_m]
-        out = [Settled(w.key, w.hypothesis, False, f"no cluster within {self._config.wait_m:g} m of travel") for w in old]
-        self._keep([i for i, w in enumerate(self._queue) if w not in old])
+        reason = f"no cluster within {self._config.wait_m:g} m of travel"
+        out = [Settled(w.key, w.hypothesis, False, reason) for w in self._expire(travel_m)]
         return out + self._commit_all(belief, self._config.span_per_efold_m)
 
     def flush(self, belief: Belief) -> list[Settled]:
-        """At the end, when no more evidence will come: commit by the rule for a narrow gate and give up the rest."""
-        out = self._commit_all(belief, 0.0)
-        out += [Settled(w.key, w.hypothesis, False, "no cluster by the end") for w in self._queue]
+        """At the end: go once more through all that found no cluster, by the rule of a narrow gate.
+
+        What was given up while driving is tried again from the new map; may be called again after the map has changed.
+        """
+        fresh = {w.key for w in self._queue}
+        again = sorted(self._given_up + self._queue, key=lambda w: (self._travel(w.hypothesis.probe), w.key))
         self._keep([])
-        return out
+        self._given_up = []
+        out: list[Settled] = []
+        for probe, group in groupby(again, key=lambda w: w.hypothesis.probe):
+            self._expire(self._travel(probe))
+            self._queue += group
+            out += [s for s in self._commit_all(belief, 0.0) if s.accepted or s.key in fresh]
+        self._expire(np.inf)
+        settled = {s.key for s in out}
+        left = [w for w in self._given_up if w.key in fresh and w.key not in settled]
+        return out + [Settled(w.key, w.hypothesis, False, "no cluster by the end") for w in left]
+
+    def _expire(self, travel_m: float) -> list[Waiting]:
+        """Take out what has waited too long, and remember it for the end."""
+        old = [w for w in self._queue if travel_m - self._travel(w.hypothesis.probe) > self._config.wait_m]
+        self._keep([i for i, w in enumerate(self._queue) if w not in old])
+        self._given_up += old
+        return old
 
     def _commit_all(self, belief: Belief, span_per_efold_m: float) -> list[Settled]:
         out: list[Settled] = []

@@ -107,11 +107,14 @@ class LaserFrontEnd:
         return out
 
     def finish(self, belief: Belief) -> list[Proposal]:
-        """Probe from where the robot ended, settle all that waits; register nodes that came near each other on the map."""
+        """Probe from where the robot ended and settle all that waits; then register nodes that lie near each other."""
         last, out = len(self._atlas) - 1, []
         if last >= 0 and self._atlas.travel_m[last] - self._last_probe_m > LAST_PROBE_M:
             out = self._probe(last, belief)
-        out += [_settled(s) for s in self._commitment.flush(belief)]
+        settled = self._commitment.flush(belief)
+        out += [_settled(s) for s in settled]
+        if any(s.accepted for s in settled):
+            return out
         for hypothesis in self._reviser.round(belief):
             verdict = Verdict.REJECTED if hypothesis.refusal else Verdict.ACCEPTED
             out.append(_loop(self._next_key(), hypothesis, verdict, hypothesis.refusal or "near on the optimised map"))
