@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridmap.backends.ensemble import Ensemble
+from hybridmap.calibration.gains import Gains
+from hybridmap.calibration.online import OnlineCalibration
 from hybridmap.config import Config
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, inverse
 from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
@@ -78,7 +80,10 @@ class Mapper:
         self.integrator = PathIntegrator(config.neural)
         self.vision = create_front_end(config.vision, rig if rig is not None else rig_of(config.sensors), config.seed)
         self.backends = Ensemble(config.backends, self.clock)
-        self._synchroniser = Synchroniser(latency_s=config.sensors.latency_s)
+        self.calibration = OnlineCalibration(config.calibration, Gains.of(config.neural))
+        self._synchroniser = Synchroniser(
+            latency_s=config.sensors.latency_s, odometry_delay_s=config.sensors.odometry_delay_s
+        )
         self._novelty = Novelty(config.nodes)
         self._stamp_ns = 0
         self._pose_odom_given: Array = IDENTITY
@@ -135,7 +140,7 @@ class Mapper:
             edges += self._close_loops(node)
         self._since_node = (0.0, 0.0)
         self._correct()
-        return self._update(pose_odom, reason, node, edges)
+        return self._update(pose_odom, reason + self._calibrate(), node, edges)
 
     def finish(self) -> list[Update]:
         """End of the drive: settle what waits, propose loops again on the optimised map, let every back-end finish."""
@@ -191,7 +196,16 @@ class Mapper:
         names = self.config.backends.names
         self._pose_map_at_node = {name: self.backends.poses(graph, name)[self._at_node] for name in names}
 
+    def _calibrate(self) -> str:
+        """Let the gains follow the map, where the map is sure; returns what to add to the reason."""
+        change = self.calibration.follow(self._stamp_ns, self.map.pose_graph, self.poses)
+        if change is None:
+            return ""
+        self.integrator.use_gains(*change.gains.to_array().tolist())
+        return f"; {change}"
+
     def _path_integrate(self, ready: Ready) -> Array:
+        self.calibration.observe(ready.stamp_ns, ready.delta_robot)
         with self.clock.stage("neural"):
             self.integrator.step(ready.delta_robot, ready.dt_s)
             pose_odom = self.integrator.pose

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hybridmap.backends import objective
+from hybridmap.calibration.sessions import GAIN_CHANGES
 from hybridmap.config import Config
 from hybridmap.errors import HybridMapError, StreamError
 from hybridmap.geometry import Array, between, compose
@@ -103,6 +104,7 @@ class _Recorder:
         self.largest_correction_m = 0.0
         self._mapper = mapper
         self._before_first_node: list[Update] = []
+        self._gain_changes = 0
         self._last_stamp_ns = -1
         self._poses = np.zeros((0, 3))
 
@@ -110,6 +112,7 @@ class _Recorder:
         """Take in one update."""
         if update.new_node is not None:
             self._write_node(update.new_node)
+            self._write_gain_changes()
         for number in update.edges:
             self.store.put_edge(number, self._mapper.map.edge(number))
         if update.at_node < 0:
@@ -129,6 +132,12 @@ class _Recorder:
         keyframe = mapper.vision.keyframe(number) if mapper.vision is not None else {}
         initial = mapper.map.initial[number]
         self.store.add_node(number, mapper.map.node(number), initial, keyframe, mapper.integrator.snapshot())
+
+    def _write_gain_changes(self) -> None:
+        changes = self._mapper.calibration.changes
+        if len(changes) > self._gain_changes:
+            self._gain_changes = len(changes)
+            self.store.put_info(GAIN_CHANGES, [change.row for change in changes])
 
     def _write_track(self, update: Update, node: int, delta: Array) -> None:
         if update.stamp_ns <= self._last_stamp_ns:
@@ -182,7 +191,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
         "source": stream.name,
         "failed_backends": dict(mapper.backends.failures),
         "stream": dict(stream.report.counts),
-        "remarks": list(stream.report.remarks),
+        "remarks": [*stream.report.remarks, *map(str, mapper.calibration.changes)],
     }
     for key in ("graph_hash", "primary_backend"):
         store.put_info(key, head[key])

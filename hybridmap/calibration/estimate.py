@@ -48,6 +48,11 @@ class Estimate:
         difference = self.gains.to_array() - other.to_array()
         return np.asarray(difference / np.maximum(self.sigmas[:3], 1e-12))
 
+    @property
+    def delay_differs(self) -> bool:
+        """Whether the delay differs significantly from none."""
+        return bool(abs(self.delay_s) > SIGNIFICANT_SIGMAS * self.sigmas[3])
+
     def differs(self, other: Gains = NEUTRAL) -> bool:
         """Whether any of the three differs significantly from others."""
         return bool(np.any(np.abs(self.off(other)) > SIGNIFICANT_SIGMAS))

@@ -48,7 +48,14 @@ def verdict(estimate: Estimate, in_use: Gains) -> str:
     return f"{', '.join(clear)} {'differ' if len(clear) > 1 else 'differs'} by more than {SIGNIFICANT_SIGMAS:g} sigma"
 
 
-def with_gains(config_tree: dict[str, Any], gains: Gains) -> str:
-    """A configuration (the nested mapping of its file) with other gains, as YAML."""
-    neural = dict(config_tree.get("neural") or {}) | dict(zip(GAIN_KEYS, gains.to_array().tolist(), strict=True))
-    return yaml.safe_dump(config_tree | {"neural": neural}, sort_keys=False, allow_unicode=True)
+def calibrated(config_tree: dict[str, Any], estimate: Estimate, in_use: Gains) -> str:
+    """A configuration (the nested mapping of its file) with what the estimate changes in it, as YAML.
+
+    The gains change together, where one of them is significant: each is estimated given the others. So does the delay.
+    """
+    neural, sensors = dict(config_tree.get("neural") or {}), dict(config_tree.get("sensors") or {})
+    if estimate.differs(in_use):
+        neural |= dict(zip(GAIN_KEYS, estimate.gains.to_array().tolist(), strict=True))
+    if estimate.delay_differs:
+        sensors["odometry_delay_s"] = float(sensors.get("odometry_delay_s", 0.0)) + estimate.delay_s
+    return yaml.safe_dump(config_tree | {"neural": neural, "sensors": sensors}, sort_keys=False, allow_unicode=True)

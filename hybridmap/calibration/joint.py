@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from hybridmap import backends
 from hybridmap.backends.factors import NoiseModels, anchor, factors, poses_of
-from hybridmap.backends.following import with_edges
 from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.gains import NEUTRAL, Gains
 from hybridmap.calibration.legs import Motion
@@ -187,7 +186,7 @@ class _Problem:
         others[self.own] = False
         models = NoiseModels(lambda base: gtsam.noiseModel.Robust.Create(loops, base))
         out = gtsam.NonlinearFactorGraph()
-        for factor in factors(with_edges(self.graph, others), models):
+        for factor in factors(self.graph.with_edges(others), models):
             out.push_back(factor)
         kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY)
         unit = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Unit.Create(3))

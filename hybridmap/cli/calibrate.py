@@ -30,7 +30,7 @@ def calibrate(
 
     What is written differs from the configuration in use only if the estimate does, by more than three sigma.
     """
-    from hybridmap.calibration.figures import metrics_of, verdict, with_gains
+    from hybridmap.calibration.figures import calibrated, metrics_of, verdict
     from hybridmap.calibration.gains import Gains
     from hybridmap.calibration.sessions import estimate_of, read_drive
     from hybridmap.cli.show import emit
@@ -40,14 +40,13 @@ def calibrate(
     truths = [read_tum(path) for path in reference or []]
     estimate = estimate_of(drives, truths, estimator, leg)
     in_use = Gains.of(drives[0].config.neural)
-    significant = estimate.differs(in_use)
     if out is not None:
-        write_text_atomic(out, with_gains(drives[0].config_tree, estimate.gains if significant else in_use))
+        write_text_atomic(out, calibrated(drives[0].config_tree, estimate, in_use))
     how = "reference" if truths else estimator
     head = {
         "sessions": [str(folder) for folder in folders],
         "estimator": how,
-        "significant": significant,
+        "significant": estimate.differs(in_use),
         "message": verdict(estimate, in_use),
     }
     emit(head, metrics_of(estimate, in_use), as_json=as_json, title=f"{', '.join(map(str, folders))}: {how}")

@@ -11,6 +11,7 @@ import yaml
 from pydantic import Field, ValidationError
 
 from hybridmap.config.backends import BackendsConfig
+from hybridmap.config.calibration import CalibrationConfig
 from hybridmap.config.mapping import EdgesConfig, NodesConfig
 from hybridmap.config.neural import NeuralConfig
 from hybridmap.config.section import Section
@@ -39,6 +40,8 @@ class Config(Section):
     """Noise of odometry edges; how closures enter the map."""
     backends: BackendsConfig = BackendsConfig()
     """Which back-ends run, and their settings."""
+    calibration: CalibrationConfig = CalibrationConfig()
+    """Odometry gains that follow the map while driving."""
 
     @classmethod
     def load(cls, source: str | Path | None = None, overrides: Mapping[str, Any] | None = None) -> Self:

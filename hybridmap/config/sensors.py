@@ -83,6 +83,9 @@ class SensorsConfig(Section):
     """Colour and depth belong together when their stamps differ by no more than this, s."""
     latency_s: float = Field(default=0.0, ge=0)
     """Live input: how long samples wait to be sorted by stamp, s; 0 for recordings, which are sorted by their reader."""
+    odometry_delay_s: float = Field(default=0.0, ge=-1, le=1)
+    """Added to the stamps of self-motion: how much later views are stamped than odometry, s (`hybridmap calibrate` finds it).
+    Updates of a live robot come later by as much."""
     range_min_m: float | None = Field(default=None, ge=0)
     """Laser returns nearer than this are dropped, m; None: the recording's limit alone."""
     range_max_m: float | None = Field(default=None, gt=0)

@@ -97,6 +97,11 @@ class PathIntegrator:
         if dx != 0.0 or dy != 0.0:
             self._translate(np.array([c * forward - s * left, s * forward + c * left]), dt_s)
 
+    def use_gains(self, gain: float, turn_gain: float, heading_bias_rad_m: float) -> None:
+        """Integrate the steps to come with other gains (their meaning: `config/neural.py: NeuralConfig`)."""
+        gains = {"gain": gain, "turn_gain": turn_gain, "heading_bias_rad_m": heading_bias_rad_m}
+        self.config = self.config.model_copy(update=gains)
+
     def step_velocity(self, v_m_s: float, omega_rad_s: float, dt_s: float) -> None:
         """Integrate constant speed and turn rate over `dt_s`, by the mid-point heading."""
         ds, dyaw = v_m_s * dt_s, omega_rad_s * dt_s

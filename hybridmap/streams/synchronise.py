@@ -6,7 +6,7 @@ It stands inside the mapper, so that a live robot and a recording give the same 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,15 +47,17 @@ class Synchroniser:
     are the same whatever the latency, as long as it covers the delay; a scan that comes behind it is dropped and counted.
     """
 
-    def __init__(self, max_hold_s: float = 1.0, latency_s: float = 0.0) -> None:
+    def __init__(self, max_hold_s: float = 1.0, latency_s: float = 0.0, odometry_delay_s: float = 0.0) -> None:
         """Start without any sample.
 
         Args:
             latency_s: samples are held back until the newest stamp is this much ahead of theirs, s; 0 for sorted streams.
+            odometry_delay_s: added to the stamps of self-motion, so that they mean the same instants as those of views.
             max_hold_s: observations further behind the last odometry than this are dropped at the end, not held, s.
         """
         self.report = StreamReport()
-        self._arrived = ReorderBuffer(latency_s)
+        self._arrived = ReorderBuffer(latency_s + abs(odometry_delay_s))
+        self._odometry_delay_ns = round(odometry_delay_s * NS_PER_S)
         self._max_hold_ns = round(max_hold_s * NS_PER_S)
         self._last: tuple[int, Array] | None = None  # newest self-motion: stamp, pose
         self._velocity: Velocity | None = None
@@ -69,6 +71,8 @@ class Synchroniser:
         Raises:
             StreamError: stamps go back, self-motion is not finite, or odometry and velocities are mixed.
         """
+        if self._odometry_delay_ns and isinstance(sample, SelfMotion | Velocity):
+            sample = replace(sample, stamp_ns=sample.stamp_ns + self._odometry_delay_ns)
         return [step for ready in self._arrived.push(sample) for step in self._take(ready)]
 
     def flush(self) -> list[Ready]:

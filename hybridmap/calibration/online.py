@@ -1,0 +1,102 @@
+"""Calibration while driving: the gains follow the map as soon as the map is sure that they are wrong."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.calibration.estimate import Estimate
+from hybridmap.calibration.gains import Gains
+from hybridmap.calibration.legs import Motion
+from hybridmap.calibration.regression import Sighting, regress
+from hybridmap.config.calibration import CalibrationConfig
+from hybridmap.errors import EvaluationError
+from hybridmap.geometry import Array
+from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class GainChange:
+    """New gains, in use from a stamp on.
+
+    Attributes:
+        stamp_ns: of the last step with the old ones.
+        gains: the new ones.
+        estimate: what they rest on.
+    """
+
+    stamp_ns: int
+    gains: Gains
+    estimate: Estimate
+
+    @property
+    def row(self) -> list[float]:
+        """As the map file keeps it: stamp_ns, gain, turn gain, heading bias."""
+        return [self.stamp_ns, *self.gains.to_array().tolist()]
+
+    def __str__(self) -> str:
+        values, sigmas = self.gains.to_array(), self.estimate.sigmas
+        named = zip(("gain", "turn gain", "heading bias"), values, sigmas, strict=False)
+        return "odometry gains changed: " + ", ".join(f"{name} {value:.4f} +- {sigma:.4f}" for name, value, sigma in named)
+
+
+class OnlineCalibration:
+    """Collects raw odometry, and from time to time regresses it on the map; does nothing where it is switched off.
+
+    The odometry edges that are in the map stay as they were measured; new gains hold for the way ahead.
+    """
+
+    def __init__(self, config: CalibrationConfig, gains: Gains) -> None:
+        """Start with the gains that the path integrator uses."""
+        self.changes: list[GainChange] = []
+        self._config = config
+        self._in_use = gains
+        self._stamps_ns: list[int] = []
+        self._steps: list[Array] = []
+        self._node_stamps_ns: list[int] = []
+        self._travel_m = 0.0
+        self._due_m = config.first_m
+
+    def observe(self, stamp_ns: int, delta_robot: Array) -> None:
+        """Take in a raw step (3,) that ends at a stamp; a second step at one stamp must not move."""
+        if not self._config.online or (self._stamps_ns and stamp_ns <= self._stamps_ns[-1]):
+            return
+        if self._stamps_ns:
+            self._steps.append(delta_robot)
+            self._travel_m += float(np.hypot(delta_robot[0], delta_robot[1]))
+        self._stamps_ns.append(stamp_ns)
+
+    def follow(self, stamp_ns: int, graph: Callable[[], PoseGraph], poses: Callable[[], Array]) -> GainChange | None:
+        """A node was made: the change of gains that the map asks for, if it does.
+
+        Args:
+            stamp_ns: of the node.
+            graph: gives nodes and accepted edges, the new node included; called only when an estimate is due, as is
+            poses: gives (N, 3) of all nodes on the map.
+        """
+        if not self._config.online:
+            return None
+        self._node_stamps_ns.append(stamp_ns)
+        if self._travel_m < self._due_m or not np.any(graph().kinds != EdgeKind.ODOMETRY):
+            return None
+        self._due_m = self._travel_m + self._config.every_m
+        motion = Motion(np.array(self._stamps_ns, dtype=np.int64), np.array(self._steps))
+        stamps: NDArray[np.int64] = np.array(self._node_stamps_ns, dtype=np.int64)
+        try:
+            estimate = regress([Sighting(motion, stamps, poses())])
+        except EvaluationError as error:
+            _logger.info("%s", error)
+            return None
+        if not estimate.differs(self._in_use):
+            return None
+        change = GainChange(stamp_ns, estimate.gains, estimate)
+        self._in_use = estimate.gains
+        self.changes.append(change)
+        _logger.warning("%s", change)
+        return change

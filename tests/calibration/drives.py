@@ -1,0 +1,129 @@
+"""Drives with a known calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridmap.calibration.gains import Gains, remove
+from hybridmap.calibration.legs import Motion, chain
+from hybridmap.calibration.regression import Sighting
+from hybridmap.geometry import RelativePose, between, compose, exp, interpolate
+from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
+from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.store import MapStore, SessionFolder
+from hybridmap.streams.base import Rig
+
+STEP_NS = 100_000_000
+GAINS = Gains(1.03, 0.97, -0.04)
+COVARIANCE = np.diag([1e-4, 1e-4, 3e-5])
+
+
+@dataclass(frozen=True)
+class Drive:
+    """True poses (S + 1, 3) and raw odometry at the same instants."""
+
+    truth: np.ndarray
+    motion: Motion
+
+
+def drive(rng, laps=4, gains=GAINS, noise=1.0, drop_outs=0):
+    """Round and round a room of 8 x 5 m at 0.5 m/s, turning in place in the corners, now the one way and now the other.
+
+    `noise` scales a random walk of heading of 0.4 deg per sqrt(m) and 1 % of way; a drop-out is one step
+    wrong by 0.5 m and 20 deg.
+    """
+    steps = []
+    for lap in range(laps):
+        side = 1.0 if lap % 2 == 0 else -1.0
+        for length in (8.0, 5.0, 8.0, 5.0):
+            steps += [(0.05, 0.0, 0.0)] * round(length / 0.05)
+            steps += [(0.001, 0.0, side * np.pi / 2 / 15)] * 15
+    true = np.array(steps)
+    measured = true + noise * rng.normal(size=true.shape) * [0.002, 0.0, np.radians(0.4) * np.sqrt(0.05)]
+    raw = remove(measured, gains)
+    bad = rng.choice(len(raw), drop_outs, replace=False)
+    raw[bad] += [0.5, 0.0, np.radians(20)]
+    stamps = np.arange(len(true) + 1) * STEP_NS + 7
+    return Drive(chain(true), Motion(stamps, raw))
+
+
+def sighting(one, rng=None, every=10, delay_s=0.0):
+    """The true poses every second; with noise of 1 cm and 0.3 deg, stamped late by a delay."""
+    chosen = np.arange(every, len(one.truth) - every, every)
+    share = delay_s * 1e9 / STEP_NS
+    whole = int(np.floor(share))
+    poses = interpolate(one.truth[chosen - whole], one.truth[chosen - whole - 1], share - whole)
+    if rng is not None:
+        poses = compose(poses, exp(rng.normal(size=poses.shape) * [0.01, 0.01, np.radians(0.3)]))
+    return Sighting(one.motion, one.motion.stamps_ns[chosen], poses)
+
+
+def experience_map(one, rng, every=10, registered=False):
+    """Nodes each second, odometry edges as neutral gains have them, true loops with noise where a place is seen again.
+
+    Returns the map and the index of each node among the odometry's instants.
+    """
+    chosen = np.arange(0, len(one.truth), every)
+    raw = chain(one.motion.steps)
+    truth = one.truth[chosen]
+    experiences = ExperienceMap()
+    code = np.ones(4, dtype=np.float32)
+    for number, at in enumerate(chosen):
+        node = Node(int(one.motion.stamps_ns[at]), raw[at], code, -1, float(one.motion.travel_m[at]))
+        experiences.add_node(node, raw[at])
+        if number:
+            delta = between(raw[chosen[number - 1]], raw[at])
+            covariance = np.diag([4e-4, 4e-4, np.radians(1.0) ** 2])
+            edge = Edge(number - 1, number, EdgeKind.ODOMETRY, Status.ACCEPTED, "chain", RelativePose(delta, covariance))
+            experiences.add_edge(edge)
+        for old, kind in _seen_again(truth, number, registered):
+            measured = compose(between(truth[number], truth[old]), exp(rng.normal(size=3) * np.sqrt(np.diag(COVARIANCE))))
+            experiences.add_edge(Edge(number, old, kind, Status.ACCEPTED, "true", RelativePose(measured, COVARIANCE)))
+    return experiences, chosen
+
+
+def _seen_again(truth, number, registered):
+    if registered and number:
+        yield number - 1, EdgeKind.REGISTRATION
+    near = np.hypot(*(truth[: max(number - 40, 0), :2] - truth[number, :2]).T) < 0.6
+    if near.any():
+        yield int(np.flatnonzero(near)[0]), EdgeKind.LOOP
+
+
+def write_session(folder, one, rng, registered=True, gains=None, changes=(), poses=None):
+    """A session folder around a drive; the stored odometry is what the given gains make of the raw one."""
+    from hybridmap.backends.base import SolveReport, SolveStatus
+    from hybridmap.calibration.gains import NEUTRAL, apply
+
+    used = gains or NEUTRAL
+    experiences, chosen = experience_map(one, rng, registered=registered)
+    odometry = chain(apply(one.motion.steps, used))
+    for change in changes:
+        stamp_ns, *values = change
+        at = int(np.searchsorted(one.motion.stamps_ns, stamp_ns))
+        steps = apply(one.motion.steps[at:], Gains.from_array(values))
+        odometry = np.concatenate([odometry[:at], compose(odometry[at], chain(steps))])
+    config = (
+        f"neural: {{gain: {used.gain}, turn_gain: {used.turn_gain}, heading_bias_rad_m: {used.heading_bias_rad_m}}}\n"
+        "backends: {names: [gtsam-cauchy]}\n"
+    )
+    session = SessionFolder(folder)
+    session.prepare()
+    session.write_config(config)
+    with MapStore.create(folder, config, Rig(), "drive") as store:
+        for number, node in enumerate(experiences.nodes):
+            store.add_node(number, node, experiences.initial[number], {}, {})
+        for number, edge in enumerate(experiences.edges):
+            store.put_edge(number, edge)
+        nodes = np.searchsorted(chosen, np.arange(len(odometry)), side="right") - 1
+        for stamp, node, pose in zip(one.motion.stamps_ns, nodes, odometry, strict=True):
+            store.add_track(int(stamp), int(node), np.zeros(3), pose)
+        report = SolveReport("gtsam-cauchy", SolveStatus.CONVERGED, "done", 5, 10.0, 1.0, 0.1)
+        store.put_solution("gtsam-cauchy", one.truth[chosen] if poses is None else poses, report)
+        if changes:
+            store.put_info("gain_changes", [list(change) for change in changes])
+    session.write_metrics({"primary_backend": "gtsam-cauchy"}, [])
+    session.keep()
+    return folder

@@ -1,0 +1,87 @@
+"""The calibration as a variable of the graph: a chain that bends too much to be optimised is solved with it."""
+
+import numpy as np
+import pytest
+
+from hybridmap import backends
+from hybridmap.calibration import joint
+from hybridmap.calibration.gains import Gains
+from hybridmap.calibration.odometry_terms import own_edges, terms_of
+from hybridmap.config.backends import BackendsConfig
+from hybridmap.geometry import align, transform_points
+from tests.calibration.drives import drive, experience_map
+
+CONFIG = BackendsConfig()
+BENT = Gains(1.0, 1.0, 0.06)
+
+
+def ate(poses, truth):
+    return float(np.sqrt(np.mean(np.sum((transform_points(align(truth, poses), poses[:, :2]) - truth[:, :2]) ** 2, axis=1))))
+
+
+@pytest.fixture(scope="module")
+def bent():
+    """Odometry and true loops alone, with a heading bias of 3.4 deg/m."""
+    rng = np.random.default_rng(3)
+    one = drive(rng, laps=3, gains=BENT)
+    experiences, chosen = experience_map(one, rng, every=20)
+    return experiences.pose_graph(), one.motion, one.motion.stamps_ns[chosen], one.truth[chosen]
+
+
+def test_it_solves_a_chain_that_a_robust_back_end_does_not(bent):
+    graph, motion, stamps, truth = bent
+    found = joint.solve(graph, motion, stamps, CONFIG)
+    assert found.estimate.gains.heading_bias_rad_m == pytest.approx(BENT.heading_bias_rad_m, abs=0.006)
+    assert ate(found.poses, truth) < 0.3
+    alone = backends.create("gtsam-cauchy", CONFIG).solve(graph).poses
+    assert ate(found.poses, truth) < 0.5 * ate(alone, truth)
+
+
+def test_registrations_leave_no_winding_in_doubt_and_long_legs_enter():
+    rng = np.random.default_rng(4)
+    one = drive(rng, laps=3, gains=BENT)
+    experiences, chosen = experience_map(one, rng, every=20, registered=True)
+    graph, stamps = experiences.pose_graph(), one.motion.stamps_ns[chosen]
+    terms = terms_of(graph, one.motion, stamps, BENT)
+    assert set(terms.components.tolist()) == {2}
+    assert np.all(terms.targets - terms.sources > 1)
+    found = joint.solve(graph, one.motion, stamps, CONFIG)
+    assert np.all(np.abs(found.estimate.off(BENT)) < 4.0)
+    assert found.bias_start_rad_m == 0.0
+
+
+def test_derivatives_agree_with_differences(bent):
+    import gtsam
+
+    graph, motion, stamps, truth = bent
+    problem = joint._Problem(graph, motion, stamps, CONFIG)
+    error = joint._leg_error(problem, problem.terms, 7)
+    source, target = int(problem.terms.sources[7]), int(problem.terms.targets[7])
+    variable = np.array([1.02, 0.97, 0.03, 0.01])
+
+    def at(pose_i, pose_j, calibration):
+        values = gtsam.Values()
+        values.insert(source, pose_i)
+        values.insert(target, pose_j)
+        values.insert(problem.key, calibration)
+        return values
+
+    pose_i, pose_j = gtsam.Pose2(*truth[source]), gtsam.Pose2(*truth[target])
+    given = [np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 4))]
+    error(None, at(pose_i, pose_j, variable), given)
+    h = 1e-6
+    for k in range(3):
+        step = np.eye(3)[k] * h
+        more, less = (at(pose_i.retract(s), pose_j, variable) for s in (step, -step))
+        np.testing.assert_allclose((error(None, more, None) - error(None, less, None)) / (2 * h), given[0][:, k], atol=1e-3)
+        more, less = (at(pose_i, pose_j.retract(s), variable) for s in (step, -step))
+        np.testing.assert_allclose((error(None, more, None) - error(None, less, None)) / (2 * h), given[1][:, k], atol=1e-3)
+        step = np.eye(4)[k] * h
+        more, less = (at(pose_i, pose_j, variable + s) for s in (step, -step))
+        np.testing.assert_allclose((error(None, more, None) - error(None, less, None)) / (2 * h), given[2][:, k], atol=1e-3)
+
+
+def test_every_odometry_edge_enters_where_nothing_else_joins_the_chain(bent):
+    graph, motion, stamps, _ = bent
+    terms = terms_of(graph, motion, stamps, BENT)
+    assert len(terms.legs) == len(own_edges(graph)) == graph.n_nodes - 1

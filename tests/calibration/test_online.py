@@ -1,0 +1,99 @@
+"""While driving: off unless asked for, no change without significance, and every change is said."""
+
+import logging
+
+import numpy as np
+import pytest
+
+from hybridmap.calibration.gains import NEUTRAL, Gains, remove
+from hybridmap.calibration.online import OnlineCalibration
+from hybridmap.config import Config
+from hybridmap.config.calibration import CalibrationConfig
+from hybridmap.geometry import compose
+from hybridmap.mapper import Mapper
+from tests.calibration.drives import GAINS, STEP_NS, drive, experience_map
+
+ON = CalibrationConfig(online=True, first_m=30.0, every_m=20.0)
+
+
+def run(config, gains, registered=True, seed=0):
+    """Feed a drive; the map's poses are the truth. Returns the stage and the changes it asked for."""
+    rng = np.random.default_rng(seed)
+    one = drive(rng, laps=4, gains=gains)
+    experiences, chosen = experience_map(one, rng, registered=registered)
+    graph, stage, changes = experiences.pose_graph(), OnlineCalibration(config, NEUTRAL), []
+    node = {int(at): k for k, at in enumerate(chosen)}
+    for index, stamp in enumerate(one.motion.stamps_ns):
+        stage.observe(int(stamp), one.motion.steps[index - 1] if index else np.zeros(3))
+        if index in node:
+            known = one.truth[chosen[: node[index] + 1]]
+            changes.append(stage.follow(int(stamp), lambda: graph, lambda known=known: known))
+    return stage, [change for change in changes if change is not None]
+
+
+def test_off_by_default():
+    assert not Config().calibration.online
+    stage, changes = run(CalibrationConfig(), GAINS)
+    assert changes == stage.changes == []
+
+
+def test_a_clear_error_is_corrected_and_said(caplog):
+    with caplog.at_level(logging.WARNING):
+        stage, changes = run(ON, GAINS)
+    assert changes
+    assert changes == stage.changes
+    assert changes[-1].gains.heading_bias_rad_m == pytest.approx(GAINS.heading_bias_rad_m, abs=0.01)
+    assert caplog.text.count("odometry gains changed") == len(changes)
+    assert len(changes) <= 3  # once it is right there is nothing more to say
+
+
+def test_right_odometry_is_left_alone():
+    assert sum(len(run(ON, NEUTRAL, seed=seed)[1]) for seed in range(4)) <= 1
+
+
+def test_a_map_of_odometry_alone_says_nothing():
+    rng = np.random.default_rng(0)
+    one = drive(rng, laps=2)
+    from hybridmap.graph.pose_graph import EdgeKind
+
+    experiences, chosen = experience_map(one, rng)
+    graph, stage = experiences.pose_graph().only(EdgeKind.ODOMETRY), OnlineCalibration(ON, NEUTRAL)
+    for index, stamp in enumerate(one.motion.stamps_ns):
+        stage.observe(int(stamp), one.motion.steps[index - 1] if index else np.zeros(3))
+    assert stage.follow(int(one.motion.stamps_ns[chosen[-1]]), lambda: graph, lambda: one.truth[chosen]) is None
+
+
+def test_the_mapper_changes_its_integrator_and_says_why(monkeypatch):
+    from hybridmap.calibration import online
+
+    tree = {"vision": {"sensor": "none"}, "calibration": {"online": True, "first_m": 1.0, "every_m": 1.0}}
+    mapper = Mapper(Config.from_tree(tree, "test"))
+    wanted = Gains(1.1, 0.9, 0.02)
+
+    def follow(self, stamp_ns, graph, poses):
+        if self.changes or len(graph().initial) < 3:
+            return None
+        estimate = online.regress([_seen()])
+        self.changes.append(online.GainChange(stamp_ns, wanted, estimate))
+        return self.changes[-1]
+
+    monkeypatch.setattr(online.OnlineCalibration, "follow", follow)
+    pose, reasons = np.zeros(3), []
+    for k in range(40):
+        reasons += [update.reason for update in mapper.add(_sample(k, pose))]
+        pose = compose(pose, remove(np.array([[0.055, 0.0, 0.0]]), NEUTRAL)[0])
+    assert sum("odometry gains changed: gain 1.1" in reason for reason in reasons) == 1
+    assert Gains.of(mapper.integrator.config) == wanted
+    assert mapper.pose_map_robot[2] > 0.01
+
+
+def _sample(k, pose):
+    from hybridmap.streams.base import SelfMotion
+
+    return SelfMotion(k * STEP_NS, pose)
+
+
+def _seen():
+    from tests.calibration.drives import sighting
+
+    return sighting(drive(np.random.default_rng(0)))

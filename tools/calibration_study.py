@@ -1,0 +1,182 @@
+"""What calibration does to dead reckoning: trained on the first half of each log, tested on every window of the second.
+
+    python tools/calibration_study.py --data ../shared/data/real --out /somewhere [--only fr079]
+
+The laser logs are trained on their own map of the first half (no reference), the motion-capture robots on the reference of the
+first half, each alone and all five together. A window begins every half metre of the reference's way wherever 16.8 m or 70 m
+follow; its error is the distance between where dead reckoning and the reference end, both begun at the same pose. Every
+window of every log is in `windows.json`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hybridmap import session
+from hybridmap.calibration.estimate import Estimate
+from hybridmap.calibration.gains import NEUTRAL, Gains
+from hybridmap.calibration.legs import Motion
+from hybridmap.calibration.sessions import Drive, estimate_of, read_drive
+from hybridmap.cli.choose import choose
+from hybridmap.evaluate.association import Pairs, known_at, travel
+from hybridmap.evaluate.trajectory import motion_errors
+from hybridmap.geometry import Array
+from hybridmap.streams.base import SelfMotion, Velocity
+from hybridmap.streams.synchronise import Synchroniser
+from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
+
+LENGTHS_M = (16.8, 70.0)
+EVERY_M = 0.5
+BARS = {("fr079", 16.8): 0.6, ("aces", 16.8): 0.6, ("fr079", 70.0): 0.7, ("aces", 70.0): 0.7}
+LASER = {"fr079": ("fr079/fr079.mcap", "fr079/reference.tum"), "aces": ("aces/aces.bag", "aces/reference_dense.tum")}
+ROBOTS = {f"mrclam6-{k}": (f"mrclam6/robot{k}.csv", f"mrclam6/robot{k}_groundtruth.tum") for k in range(1, 6)}
+
+
+@dataclass(frozen=True)
+class Log:
+    """A recording: its raw odometry, its reference, and where its second half begins."""
+
+    name: str
+    source: Path
+    motion: Motion
+    reference: Trajectory
+    half_s: float
+
+    @property
+    def half_ns(self) -> int:
+        """Stamp at which the second half begins."""
+        return int(self.motion.stamps_ns[0]) + round(self.half_s * NS_PER_S)
+
+
+def read_log(name: str, source: Path, reference: Path) -> Log:
+    """Raw odometry of a whole recording, as the mapper's synchroniser hands it out."""
+    stream = choose(str(source), None, {}).stream
+    synchroniser = Synchroniser()
+    steps = [s for sample in stream if isinstance(sample, SelfMotion | Velocity) for s in synchroniser.push(sample)]
+    steps += synchroniser.flush()
+    stamps = np.array([step.stamp_ns for step in steps])
+    motion = Motion(stamps, np.array([step.delta_robot for step in steps])[1:])
+    return Log(name, source, motion, read_tum(reference), float(stamps[-1] - stamps[0]) / NS_PER_S / 2.0)
+
+
+def first_half(log: Log, out: Path) -> Drive:
+    """Map the first half of a log; nothing of the second is read."""
+    folder = out / f"{log.name}-first-half"
+    if not (folder / "metrics.json").is_file():
+        chosen = choose(str(log.source), None, {}, end_s=log.half_s)
+        session.run(chosen.stream, chosen.config, folder, overwrite=True)
+    return read_drive(folder)
+
+
+def windows(log: Log, gains: Gains, delay_s: float, length_m: float) -> tuple[Array, Array]:
+    """Start (s from the log's begin) and end error (m) of every window of the second half."""
+    shift = round(delay_s * NS_PER_S)
+    stamps = log.motion.stamps_ns
+    used = known_at(log.reference, stamps + shift) & (stamps >= log.half_ns)
+    poses = log.motion.poses(gains)[used]
+    pairs = Pairs(stamps[used], poses, log.reference.at(stamps[used] + shift), len(stamps))
+    along = travel(pairs.reference)
+    first = np.searchsorted(along, np.arange(0.0, max(along[-1] - length_m, 0.0), EVERY_M))
+    last = np.searchsorted(along, along[first] + length_m)
+    reached = last < len(along)
+    first, last = first[reached], last[reached]
+    near = along[last] - along[first] < 1.5 * length_m
+    errors, _ = motion_errors(pairs, first[near], last[near])
+    return (pairs.stamps_ns[first[near]] - stamps[0]) / NS_PER_S, errors
+
+
+def judge(log: Log, how: str, estimate: Estimate) -> list[dict[str, object]]:
+    """Errors of raw and calibrated dead reckoning, for each length of window."""
+    rows: list[dict[str, object]] = []
+    for length in LENGTHS_M:
+        start, raw = windows(log, NEUTRAL, 0.0, length)
+        if not len(raw):
+            continue
+        _, gains = windows(log, estimate.gains, 0.0, length)
+        _, timed = windows(log, estimate.gains, estimate.delay_s, length)
+        row = {
+            "log": log.name,
+            "trained": how,
+            "length_m": length,
+            "windows": len(raw),
+            "raw_mean_m": float(raw.mean()),
+            "raw_median_m": float(np.median(raw)),
+            "gains_mean": float(gains.mean() / raw.mean()),
+            "gains_median": float(np.median(gains) / np.median(raw)),
+            "delay_mean": float(timed.mean() / raw.mean()),
+            "delay_median": float(np.median(timed) / np.median(raw)),
+            "gain": estimate.gains.gain,
+            "turn_gain": estimate.gains.turn_gain,
+            "heading_bias_rad_m": estimate.gains.heading_bias_rad_m,
+            "delay_s": estimate.delay_s,
+            "sigmas": estimate.sigmas.tolist(),
+            "every_window": {
+                "start_s": start.tolist(),
+                "raw_m": raw.tolist(),
+                "gains_m": gains.tolist(),
+                "delay_m": timed.tolist(),
+            },
+        }
+        rows.append(row)
+        print(line(row), flush=True)
+    return rows
+
+
+def line(row: dict[str, object]) -> str:
+    """One row of the table."""
+    bar = BARS.get((str(row["log"]), float(str(row["length_m"]))))
+    s = row["sigmas"]
+    assert isinstance(s, list)
+    met = bar is not None and float(str(row["delay_mean"])) <= bar
+    verdict = "" if bar is None else f" bar {bar:.0%}: {'met' if met else 'missed'} |"
+    return (
+        f"| {row['log']} | {row['trained']} | {row['length_m']} m | {row['windows']} | {row['raw_mean_m']:.2f} "
+        f"({row['raw_median_m']:.2f}) | {row['gains_mean']:.0%} ({row['gains_median']:.0%}) | {row['delay_mean']:.0%} "
+        f"({row['delay_median']:.0%}) | {row['gain']:.4f} +- {s[0]:.4f} | {row['turn_gain']:.4f} +- {s[1]:.4f} | "
+        f"{row['heading_bias_rad_m']:.4f} +- {s[2]:.4f} | {row['delay_s']:.3f} +- {s[3]:.3f} |{verdict}"
+    )
+
+
+def summary(rows: list[dict[str, object]], how: str) -> None:
+    """Median over the motion-capture robots."""
+    ratios = [float(str(r["gains_mean"])) for r in rows if r["trained"] == how and r["length_m"] == LENGTHS_M[0]]
+    if ratios:
+        better = sum(ratio < 1.0 for ratio in ratios)
+        print(f"mrclam6, {how}: median {np.median(ratios):.0%} of raw (bar 75 %), better in {better} of {len(ratios)} (bar 4)")
+
+
+def main() -> None:
+    """Run the study."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--only", default="")
+    parser.add_argument("--estimators", nargs="+", default=["alternating", "joint"])
+    options = parser.parse_args()
+    rows: list[dict[str, object]] = []
+    for name, (source, reference) in LASER.items():
+        if options.only in name:
+            log = read_log(name, options.data / source, options.data / reference)
+            drive = first_half(log, options.out)
+            for estimator in options.estimators:
+                rows += judge(log, estimator, estimate_of([drive], [], estimator))
+    robots = [read_log(n, options.data / s, options.data / r) for n, (s, r) in ROBOTS.items() if options.only in n]
+    drives = [first_half(log, options.out) for log in robots]
+    for log, drive in zip(robots, drives, strict=True):
+        rows += judge(log, "reference", estimate_of([drive], [log.reference], ""))
+    if len(robots) > 1:
+        together = estimate_of(drives, [log.reference for log in robots], "")
+        for log in robots:
+            rows += judge(log, "reference, all robots", together)
+    for how in ("reference", "reference, all robots"):
+        summary(rows, how)
+    (options.out / "windows.json").write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    main()
