@@ -1,6 +1,7 @@
 """The documents: every example of the walk-through is run, every command and link that is named exists."""
 
 import doctest
+import json
 import re
 import shlex
 import subprocess
@@ -55,6 +56,10 @@ def test_walk_through_does_what_it_shows(tmp_path: Path) -> None:
         else:
             check(text, said, "output of the block before")
     assert (tmp_path / "session" / "report.html").is_file()
+    described = (ROOT / "docs" / "formats.md").read_text()
+    metrics = json.loads((tmp_path / "session" / "metrics.json").read_text())["metrics"]
+    measures = {metric["name"].partition("/")[0].replace("_online", "") for metric in metrics}
+    assert {measure for measure in measures if f"`{measure}" not in described} == set()
     assert not (tmp_path / "other").exists()
 
 
