@@ -11,7 +11,7 @@ import numpy as np
 
 from hybridmap.backends.base import SolveStatus
 from hybridmap.backends.factors import NoiseModels, anchor, factor_graph, factors, poses_of, values
-from hybridmap.backends.following import Change, GraphBackend, Outcome, difference, with_edges
+from hybridmap.backends.following import Change, GraphBackend, Outcome, difference
 from hybridmap.backends.initial import best_start
 from hybridmap.backends.objective import chi2
 from hybridmap.config.backends import BackendsConfig
@@ -90,7 +90,7 @@ class WarmStart:
         """One optimiser run; where the graph was seen before, `start` (N, 3) must carry on from the last outcome."""
         added = difference(self._graph, graph).added
         known = self._graph.n_nodes if self._graph is not None else 0
-        new = with_edges(graph, added)
+        new = graph.with_edges(added)
         self._factors |= zip(new.edge_ids.tolist(), factors(new, self._models), strict=True)
         initial = values(start[known:], known)
         if self._values is not None:

@@ -57,20 +57,6 @@ class Change:
     closes: bool
 
 
-def with_edges(graph: PoseGraph, kept: NDArray[np.int64] | NDArray[np.bool_]) -> PoseGraph:
-    """The same nodes with some of the edges."""
-    return PoseGraph(
-        graph.initial,
-        graph.sources[kept],
-        graph.targets[kept],
-        graph.deltas[kept],
-        graph.information[kept],
-        graph.kinds[kept],
-        graph.edge_ids[kept],
-        None if graph.entered is None else graph.entered[kept],
-    )
-
-
 def prefix(graph: PoseGraph, nodes: int) -> PoseGraph:
     """The graph as it was when it had `nodes` nodes.
 
@@ -78,7 +64,7 @@ def prefix(graph: PoseGraph, nodes: int) -> PoseGraph:
     """
     both = np.maximum(graph.sources, graph.targets)
     entry = np.where(graph.kinds < EdgeKind.LOOP, both, np.maximum(both, graph.entry_nodes))
-    return replace(with_edges(graph, entry < nodes), initial=graph.initial[:nodes])
+    return replace(graph.with_edges(entry < nodes), initial=graph.initial[:nodes])
 
 
 def difference(old: PoseGraph | None, new: PoseGraph) -> Change:
@@ -177,7 +163,7 @@ class GraphBackend(ABC):
             return graph.initial[:1]
         if graph.n_nodes < old.n_nodes:
             raise BackendError(f"{self._name}: the graph shrank from {old.n_nodes} to {graph.n_nodes} nodes between updates")
-        with_edges(graph, change.added).validate()
+        graph.with_edges(change.added).validate()
         if len(change.removed):
             require_connected(graph)
         return self._poses

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from hybridmap.backends.base import Solution, SolveStatus
 from hybridmap.backends.factors import NoiseModels, anchor, factors, poses_of, values
-from hybridmap.backends.following import Change, GraphBackend, Outcome, difference, prefix, with_edges
+from hybridmap.backends.following import Change, GraphBackend, Outcome, difference, prefix
 from hybridmap.backends.robust import gate_of, judged, kernel_models
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
@@ -36,7 +36,7 @@ class Smoother:
         fresh = gtsam.NonlinearFactorGraph()
         if known == 0:
             fresh.push_back(anchor(graph.initial[0]))
-        new = with_edges(graph, change.added)
+        new = graph.with_edges(change.added)
         for factor in factors(new, self._models):
             fresh.push_back(factor)
         gone = self._forget(change.removed)

@@ -33,14 +33,12 @@ def compare(
     A back-end that fails is a row that says so.
     """
     from hybridmap.backends import comparison
-    from hybridmap.cli.choose import parse_settings
-    from hybridmap.cli.graphs import open_graph
+    from hybridmap.cli.graphs import open_graph, settings_of
     from hybridmap.cli.show import emit, progress
-    from hybridmap.config import Config
     from hybridmap.metrics import Metric
 
-    settings = Config.load(config, parse_settings(setting)).backends
     opened = open_graph(source)
+    settings = settings_of(opened, config, setting)
     names = [name.strip() for name in backends.split(",") if name.strip()]
     with progress(f"comparing on {source}") as advance:
         rows = comparison.compare(opened.graph, names, settings, incremental=incremental, progress=advance)

@@ -6,9 +6,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from hybridmap.cli.choose import parse_settings
+from hybridmap.config import Config
+from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import GraphError
+from hybridmap.graph.hashing import graph_hash
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.store import MapStore, SessionFolder
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +43,6 @@ def open_graph(path: Path) -> GraphSource:
     if not path.is_dir():
         graph = read_graph(path)
         return GraphSource(path, graph, is_session=False, head=_head(path, graph))
-    from hybridmap.graph.hashing import graph_hash
-    from hybridmap.store import MapStore, SessionFolder
-
     SessionFolder(path).require()
     with MapStore.open(path) as store:
         experiences = store.map()
@@ -48,6 +50,17 @@ def open_graph(path: Path) -> GraphSource:
     if graph.n_edges == 0:
         raise GraphError(f"{path}: the map has no accepted edge; there is nothing to optimise")
     return GraphSource(path, graph, is_session=True, head=_head(path, graph) | {"graph_hash": graph_hash(experiences)})
+
+
+def settings_of(source: GraphSource, config: str | None, setting: list[str] | None) -> BackendsConfig:
+    """Settings of the back-ends: of the configuration named, else of the session itself, with `--set` on top.
+
+    Raises:
+        ConfigError: the configuration cannot be used.
+    """
+    own = SessionFolder(source.path).config_yaml if source.is_session else None
+    named: str | Path | None = config or (own if own is not None and own.is_file() else None)
+    return Config.load(named, parse_settings(setting)).backends
 
 
 def _head(path: Path, graph: PoseGraph) -> dict[str, Any]:

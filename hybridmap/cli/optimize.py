@@ -24,14 +24,12 @@ def optimize(
     """
     from hybridmap.backends import SolveStatus, create
     from hybridmap.backends.comparison import Row, metrics_of
-    from hybridmap.cli.choose import parse_settings
-    from hybridmap.cli.graphs import open_graph
+    from hybridmap.cli.graphs import open_graph, settings_of
     from hybridmap.cli.show import emit
-    from hybridmap.config import Config
     from hybridmap.graph.io import write_g2o
 
-    chosen = create(backend, Config.load(config, parse_settings(setting)).backends)
     source = open_graph(graph)
+    chosen = create(backend, settings_of(source, config, setting))
     solution = chosen.solve(source.graph)
     report = solution.report
     solved = report.status not in (SolveStatus.FAILED, SolveStatus.DIVERGED)

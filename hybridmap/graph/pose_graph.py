@@ -66,7 +66,10 @@ class PoseGraph:
 
     def only(self, *kinds: EdgeKind) -> PoseGraph:
         """The same nodes with only the edges of some kinds."""
-        kept = np.isin(self.kinds, kinds)
+        return self.with_edges(np.isin(self.kinds, kinds))
+
+    def with_edges(self, kept: NDArray[np.int64] | NDArray[np.bool_]) -> PoseGraph:
+        """The same nodes with some of the edges, by index or mask."""
         return PoseGraph(
             self.initial,
             self.sources[kept],

@@ -7,7 +7,7 @@ import pytest
 from graphs_for_tests import laps
 
 from hybridmap import backends
-from hybridmap.backends.following import difference, prefix, with_edges
+from hybridmap.backends.following import difference, prefix
 from hybridmap.backends.objective import chi2
 from hybridmap.config.backends import BackendsConfig, Isam2Config
 from hybridmap.errors import BackendError, GraphError
@@ -23,7 +23,7 @@ def test_a_node_on_odometry_alone_is_the_last_pose_and_its_edge(name):
     backend = backends.create(name)
     before = backend.update(prefix(graph, 20)).poses
     edge = int(np.flatnonzero((graph.sources == 19) & (graph.targets == 20))[0])
-    only_odometry = prefix(with_edges(graph, graph.kinds == EdgeKind.ODOMETRY), 21)
+    only_odometry = prefix(graph.with_edges(graph.kinds == EdgeKind.ODOMETRY), 21)
     after = backend.update(only_odometry)
     assert np.allclose(after.poses[20], compose(before[19], graph.deltas[edge]), atol=1e-6)
 
@@ -99,7 +99,7 @@ def test_what_is_new_and_what_is_gone_is_found_by_number_and_content():
     assert len(grown.added) == 1
     assert not grown.closes
     assert difference(prefix(graph, 25), prefix(graph, 26)).closes
-    fewer = difference(graph, with_edges(graph, np.arange(graph.n_edges) != 7))
+    fewer = difference(graph, graph.with_edges(np.arange(graph.n_edges) != 7))
     assert fewer.removed.tolist() == [7]
     assert fewer.closes
     deltas = graph.deltas.copy()
