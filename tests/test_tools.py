@@ -33,6 +33,9 @@ def test_page_of_results_is_what_was_recorded() -> None:
     results = importlib.import_module("results")
     found = json.loads((ROOT / "docs" / "results.json").read_text())
     assert (ROOT / "docs" / "results.md").read_text() == results.page(found)
+    readme = (ROOT / "README.md").read_text()
+    assert results.with_headlines(readme, found) == readme
+    assert "fr079" in readme
 
 
 def test_figures_are_held_against_their_bars(tmp_path: Path) -> None:

@@ -174,3 +174,32 @@ STUDIES = (
         ),
     ),
 )
+
+
+@dataclass(frozen=True)
+class Headline:
+    """A line of the README's table: one figure of odometry and of the primary back-end, both in m."""
+
+    study: str
+    label: str
+    odometry: str
+    mapped: str
+
+
+HEADLINES = (
+    Headline("demo", "demo, simulated laboratory, RGB-D: ATE", "ate_rmse/odometry", "ate_rmse/gtsam-gnc"),
+    Headline("office", "two laps of a simulated office, RGB-D: ATE", "ate_rmse/odometry", "ate_rmse/gtsam-gnc"),
+    Headline("hololens", "a real office, hand-held RGB-D: ATE", "ate_rmse/odometry", "ate_rmse/gtsam-gnc"),
+    Headline(
+        "fr079",
+        "fr079, real wheels and laser: mean relation error",
+        "relation_trans_mean/odometry",
+        "relation_trans_mean/gtsam-gnc",
+    ),
+    Headline(
+        "aces",
+        "aces, real wheels and laser: mean relation error",
+        "relation_trans_mean/odometry",
+        "relation_trans_mean/gtsam-gnc",
+    ),
+)

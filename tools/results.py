@@ -1,4 +1,4 @@
-"""Run the commands behind every figure that the project claims, and write `docs/results.md`.
+"""Run the commands behind every figure that the project claims; write `docs/results.md` and the README's table.
 
     python tools/results.py                  every study (those without their recordings are left as they were)
     python tools/results.py --only demo      some of them; the others keep what was found before
@@ -23,10 +23,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from result_studies import STUDIES, Figure, Step, Study
+from result_studies import HEADLINES, STUDIES, Figure, Step, Study
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE, RECORD = ROOT / "docs" / "results.md", ROOT / "docs" / "results.json"
+PAGE, RECORD, README = ROOT / "docs" / "results.md", ROOT / "docs" / "results.json", ROOT / "README.md"
+HEADLINES_BEGIN, HEADLINES_END = "<!-- results: written by tools/results.py -->\n", "<!-- end of results -->\n"
 DATA = "$HYBRIDMAP_DATA"
 PROGRAMS = {
     "hybridmap": (sys.executable, "-c", "from hybridmap.cli import main; main()"),
@@ -53,6 +54,7 @@ def main() -> None:
         found[study.name] = run(study)
         RECORD.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
         PAGE.write_text(page(found), encoding="utf-8")
+        README.write_text(with_headlines(README.read_text(encoding="utf-8"), found), encoding="utf-8")
 
 
 def data_folder() -> Path:
@@ -146,6 +148,19 @@ def page(found: dict[str, Any]) -> str:
         if study.name in found:
             lines += section(study, found[study.name])
     return "\n".join(lines) + "\n"
+
+
+def with_headlines(readme: str, found: dict[str, Any]) -> str:
+    """The README with its table of results brought up to what was found."""
+    before, rest = readme.split(HEADLINES_BEGIN)
+    _, after = rest.split(HEADLINES_END)
+    lines = ["| | odometry | mapped |", "|---|---:|---:|"]
+    for headline in HEADLINES:
+        values = {line["what"].strip("`"): line["value"] for line in found.get(headline.study, {"rows": []})["rows"]}
+        if headline.odometry in values and headline.mapped in values:
+            odometry, mapped = (float(values[name]) for name in (headline.odometry, headline.mapped))
+            lines.append(f"| {headline.label} | {odometry:.2f} m | {mapped:.3f} m |")
+    return before + HEADLINES_BEGIN + "\n" + "\n".join(lines) + "\n\n" + HEADLINES_END + after
 
 
 def section(study: Study, result: dict[str, Any]) -> list[str]:
