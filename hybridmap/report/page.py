@@ -56,6 +56,7 @@ def _content(scene: Scene, store: MapStore) -> dict[str, Any]:
         "backends": scene.backends,
         "reports": [scene.reports[name] for name in scene.backends if name in scene.reports],
         "known_truth": scene.truth is not None,
+        "saw_something": building is not None,
         "tiles": tiles(scene),
         "remarks": _remarks(scene),
         "trajectories": trajectories_figure(scene, building),
@@ -101,7 +102,7 @@ def tiles(scene: Scene) -> list[Tile]:
         ("loops_rejected", "loops rejected"),
         ("cpu_s_per_min", "CPU a minute of recording"),
     ]
-    return [_tile(named[name], label) for name, label in wanted if name in named]
+    return [_tile(named[name], label) for name, label in dict(reversed(wanted)).items() if name in named][::-1]
 
 
 def _tile(metric: Metric, label: str) -> Tile:

@@ -14,7 +14,7 @@ from hybridmap.geometry import IDENTITY, Array, compose
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.metrics import Metric
 from hybridmap.store import MapStore, SessionFolder
-from hybridmap.trajectory import Trajectory, read_tum
+from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
 
 ODOMETRY = "odometry"
 ONLINE = "_online"
@@ -77,8 +77,8 @@ def load_scene(folder: SessionFolder, store: MapStore) -> Scene:
         StoreError: the map or the figures are damaged.
         StreamError: a trajectory is damaged.
     """
-    truth = read_tum(folder.groundtruth) if folder.groundtruth.is_file() else None
     estimates = session_trajectories(folder, store)
+    truth = _truth(folder, estimates[ODOMETRY])
     alignments = {} if truth is None else _alignments(estimates, truth)
     estimates = {
         name: Trajectory(estimate.stamps_ns, compose(alignments.get(name, IDENTITY), estimate.poses))
@@ -107,6 +107,15 @@ def load_scene(folder: SessionFolder, store: MapStore) -> Scene:
         metrics=figures.metrics,
         config_yaml=store.config_yaml,
     )
+
+
+def _truth(folder: SessionFolder, odometry: Trajectory) -> Trajectory | None:
+    """The part of the known truth that the recording covers."""
+    if not folder.groundtruth.is_file():
+        return None
+    truth = read_tum(folder.groundtruth)
+    covered = odometry.covers(truth.stamps_ns, slack_ns=NS_PER_S)
+    return Trajectory(truth.stamps_ns[covered], truth.poses[covered]) if covered.any() else None
 
 
 def _alignments(estimates: dict[str, Trajectory], truth: Trajectory) -> dict[str, Array]:
