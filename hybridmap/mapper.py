@@ -81,9 +81,7 @@ class Mapper:
         self.vision = create_front_end(config.vision, rig if rig is not None else rig_of(config.sensors), config.seed)
         self.backends = Ensemble(config.backends, self.clock)
         self.calibration = OnlineCalibration(config.calibration, Gains.of(config.neural))
-        self._synchroniser = Synchroniser(
-            latency_s=config.sensors.latency_s, odometry_delay_s=config.sensors.odometry_delay_s
-        )
+        self._synchroniser = Synchroniser(latency_s=config.sensors.latency_s, odometry_delay_s=config.sensors.odometry_delay_s)
         self._novelty = Novelty(config.nodes)
         self._stamp_ns = 0
         self._pose_odom_given: Array = IDENTITY

@@ -76,6 +76,9 @@ def run(stream: Stream, config: Config, out: Path, *, overwrite: bool = False, p
     except HybridMapError:
         folder.discard()
         raise
+    except KeyboardInterrupt:
+        folder.restore_previous()
+        raise
     folder.keep()
     return session
 
@@ -149,7 +152,7 @@ class _Recorder:
             self.store.add_online(backend, update.stamp_ns, pose)
 
     def _note_correction(self, update: Update) -> None:
-        """Keep the map just before and after the largest shift of the robot on it."""
+        """Keep the map just before and after the largest shift of a node on it."""
         poses = self._mapper.poses()
         known = len(self._poses)
         if known and update.edges:
@@ -226,7 +229,7 @@ def _figures(mapper: Mapper, recorder: _Recorder, duration_s: float) -> list[Met
             continue
         report = solution.report
         rows += [
-            Metric(f"chi2_initial/{name}", report.chi2_initial, "1", "referee's chi2 before the last solve"),
+            Metric(f"chi2_initial/{name}", chain, "1", "referee's chi2 of the odometry chain"),
             Metric(f"chi2/{name}", objective.chi2(graph, solution.poses), "1", f"referee's chi2 at the end: {report.status}"),
             Metric(f"loops_rejected/{name}", len(report.rejected_edge_ids), "1", "accepted loops that it gave no weight"),
         ]

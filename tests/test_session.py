@@ -83,6 +83,29 @@ def test_bad_input_leaves_nothing_behind_and_loses_nothing(tmp_path):
         assert graph_hash(store.map()) == kept
 
 
+class Interrupted(RoomDrive):
+    """A drive during which the user presses Ctrl-C."""
+
+    def __iter__(self):
+        for i, sample in enumerate(super().__iter__()):
+            if i > 60:
+                raise KeyboardInterrupt
+            yield sample
+
+
+def test_breaking_off_an_overwrite_brings_the_old_session_back(tmp_path):
+    config = Config.load("laser", {"vision.sensor": "none"})
+    kept = session.run(RoomDrive(laps=0.2, with_scans=False), config, tmp_path / "s").head["graph_hash"]
+    with pytest.raises(KeyboardInterrupt):
+        session.run(Interrupted(), config, tmp_path / "s", overwrite=True)
+    with MapStore.open(tmp_path / "s") as store:
+        assert graph_hash(store.map()) == kept
+    with pytest.raises(KeyboardInterrupt):
+        session.run(Interrupted(), config, tmp_path / "new")
+    with MapStore.open(tmp_path / "new") as store:
+        assert len(store.map()) > 1
+
+
 def test_nothing_to_map_is_said():
     class Empty(RoomDrive):
         def __iter__(self):

@@ -65,9 +65,12 @@ app.command("verify")(verify)
 
 def main() -> None:
     """Run the command line: every error is one line on standard error and exit code 2."""
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # a damaged picture is reported by our own line
     try:
         code = app(prog_name="hybridmap", standalone_mode=False)
         raise SystemExit(code if isinstance(code, int) else 0)
+    except OSError as error:
+        _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except HybridMapError as error:
         _fail(" ".join(str(error).split()))
     except Exception as error:

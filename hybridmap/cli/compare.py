@@ -35,11 +35,16 @@ def compare(
     from hybridmap.backends import comparison
     from hybridmap.cli.graphs import open_graph, settings_of
     from hybridmap.cli.show import emit, progress
+    from hybridmap.errors import BackendError, GraphError
     from hybridmap.metrics import Metric
 
     opened = open_graph(source)
     settings = settings_of(opened, config, setting)
     names = [name.strip() for name in backends.split(",") if name.strip()]
+    if not names:
+        raise BackendError("--backends: found no name, expected back-ends separated by commas")
+    if out is not None and out.exists() and not out.is_dir():
+        raise GraphError(f"{out}: is a file; --out names a folder")
     with progress(f"comparing on {source}") as advance:
         rows = comparison.compare(opened.graph, names, settings, incremental=incremental, progress=advance)
     ate = _ate(opened, rows)

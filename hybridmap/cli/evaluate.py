@@ -26,7 +26,10 @@ def evaluate(
     """ATE, RPE (m, deg), drift (%), relation errors (m, deg), loop precision and recall; also put into metrics.json."""
     from hybridmap.cli.show import emit
     from hybridmap.evaluate import evaluate_session
+    from hybridmap.report import write_report
     from hybridmap.store import SessionFolder
 
     metrics = evaluate_session(folder, reference, relations)
+    if SessionFolder(folder).report.is_file():
+        write_report(SessionFolder(folder))
     emit(SessionFolder(folder).read_metrics().head, metrics, as_json=as_json, title=str(folder))

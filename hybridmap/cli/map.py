@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from hybridmap.cli.show import emit, progress
+from hybridmap.errors import EvaluationError
+
+log = logging.getLogger(__name__)
 
 Topic = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic to use instead of the one found.")]
 
@@ -62,7 +66,10 @@ def map_and_report(stream: Any, config: Any, out: Path, *, overwrite: bool) -> t
     with progress(f"mapping {stream.name}") as advance:
         finished = session.run(stream, config, out, overwrite=overwrite, progress=advance)
     if stream.groundtruth is not None:
-        evaluate_session(finished.folder.path)
+        try:
+            evaluate_session(finished.folder.path)
+        except EvaluationError as error:
+            log.warning("mapped, but not evaluated: %s", error)
     write_report(finished.folder)
     written = finished.folder.read_metrics()
     return written.head, written.metrics

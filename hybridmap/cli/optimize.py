@@ -14,6 +14,7 @@ def optimize(
         str, typer.Option(metavar="NAME", help="Back-end, e.g. gtsam-lm; a wrong name lists them.")
     ] = "gtsam-lm",
     out: Annotated[Path | None, typer.Option(metavar="FILE.g2o", help="Write the optimised graph here (m, rad).")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
     config: Annotated[str | None, typer.Option(help="Configuration with the back-end's settings: a name or a file.")] = None,
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
@@ -26,8 +27,11 @@ def optimize(
     from hybridmap.backends.comparison import Row, metrics_of
     from hybridmap.cli.graphs import open_graph, settings_of
     from hybridmap.cli.show import emit
+    from hybridmap.errors import GraphError
     from hybridmap.graph.io import write_g2o
 
+    if out is not None and out.exists() and (out.is_dir() or not overwrite):
+        raise GraphError(f"{out}: {'is a folder; name a file' if out.is_dir() else 'exists already; give --overwrite'}")
     source = open_graph(graph)
     chosen = create(backend, settings_of(source, config, setting))
     solution = chosen.solve(source.graph)

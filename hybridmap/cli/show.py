@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Iterable, Iterator
@@ -12,6 +13,8 @@ from hybridmap.metrics import Metric, to_json
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+_ROUND_OFF = 1e-12  # below it a figure is shown as 0; JSON has every digit
 
 
 class Advance(Protocol):
@@ -47,7 +50,8 @@ def _value(row: Metric | None) -> str:
     if row is None:
         return ""
     verdict = "" if row.passed is None else " ✓" if row.passed else " ✗"
-    return f"{row.value:.4g}{verdict}"
+    value = 0.0 if abs(row.value) < _ROUND_OFF else row.value
+    return "none" if math.isnan(value) else f"{value:.4g}{verdict}"
 
 
 def _plain_table(rows: list[Metric], title: str) -> Table:

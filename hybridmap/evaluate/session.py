@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from hybridmap.errors import EvaluationError
@@ -12,6 +13,8 @@ from hybridmap.evaluate.trajectory import absolute_error_of, drift_percent, rela
 from hybridmap.metrics import Metric
 from hybridmap.store import MapStore, SessionFolder, trajectory_of
 from hybridmap.trajectory import Trajectory, read_tum
+
+log = logging.getLogger(__name__)
 
 ODOMETRY = "odometry"
 _ONLINE = "_online"
@@ -119,6 +122,10 @@ def _against_truth(estimate: str, trajectory: Trajectory, truth: Trajectory) -> 
 def _against_relations(estimate: str, trajectory: Trajectory, relations: Relations) -> list[Metric]:
     suffix, backend, when = _names(estimate)
     errors = relation_errors(trajectory, relations)
+    if not suffix and backend == ODOMETRY and errors.all.used < 0.5 * errors.all.total:
+        log.warning(
+            "only %d of %d relations lie within the session; are they of this recording?", errors.all.used, errors.all.total
+        )
     rows = [
         *_relation_rows("relation", errors.all, "all relations"),
         *_relation_rows("relation_loop", errors.loops, "relations over more than 60 s"),

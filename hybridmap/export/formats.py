@@ -25,22 +25,24 @@ class Format:
         suffix: what its file is called while it is written; some writers go by it.
         description: one line for people.
         companion: suffix of a second file that lies beside the first, if there is one.
+        by_suffix: Open3D reads the file back only under its suffix.
     """
 
     writer: str
     suffix: str
     description: str
     companion: str | None = None
+    by_suffix: bool = False
 
 
 FORMATS: dict[str, Format] = {
     "tum": Format("trajectories:write_tum_trajectory", ".tum", "trajectory: stamp, position, quaternion a line"),
     "kitti": Format("trajectories:write_kitti_trajectory", ".txt", "trajectory: the 12 numbers of a 3x4 pose a line"),
     "g2o": Format("graphs:write_g2o_graph", ".g2o", "pose graph: VERTEX_SE2, EDGE_SE2"),
-    "lineset": Format("graphs:write_lineset", ".ply", "graph as an Open3D LineSet, edges coloured by kind"),
-    "posegraph": Format("graphs:write_posegraph", ".json", "graph as an Open3D PoseGraph"),
-    "ply": Format("clouds:write_cloud", ".ply", "merged point cloud, PLY"),
-    "pcd": Format("clouds:write_cloud", ".pcd", "merged point cloud, PCD"),
+    "lineset": Format("graphs:write_lineset", ".ply", "graph as an Open3D LineSet, edges coloured by kind", by_suffix=True),
+    "posegraph": Format("graphs:write_posegraph", ".json", "graph as an Open3D PoseGraph", by_suffix=True),
+    "ply": Format("clouds:write_cloud", ".ply", "merged point cloud, PLY", by_suffix=True),
+    "pcd": Format("clouds:write_cloud", ".pcd", "merged point cloud, PCD", by_suffix=True),
     "grid": Format("grids:write_grid", ".yaml", "occupancy grid for map_server: yaml and pgm", ".pgm"),
 }
 
@@ -82,6 +84,8 @@ def export_session(
     chosen = FORMATS[format_name]
     targets = _targets(out, chosen)
     for target in targets:
+        if chosen.by_suffix and target.suffix != chosen.suffix:
+            raise ExportError(f"{target}: Open3D reads a {format_name} by its suffix; name a file that ends in {chosen.suffix}")
         if target.is_dir():
             raise ExportError(f"{target}: is a folder; name a file")
         if target.exists() and not overwrite:

@@ -90,6 +90,8 @@ class SessionFolder:
     def _prepare(self, overwrite: bool) -> None:
         if self.path.exists() and not self.path.is_dir():
             raise StoreError(f"{self.path}: is a file; expected a folder that is empty or does not exist")
+        if overwrite:
+            self.restore_previous()  # a run that was killed while it overwrote: the session set aside is the whole one
         found = sorted(entry.name for entry in self.path.iterdir()) if self.path.exists() else []
         session = MAP_NAME in found or (bool(found) and set(found) <= {*_OURS, _PREVIOUS})
         if session and not overwrite:
@@ -107,6 +109,11 @@ class SessionFolder:
     def keep(self) -> None:
         """The new session stands: drop the one set aside by `prepare`."""
         shutil.rmtree(self.path / _PREVIOUS, ignore_errors=True)
+
+    def restore_previous(self) -> None:
+        """The new session was broken off: an overwritten one comes back; where there was none, what is mapped so far stays."""
+        if (self.path / _PREVIOUS).is_dir():
+            self.discard()
 
     def discard(self) -> None:
         """The new session failed: remove what it wrote, bring back the one set aside, and leave no empty folder."""

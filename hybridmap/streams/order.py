@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -96,6 +97,9 @@ class Window:
     end_s: float | None = None
 
     def __post_init__(self) -> None:
+        for name, value in (("--start", self.start_s), ("--end", self.end_s)):
+            if value is not None and not (math.isfinite(value) and value >= 0.0):
+                raise StreamError(f"{name} {value}: expected seconds from the first stamp, 0 or more")
         if self.start_s is not None and self.end_s is not None and self.end_s < self.start_s:
             raise StreamError(f"--end {self.end_s} s lies before --start {self.start_s} s")
 

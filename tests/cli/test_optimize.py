@@ -111,3 +111,15 @@ def test_files_are_never_left_half_written(square, tmp_path):
     graph = read_graph(square)
     assert np.isfinite(graph.initial).all()
     assert not list(Path(tmp_path).glob(".*partial"))
+
+
+def test_a_file_in_the_way_is_not_lost(monkeypatch, capsys, tmp_path):
+    (tmp_path / "square.g2o").write_text(SQUARE)
+    (tmp_path / "out.g2o").write_text("mine")
+    words = ("optimize", tmp_path / "square.g2o", "--backend", "gtsam-lm", "--out")
+    code, _, error = run(monkeypatch, capsys, *words, tmp_path / "out.g2o")
+    assert (code, error.count("\n")) == (2, 1)
+    assert (tmp_path / "out.g2o").read_text() == "mine"
+    assert run(monkeypatch, capsys, *words, tmp_path)[0] == 2
+    assert run(monkeypatch, capsys, *words, tmp_path / "out.g2o", "--overwrite")[0] == 0
+    assert (tmp_path / "out.g2o").read_text().startswith("VERTEX_SE2")

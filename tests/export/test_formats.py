@@ -41,8 +41,9 @@ def truth(experiences):
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_is_written_whole_and_with_the_same_bytes_each_time(folder, tmp_path, name):
-    first = export_session(folder, name, tmp_path / "a" / "out", options=OPTIONS)
-    second = export_session(folder, name, tmp_path / "b" / "out", options=OPTIONS)
+    out = f"out{FORMATS[name].suffix}"
+    first = export_session(folder, name, tmp_path / "a" / out, options=OPTIONS)
+    second = export_session(folder, name, tmp_path / "b" / out, options=OPTIONS)
     assert first.metrics == second.metrics
     assert first.backend == "gtsam-lm"
     for one, other in zip(first.files, second.files, strict=True):
@@ -216,8 +217,10 @@ def test_what_the_session_cannot_give_is_said_and_leaves_nothing(tmp_path, folde
         ("grid", "no valid range"),
     ):
         with pytest.raises(ExportError, match=match):
-            export_session(tmp_path / "bare", name, tmp_path / "new" / "x")
+            export_session(tmp_path / "bare", name, tmp_path / "new" / f"x{FORMATS[name].suffix}")
     assert not (tmp_path / "new").exists()
+    with pytest.raises(ExportError, match=r"ends in \.json"):
+        export_session(folder, "posegraph", tmp_path / "x.pg")
     with pytest.raises(ExportError, match=r"unknown format 'obj'.*tum, kitti"):
         export_session(folder, "obj", tmp_path / "x")
     with pytest.raises(ExportError, match=r"no result of back-end 'ceres'.*odometry.*gtsam-lm"):

@@ -1,0 +1,43 @@
+"""The bars of the main job, on real recordings and on one simulated drive in four forms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hybridmap import session
+from hybridmap.cli.choose import choose
+from hybridmap.evaluate import evaluate_session
+from hybridmap.streams.simulated import SimulatedStream
+from hybridmap.streams.writers import write_rosbag1, write_rosbag2, write_tum
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("recording", "all_m", "loops_m"), [("fr079/fr079.mcap", 3.5, None), ("aces/aces.bag", 0.06, 0.5)], ids=["fr079", "aces"]
+)
+def test_real_wheels_and_laser_with_no_other_option(data_dir: Path, tmp_path: Path, recording, all_m, loops_m):
+    source = data_dir / "real" / recording
+    chosen = choose(str(source), None, {})
+    finished = session.run(chosen.stream, chosen.config, tmp_path / "s")
+    figures = {m.name: m.value for m in evaluate_session(tmp_path / "s", relations=source.parent / "relations.txt")}
+    assert figures[f"relation_trans_mean/{finished.head['primary_backend']}"] <= all_m
+    if loops_m is not None:
+        assert figures[f"relation_loop_trans_mean/{finished.head['primary_backend']}"] <= loops_m
+
+
+def test_one_drive_live_and_from_three_kinds_of_recording_gives_one_graph(tmp_path: Path):
+    overrides = {"simulation.duration_s": 40.0}
+    live = choose("office", None, overrides)
+    stream = SimulatedStream(live.config.simulation, live.config.seed)
+    write_rosbag1(stream, tmp_path / "office.bag")
+    write_rosbag2(stream, tmp_path / "office.mcap", storage="mcap")
+    write_tum(stream, tmp_path / "office_tum")
+    hashes = {"live": session.run(live.stream, live.config, tmp_path / "live").head["graph_hash"]}
+    for name in ("office.bag", "office.mcap", "office_tum"):
+        chosen = choose(str(tmp_path / name), "office", overrides)
+        hashes[name] = session.run(chosen.stream, chosen.config, tmp_path / f"s_{name}").head["graph_hash"]
+    assert len(set(hashes.values())) == 1, hashes
