@@ -6,6 +6,8 @@ import pytest
 from hybridmap.config import Config
 from hybridmap.evaluate.relations import read_relations, relation_errors
 from hybridmap.geometry import compose
+from hybridmap.graph.experience_map import Status
+from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.mapper import Mapper
 from hybridmap.streams import open_stream
 from hybridmap.trajectory import Trajectory
@@ -37,6 +39,6 @@ def test_relation_errors_of_a_real_log(data_dir, log, file, bar_m, bar_loop_m):
     assert errors.all.trans_mean_m <= bar_m
     assert errors.loops.trans_mean_m <= bar_loop_m
     final = mapper.poses()
-    loops = [edge for _, edge in mapper.map.accepted() if edge.kind.name == "LOOP"]
+    loops = [e for e in mapper.map.edges if e.kind is EdgeKind.LOOP and e.status is Status.ACCEPTED]
     off = [np.hypot(*(compose(final[e.source], e.relative.delta) - final[e.target])[:2]) for e in loops]
     assert np.mean(np.array(off) > 1.0) <= 0.01
