@@ -46,9 +46,9 @@ def test_a_stripe_is_measured_between_the_bins(angle, period, phase):
     x, y = np.meshgrid(np.arange(96), np.arange(96), indexing="ij")
     wave = np.cos(2.0 * np.pi * (np.cos(angle) * x + np.sin(angle) * y) / period + phase)
     stripe = stripe_of(np.exp(3.0 * wave), 0.02)
-    assert stripe.period_m == pytest.approx(0.02 * period, rel=2e-3)
+    assert stripe.period_m == pytest.approx(0.02 * period, rel=5e-3)
     turned = np.degrees(stripe.orientation_rad - angle)
-    assert (turned + 90.0) % 180.0 - 90.0 == pytest.approx(0.0, abs=0.2)
+    assert (turned + 90.0) % 180.0 - 90.0 == pytest.approx(0.0, abs=0.3)
 
 
 def test_fields_are_counted():

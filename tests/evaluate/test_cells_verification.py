@@ -32,12 +32,11 @@ def test_every_row_of_the_table_is_there(rows):
         "position_room_relu", "position_room_softplus", "position_corridor_relu", "position_corridor_softplus",
         "no_shadow_integrator", "place_single_recruited", "standing_still", "printed_kernel_refused",
     }  # fmt: skip
-    assert {"gridness_ideal", "gridness_square", "place_single_printed", "noise_2_percent", "turn_rate_modulation"} <= set(rows)
+    assert {"gridness_ideal", "gridness_square", "place_single_printed", "noise_1_percent", "turn_rate_modulation"} <= set(rows)
 
 
 def test_the_bars_are_kept_on_short_drives(rows):
-    coarse = {"gridness"}  # 3 cm pixels cannot show a 12 cm grid
-    assert [name for name, row in rows.items() if row.passed is False and name not in coarse] == []
+    assert [name for name, row in rows.items() if row.passed is False] == []
 
 
 def test_a_square_metric_scores_below_the_hexagonal_one(rows):
@@ -45,7 +44,7 @@ def test_a_square_metric_scores_below_the_hexagonal_one(rows):
 
 
 def test_more_noise_is_more_error(rows):
-    assert 0.0 < rows["noise_2_percent"].value < rows["noise_10_percent"].value
+    assert 0.0 < rows["noise_1_percent"].value < rows["noise_10_percent"].value
 
 
 def test_recurrence_is_stated_whichever_way_it_comes_out(result):
@@ -56,11 +55,13 @@ def test_recurrence_is_stated_whichever_way_it_comes_out(result):
     assert recurrence_verdict(settled).count("does not change") == 2
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_figures(rows):
     again = {row.name.removeprefix("verify/"): row for row in rows_of(verify_cells(3, TINY, {}))}
     assert again == rows
 
 
+@pytest.mark.slow
 def test_a_wrong_gain_is_seen():
     rows = broken(gain=1.01)
     missed = {name.removeprefix("verify/") for name, row in rows.items() if row.passed is False}

@@ -10,7 +10,7 @@ from hybridmap import geometry
 from hybridmap.geometry import Array
 
 _ROOM_M = (10.0, 3.0)
-_MARGIN_M = 0.5
+_MARGIN_M = 0.9
 
 
 @dataclass(frozen=True, slots=True)
