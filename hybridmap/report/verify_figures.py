@@ -101,10 +101,10 @@ def place_figure(place: PlaceResult) -> str:
                 _picture(axes, rates, low=0.0)
             for axes in row[len(population.examples) : 8]:
                 axes.set_axis_off()
-            counts = np.bincount(np.minimum(population.fields, 6), minlength=7)[1:]
-            row[8].bar(range(1, 7), 100.0 * counts / max(1, counts.sum()), color=style.PRIMARY, width=0.8)
+            counts = np.bincount(np.minimum(population.fields, 6), minlength=7)
+            row[8].bar(range(7), 100.0 * counts / max(1, counts.sum()), color=style.PRIMARY, width=0.8)
             row[8].set_ylim(0, 100)
-            row[8].set_xticks(range(1, 7), ["1", "2", "3", "4", "5", "≥6"], fontsize=7)
+            row[8].set_xticks(range(7), ["0", "1", "2", "3", "4", "5", "≥6"], fontsize=7)
             row[8].tick_params(axis="y", labelsize=7)
         panels[0, 8].set_title("cells (%) by number of fields", fontsize=8.0, fontweight="normal")
         _name_rows(panels, [name.replace(": ", ":\n").replace(" rec", "\nrec") for name, _ in groups])

@@ -52,8 +52,10 @@ def test_a_stripe_is_measured_between_the_bins(angle, period, phase):
 
 
 def test_fields_are_counted():
-    maps = np.zeros((4, 20, 20))
+    maps = np.zeros((5, 20, 20))
     maps[1, 3:7, 3:7] = 1.0
     maps[2, 3:7, 3:7], maps[2, 12:15, 12:15] = 1.0, 0.5
     maps[3, 3:7, 3:7], maps[3, 12:15, 12:15], maps[3, 0, 19] = 1.0, 0.15, 0.9  # too weak; too small
-    assert field_counts(maps).tolist() == [0, 1, 2, 1]
+    maps[4] = 0.5
+    maps[4, 5, 5] = 1.0  # everywhere is no field
+    assert field_counts(maps).tolist() == [0, 1, 2, 1, 0]

@@ -12,6 +12,7 @@ from hybridmap.geometry import Array
 
 _FIELD_THRESHOLD = 0.2
 _SMALLEST_FIELD_BINS = 3
+_LARGEST_SHARE = 0.5
 _CENTRAL_PEAK = 0.5
 
 
@@ -133,14 +134,16 @@ def stripe_of(rates: Array, pitch_m: float) -> Stripe:
 def field_counts(maps: NDArray[np.floating]) -> NDArray[np.int64]:
     """Number of firing fields of each rate map (C, H, W); 0 for a cell that never fires.
 
-    A field is a connected region (corners included) of at least three bins above 20 % of the map's peak.
+    A field is a connected region (corners included) of at least three bins above 20 % of the map's peak. A cell that fires
+    above that in more than half of the map fires everywhere and has no field.
     """
     from scipy import ndimage
 
     counts = np.zeros(len(maps), dtype=np.int64)
     for cell, rates in enumerate(maps):
         peak = float(rates.max())
-        if peak > 0.0:
-            regions, _ = ndimage.label(rates > _FIELD_THRESHOLD * peak, structure=np.ones((3, 3)))
+        firing = rates > _FIELD_THRESHOLD * peak
+        if peak > 0.0 and firing.mean() <= _LARGEST_SHARE:
+            regions, _ = ndimage.label(firing, structure=np.ones((3, 3)))
             counts[cell] = int((np.bincount(regions.ravel())[1:] >= _SMALLEST_FIELD_BINS).sum())
     return counts
