@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from hybridmap.cli.choose import parse_settings
 from hybridmap.config import Config
 from hybridmap.config.backends import BackendsConfig
@@ -58,9 +60,11 @@ def settings_of(source: GraphSource, config: str | None, setting: list[str] | No
     Raises:
         ConfigError: the configuration cannot be used.
     """
-    own = SessionFolder(source.path).config_yaml if source.is_session else None
-    named: str | Path | None = config or (own if own is not None and own.is_file() else None)
-    return Config.load(named, parse_settings(setting)).backends
+    own = SessionFolder(source.path).config_yaml
+    if config is not None or not source.is_session or not own.is_file():
+        return Config.load(config, parse_settings(setting)).backends
+    saved = yaml.safe_load(own.read_text(encoding="utf-8")) or {}
+    return Config.load(None, {"backends": saved.get("backends", {}), **parse_settings(setting)}).backends
 
 
 def _head(path: Path, graph: PoseGraph) -> dict[str, Any]:
