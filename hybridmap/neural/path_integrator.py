@@ -77,7 +77,7 @@ class PathIntegrator:
         Raises:
             StreamError: the displacement is not finite, or more than a kilometre.
         """
-        dx, dy, dyaw = (float(value) for value in np.asarray(delta_robot, dtype=np.float64))
+        dx, dy, dyaw = np.asarray(delta_robot, dtype=np.float64).tolist()
         if not math.isfinite(dx + dy + dyaw):
             raise StreamError(f"self-motion: expected a finite displacement (dx, dy, dyaw), found ({dx}, {dy}, {dyaw})")
         if math.hypot(dx, dy) > _LARGEST_STEP_M:
