@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +25,7 @@ from hybridmap.streams.rig import rig_of
 from hybridmap.streams.synchronise import Ready, Synchroniser
 from hybridmap.trajectory import NS_PER_S, stamp_ns_from_s
 from hybridmap.vision import create_front_end
-from hybridmap.vision.base import Belief, Proposal, Verdict, View
+from hybridmap.vision.base import Belief, Proposal, Retraced, RetracingFrontEnd, Verdict, View
 
 _KINDS = {"loop": EdgeKind.LOOP, "registration": EdgeKind.REGISTRATION}
 _STATUS = {Verdict.ACCEPTED: Status.ACCEPTED, Verdict.PENDING: Status.PENDING, Verdict.REJECTED: Status.REJECTED}
@@ -81,6 +81,7 @@ class Mapper:
         self.vision = create_front_end(config.vision, rig if rig is not None else rig_of(config.sensors), config.seed)
         self.backends = Ensemble(config.backends, self.clock)
         self.calibration = OnlineCalibration(config.calibration, Gains.of(config.neural))
+        self.retraced: Retraced | None = None
         self._synchroniser = Synchroniser(latency_s=config.sensors.latency_s, odometry_delay_s=config.sensors.odometry_delay_s)
         self._novelty = Novelty(config.nodes)
         self._stamp_ns = 0
@@ -156,6 +157,7 @@ class Mapper:
                 break
         if len(self.map):
             self._correct(final=True)
+            self._retrace()
             updates.append(self._update(pose_odom, "end of the drive"))
         return updates
 
@@ -193,6 +195,12 @@ class Mapper:
             self.backends.update(graph)
         names = self.config.backends.names
         self._pose_map_at_node = {name: self.backends.poses(graph, name)[self._at_node] for name in names}
+
+    def _retrace(self) -> None:
+        """Once the map is final, measure on it where the robot was between nodes."""
+        if isinstance(self.vision, RetracingFrontEnd):
+            with self.clock.stage("retrace"):
+                self.retraced = self.vision.retrace(replace(self.belief(), poses_map_node=self.poses()))
 
     def _calibrate(self) -> str:
         """Let the gains follow the map, where the map is sure; returns what to add to the reason."""

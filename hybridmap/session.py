@@ -22,7 +22,7 @@ from hybridmap.mapper import Mapper, Update
 from hybridmap.metrics import Metric
 from hybridmap.store import MapStore
 from hybridmap.store.session_folder import SessionFolder
-from hybridmap.store.track import trajectory_of
+from hybridmap.store.track import anchors_on, trajectory_of
 from hybridmap.streams.base import Observation, Stream
 from hybridmap.trajectory import NS_PER_S
 
@@ -176,14 +176,17 @@ class _Recorder:
 
 
 def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: SessionFolder) -> Session:
-    store = recorder.store
+    store, found = recorder.store, mapper.retraced
+    if found is not None:
+        store.put_anchors(anchors_on(mapper.poses(), found.stamps_ns, found.nodes, found.deltas))
     track = store.track()
     folder.write_trajectory("odometry", track.odometry)
     for name in mapper.config.backends.names:
         solution = mapper.backends.solutions.get(name)
         if solution is not None:
             store.put_solution(name, solution.poses, solution.report)
-            folder.write_trajectory(name, trajectory_of(track, solution.poses))
+            if name != "odometry":
+                folder.write_trajectory(name, trajectory_of(track, solution.poses))
             folder.write_trajectory(f"{name}_online", store.online(name))
     if stream.groundtruth is not None:
         folder.write_groundtruth(stream.groundtruth)

@@ -16,6 +16,7 @@ import pytest
 from hybridmap import session
 from hybridmap.config import Config
 from hybridmap.errors import StoreError, StreamError
+from hybridmap.geometry import between
 from hybridmap.graph.hashing import graph_hash
 from hybridmap.store import MapStore
 from hybridmap.trajectory import read_tum
@@ -59,6 +60,25 @@ def test_the_same_input_gives_the_same_bytes(finished, tmp_path):
     again = session.run(RoomDrive(laps=2.2), Config.load("laser", OVERRIDES), tmp_path / "s")
     assert again.head["graph_hash"] == finished.head["graph_hash"]
     assert digests(tmp_path / "s") == digests(finished.folder.path)
+
+
+def test_scans_between_nodes_are_put_right_on_the_final_map(finished, tmp_path):
+    off = session.run(
+        RoomDrive(laps=2.2), Config.load("laser", OVERRIDES | {"vision.laser.retrace.enabled": False}), tmp_path / "s"
+    )
+    truth = RoomDrive(laps=2.2).groundtruth
+    error = {}
+    for name, run in (("on", finished), ("off", off)):
+        estimate = read_tum(run.folder.trajectory / "gtsam-gnc.tum")
+        step = between(between(truth.poses[:-2], truth.poses[2:]), between(estimate.poses[:-2], estimate.poses[2:]))
+        error[name] = np.sqrt((step[:, 2] ** 2).mean())
+    assert error["on"] < 0.8 * error["off"]
+    assert "cpu_s/retrace" in {m.name for m in finished.metrics}
+    with MapStore.open(finished.folder.path) as store, MapStore.open(off.folder.path) as bare:
+        assert len(store.track().anchors) > 0.9 * (len(truth) // 2)
+        assert len(bare.track().anchors) == 0
+    dead_reckoning = [(run.folder.trajectory / "odometry.tum").read_bytes() for run in (finished, off)]
+    assert dead_reckoning[0] == dead_reckoning[1]
 
 
 def test_a_session_is_not_overwritten_by_chance_but_on_demand(tmp_path):

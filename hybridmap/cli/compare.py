@@ -82,7 +82,8 @@ def _ate(opened: GraphSource, rows: Sequence[Row]) -> dict[str, float]:
     with MapStore.open(opened.path) as store:
         track = store.track()
     solved = {row.backend: row.solution.poses for row in rows if row.solution is not None}
-    return {name: absolute_error(trajectory_of(track, poses), reference).rmse_m for name, poses in solved.items()}
+    ways = {name: track.odometry if name == "odometry" else trajectory_of(track, poses) for name, poses in solved.items()}
+    return {name: absolute_error(way, reference).rmse_m for name, way in ways.items()}
 
 
 def _table(rows: Sequence[Row], ate: dict[str, float]) -> list[list[str]]:

@@ -18,7 +18,7 @@ from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
 from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.store import codec, schema
-from hybridmap.store.track import Track
+from hybridmap.store.track import NO_ANCHORS, Anchors, Track
 from hybridmap.streams.base import Rig
 from hybridmap.trajectory import Trajectory
 
@@ -134,6 +134,13 @@ class MapStore:
         """Write where the robot believed to be at the time, (3,) in `map`, m and rad. The last word on a stamp wins."""
         self._write("INSERT OR REPLACE INTO online VALUES (?, ?, ?, ?, ?)", (backend, int(stamp_ns), *_floats(pose_map)))
 
+    def put_anchors(self, anchors: Anchors) -> None:
+        """Write where the robot was found on the final map; replaces what was there."""
+        self._write("DELETE FROM anchors", ())
+        ends = zip(anchors.stamps_ns.tolist(), anchors.nodes.tolist(), anchors.next_nodes.tolist(), strict=True)
+        for end, delta, next_delta in zip(ends, anchors.deltas, anchors.next_deltas, strict=True):
+            self._write(f"INSERT INTO anchors VALUES ({_marks(9)})", (*end, *_floats(delta), *_floats(next_delta)))
+
     def put_solution(self, backend: str, poses: Array, report: SolveReport) -> None:
         """Write a back-end's poses (N, 3) and report; replaces an earlier one of the same name."""
         position = self._one("SELECT position FROM solutions WHERE backend = ?", (backend,))
@@ -210,11 +217,20 @@ class MapStore:
         return self._named(node, _SNAPSHOT)
 
     def track(self) -> Track:
-        """Where the robot was at each stamp, seen from nodes."""
+        """Where the robot was at each stamp, seen from nodes, and where it was found on the final map."""
         rows = self._rows("SELECT * FROM track ORDER BY stamp_ns")
         values = np.array([row[2:] for row in rows], dtype=np.float64).reshape(-1, 6)
         ends = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2)
-        return Track(ends[:, 0].copy(), ends[:, 1].copy(), values[:, :3].copy(), values[:, 3:].copy())
+        return Track(ends[:, 0].copy(), ends[:, 1].copy(), values[:, :3].copy(), values[:, 3:].copy(), self._anchors())
+
+    def _anchors(self) -> Anchors:
+        if not self._rows("SELECT name FROM sqlite_master WHERE name = 'anchors'"):
+            return NO_ANCHORS
+        rows = self._rows("SELECT * FROM anchors ORDER BY stamp_ns")
+        values = np.array([row[3:] for row in rows], dtype=np.float64).reshape(-1, 6)
+        ends = np.array([row[:3] for row in rows], dtype=np.int64).reshape(-1, 3)
+        stamps, nodes, after = ends.T.copy()
+        return Anchors(stamps, nodes, after, values[:, :3].copy(), values[:, 3:].copy())
 
     def online(self, backend: str) -> Trajectory:
         """Where the robot believed to be at the time, by one back-end; empty if it kept none."""

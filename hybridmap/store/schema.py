@@ -7,8 +7,11 @@ from pathlib import Path
 
 from hybridmap.errors import StoreError
 
-VERSION = 1
-"""Raised whenever the tables change; a file of another version is refused."""
+VERSION = 2
+"""Raised whenever the tables change."""
+
+READABLE = (1, 2)
+"""Versions that can be read; a file of another one is refused. Version 1 has no anchors."""
 
 APPLICATION_ID = 0x68796D70
 """Marks the SQLite file as a map (`hymp`)."""
@@ -35,6 +38,10 @@ CREATE TABLE track (
     stamp_ns INTEGER PRIMARY KEY, node INTEGER NOT NULL,
     x_m REAL NOT NULL, y_m REAL NOT NULL, yaw_rad REAL NOT NULL,
     odom_x_m REAL NOT NULL, odom_y_m REAL NOT NULL, odom_yaw_rad REAL NOT NULL);
+CREATE TABLE anchors (
+    stamp_ns INTEGER PRIMARY KEY, node INTEGER NOT NULL, next_node INTEGER NOT NULL,
+    x_m REAL NOT NULL, y_m REAL NOT NULL, yaw_rad REAL NOT NULL,
+    next_x_m REAL NOT NULL, next_y_m REAL NOT NULL, next_yaw_rad REAL NOT NULL);
 CREATE TABLE online (
     backend TEXT NOT NULL, stamp_ns INTEGER NOT NULL,
     x_m REAL NOT NULL, y_m REAL NOT NULL, yaw_rad REAL NOT NULL,
@@ -85,7 +92,7 @@ def open_read_only(path: Path) -> sqlite3.Connection:
     if application != APPLICATION_ID:
         connection.close()
         raise StoreError(f"{path}: an SQLite file, but not a map of hybridmap")
-    if version != VERSION:
+    if version not in READABLE:
         connection.close()
         raise StoreError(f"{path}: map of version {version}, expected {VERSION}; map the source again with this hybridmap")
     return connection

@@ -8,11 +8,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.errors import StoreError
-from hybridmap.geometry import Array, between, compose, interpolate, inverse, wrap_angle
+from hybridmap.geometry import Array, between, compose, interpolate, wrap_angle
 from hybridmap.trajectory import Trajectory
 
 _TURN_AS_TRAVEL_M = 0.3
 """Metres of travel that a turn of one radian counts for when a residual is spread over the way."""
+
+
+@dataclass(frozen=True, slots=True)
+class Anchors:
+    """Where the robot was at some stamps, measured on the final map: seen from the node before and from the node after.
+
+    The two say the same on the map on which they were measured; on another back-end's map they are blended.
+
+    Attributes:
+        stamps_ns: (S,) int64, increasing.
+        nodes, next_nodes: (S,) int64, the node before and the node after (the same at the last node).
+        deltas, next_deltas: (S, 3) pose of the robot in the frame of either, m and rad.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    nodes: NDArray[np.int64]
+    next_nodes: NDArray[np.int64]
+    deltas: Array
+    next_deltas: Array
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+def anchors_on(poses: Array, stamps_ns: NDArray[np.int64], nodes: NDArray[np.int64], deltas: Array) -> Anchors:
+    """Anchors of what was measured on a map.
+
+    Args:
+        poses: (N, 3) of the nodes, m and rad.
+        stamps_ns, nodes, deltas: (S,), (S,) and (S, 3), as `vision.base.Retraced` has them.
+    """
+    after = np.minimum(nodes + 1, len(poses) - 1)
+    return Anchors(stamps_ns, nodes, after, deltas, between(poses[after], compose(poses[nodes], deltas)))
+
+
+NO_ANCHORS = anchors_on(np.zeros((1, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,12 +60,14 @@ class Track:
         nodes: (T,) int64, the node that the robot had last made (or been re-anchored to).
         deltas: (T, 3) pose of the robot in the frame of that node, m and rad.
         poses_odom: (T, 3) pose of the robot in `odom`, m and rad.
+        anchors: what was measured between nodes, at stamps of the track.
     """
 
     stamps_ns: NDArray[np.int64]
     nodes: NDArray[np.int64]
     deltas: Array
     poses_odom: Array
+    anchors: Anchors = NO_ANCHORS
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -43,9 +81,9 @@ class Track:
 def trajectory_of(track: Track, poses: Array) -> Trajectory:
     """Poses of the robot at every stamp of the track, given those of the nodes.
 
-    On the way from one node to the next the pose seen from the first and the pose seen from the next are blended along
-    the SE(2) geodesic by the share of the way done, so that what odometry and the solution disagree about is spread over
-    that way and the trajectory is continuous.
+    The pose is known where a node was made and at the anchors. On the way from one such knot to the next the pose carried
+    on from the first and the pose carried back from the next are blended along the SE(2) geodesic by the share of the way
+    done, so that what odometry and the solution disagree about is spread over that way and the trajectory is continuous.
 
     Args:
         track: where the robot was, seen from nodes.
@@ -58,15 +96,33 @@ def trajectory_of(track: Track, poses: Array) -> Trajectory:
         raise StoreError("track: holds no pose; nothing was mapped")
     if track.nodes.max() >= len(poses) or track.nodes.min() < 0:
         raise StoreError(f"track: names node {int(track.nodes.max())}, expected less than {len(poses)}")
-    forward = compose(poses[track.nodes], track.deltas)
-    first = np.flatnonzero(np.diff(track.nodes, prepend=track.nodes[0] - 1))
-    run = np.searchsorted(first, np.arange(len(track)), side="right") - 1
-    inside = run < len(first) - 1
-    target = first[np.minimum(run + 1, len(first) - 1)]
-    robot_target = between(track.poses_odom, track.poses_odom[target])
-    backward = compose(compose(poses[track.nodes[target]], track.deltas[target]), inverse(robot_target))
-    share = np.where(inside, _share_of_way(track, first[run], target), 0.0)
-    return Trajectory(track.stamps_ns, interpolate(forward, backward, share))
+    made = np.flatnonzero(np.diff(track.nodes, prepend=track.nodes[0] - 1))
+    at, anchored = _anchored(track, poses, made)
+    knots = np.union1d(made, at)
+    known = compose(poses[track.nodes[knots]], track.deltas[knots])
+    known[np.searchsorted(knots, at)] = anchored
+    before, after = _neighbours(knots, len(track))
+    start, end = knots[before], knots[after]
+    forward = compose(known[before], between(track.poses_odom[start], track.poses_odom))
+    backward = compose(known[after], between(track.poses_odom[end], track.poses_odom))
+    return Trajectory(track.stamps_ns, interpolate(forward, backward, _share_of_way(track, start, end)))
+
+
+def _anchored(track: Track, poses: Array, made: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array]:
+    """Rows of the track at which there are anchors, and the poses (A, 3) there on a map of given node poses."""
+    _, rows, chosen = np.intersect1d(track.stamps_ns, track.anchors.stamps_ns, assume_unique=True, return_indices=True)
+    a = track.anchors
+    from_before = compose(poses[a.nodes[chosen]], a.deltas[chosen])
+    from_after = compose(poses[a.next_nodes[chosen]], a.next_deltas[chosen])
+    before, after = _neighbours(made, len(track))
+    share = _share_of_way(track, made[before], made[after])
+    return rows, interpolate(from_before, from_after, share[rows])
+
+
+def _neighbours(knots: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Position of the knot at or before each of `count` rows, and of the one after (the same beyond the last)."""
+    before = np.searchsorted(knots, np.arange(count), side="right") - 1
+    return before, np.minimum(before + 1, len(knots) - 1)
 
 
 def _share_of_way(track: Track, start: NDArray[np.int64], end: NDArray[np.int64]) -> Array:
@@ -78,4 +134,4 @@ def _share_of_way(track: Track, start: NDArray[np.int64], end: NDArray[np.int64]
     time_done, time_total = track.stamps_ns - track.stamps_ns[start], track.stamps_ns[end] - track.stamps_ns[start]
     moved = total > 1e-6
     by_time = time_done / np.maximum(time_total, 1)
-    return np.asarray(np.where(moved, done / np.where(moved, total, 1.0), by_time))
+    return np.asarray(np.where(end > start, np.where(moved, done / np.where(moved, total, 1.0), by_time), 0.0))

@@ -13,7 +13,7 @@ from hybridmap.errors import StoreError
 from hybridmap.graph.experience_map import Edge, ExperienceMap, Status
 from hybridmap.graph.hashing import graph_hash
 from hybridmap.graph.pose_graph import EdgeKind
-from hybridmap.store import MapStore
+from hybridmap.store import MapStore, anchors_on
 from hybridmap.streams.base import Rig
 from tests.store.sessions import RIG, keyframe_of, ring_map, truth_at, write_session
 
@@ -106,7 +106,7 @@ def test_finished_session_is_one_file(tmp_path):
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from hybridmap.store import MapStore
+from hybridmap.store import MapStore, anchors_on
 from hybridmap.streams.base import Rig
 from tests.store.sessions import ring_map
 import numpy as np
@@ -188,7 +188,7 @@ def test_bad_files_are_refused_with_the_reason(tmp_path):
     with sqlite3.connect(tmp_path / "v" / "map.db") as connection:
         connection.execute("PRAGMA user_version = 99")
     connection.close()
-    with pytest.raises(StoreError, match="version 99, expected 1"):
+    with pytest.raises(StoreError, match="version 99, expected 2"):
         MapStore.open(tmp_path / "v")
 
 
@@ -196,3 +196,26 @@ def test_reading_changes_nothing(tmp_path):
     write_session(tmp_path / "s", ring_map())
     with MapStore.open(tmp_path / "s") as store, pytest.raises(StoreError, match="cannot write"):
         store.put_info("x", 1)
+
+
+def test_anchors_come_back_exactly_and_a_later_set_replaces_the_earlier(tmp_path):
+    poses = np.array([[0.0, 0, 0], [1.0, 0.2, 0.1]])
+    stamps, nodes = np.array([10, 20, 30]), np.array([0, 0, 1])
+    anchors = anchors_on(poses, stamps, nodes, np.array([[0.1, 0, 0], [0.7, 0.1, 0.05], [0.01, 0, 0]]))
+    with MapStore.create(tmp_path, "{}", Rig(), "x") as store:
+        store.put_anchors(anchors_on(poses, stamps + 1, nodes, np.zeros((3, 3))))
+        store.put_anchors(anchors)
+    with MapStore.open(tmp_path) as store:
+        back = store.track().anchors
+    for name in ("stamps_ns", "nodes", "next_nodes", "deltas", "next_deltas"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(anchors, name))
+
+
+def test_a_map_of_the_version_before_has_no_anchors(tmp_path):
+    MapStore.create(tmp_path, "{}", Rig(), "x").close()
+    with sqlite3.connect(tmp_path / "map.db") as connection:
+        connection.execute("DROP TABLE anchors")
+        connection.execute("PRAGMA user_version = 1")
+    connection.close()
+    with MapStore.open(tmp_path) as store:
+        assert len(store.track().anchors) == 0

@@ -5,7 +5,7 @@ import pytest
 
 from hybridmap.errors import StoreError
 from hybridmap.geometry import between, compose, log
-from hybridmap.store import Track, trajectory_of
+from hybridmap.store import Track, anchors_on, trajectory_of
 from tests.store.sessions import SECOND, odometry_of, truth_at
 
 
@@ -73,3 +73,42 @@ def test_empty_track_and_unknown_node_are_refused():
     track, _, _ = make_track()
     with pytest.raises(StoreError, match="names node 10"):
         trajectory_of(track, np.zeros((3, 3)))
+
+
+def make_anchored(every: int = 10, skip: int = 3) -> tuple[Track, np.ndarray, np.ndarray]:
+    """A drive with a drop-out of the wheels between two nodes, and every third stamp measured on the true map."""
+    track, truth, at = make_track(every)
+    odometry = track.poses_odom.copy()
+    odometry[55:] = compose(compose(odometry[55], [0.2, 0.0, 0.3]), between(odometry[55], odometry[55:]))
+    deltas = between(odometry[at], odometry)
+    rows = np.arange(0, len(truth), skip)
+    nodes = track.nodes[rows]
+    anchors = anchors_on(truth[::every], track.stamps_ns[rows], nodes, between(truth[at[rows]], truth[rows]))
+    return Track(track.stamps_ns, track.nodes, deltas, odometry, anchors), truth, rows
+
+
+def test_anchors_are_met_exactly_and_hold_the_way_between_them():
+    track, truth, rows = make_anchored()
+    found = trajectory_of(track, truth[::10]).poses
+    np.testing.assert_allclose(log(between(truth[rows], found[rows])), 0.0, atol=1e-12)
+    without = trajectory_of(Track(track.stamps_ns, track.nodes, track.deltas, track.poses_odom), truth[::10]).poses
+    off, off_without = (np.abs(log(between(truth, poses)))[:, :2].mean() for poses in (found, without))
+    assert off < off_without / 3
+
+
+def test_anchors_follow_another_map_without_a_jump():
+    """A back-end that has every node elsewhere gets the shape of the way, not the map it was measured on."""
+    track, truth, _ = make_anchored()
+    bent = truth[::10] + np.column_stack([0.05 * np.arange(11) ** 2, np.zeros(11), 0.02 * np.arange(11)])
+    found = trajectory_of(track, bent).poses
+    np.testing.assert_allclose(found[::10], bent, atol=1e-9)
+    step = np.hypot(*between(found[:-1], found[1:])[:, :2].T)
+    way = np.hypot(*between(bent[:-1], bent[1:])[:, :2].T)[np.minimum(np.arange(len(step)) // 10, 9)]
+    assert np.all(step[:50] < 1.6 * way[:50] / 10)
+
+
+def test_anchors_at_stamps_that_the_track_does_not_have_are_left_out():
+    track, truth, _ = make_track()
+    anchors = anchors_on(truth[::10], np.array([5]), np.array([0]), np.array([[9.0, 9.0, 0.0]]))
+    with_anchor = Track(track.stamps_ns, track.nodes, track.deltas, track.poses_odom, anchors)
+    np.testing.assert_array_equal(trajectory_of(with_anchor, truth[::10]).poses, trajectory_of(track, truth[::10]).poses)
