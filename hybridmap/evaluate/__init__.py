@@ -1,6 +1,7 @@
 """Estimates against the truth: trajectories, verified relations, loop closures, whole sessions."""
 
 from hybridmap.evaluate.closures import ClosureErrors, ClosureLimits, closure_errors
+from hybridmap.evaluate.edges import EdgeErrors, edge_errors
 from hybridmap.evaluate.relations import RelationErrors, Relations, read_relations, relation_errors
 from hybridmap.evaluate.session import evaluate_session, session_trajectories
 from hybridmap.evaluate.trajectory import AbsoluteError, RelativeError, absolute_error, relative_error
@@ -9,11 +10,13 @@ __all__ = [
     "AbsoluteError",
     "ClosureErrors",
     "ClosureLimits",
+    "EdgeErrors",
     "RelationErrors",
     "Relations",
     "RelativeError",
     "absolute_error",
     "closure_errors",
+    "edge_errors",
     "evaluate_session",
     "read_relations",
     "relation_errors",

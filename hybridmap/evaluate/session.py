@@ -8,6 +8,7 @@ from pathlib import Path
 from hybridmap.errors import EvaluationError
 from hybridmap.evaluate.association import associate
 from hybridmap.evaluate.closures import ClosureErrors, closure_errors
+from hybridmap.evaluate.edges import EdgeErrors, edge_errors
 from hybridmap.evaluate.relations import ErrorStatistics, Relations, read_relations, relation_errors
 from hybridmap.evaluate.trajectory import absolute_error_of, drift_percent, relative_error_of
 from hybridmap.metrics import Metric
@@ -46,6 +47,7 @@ def evaluate_session(folder: Path, reference: Path | None = None, relations: Pat
     with MapStore.open(folder) as store:
         estimates = session_trajectories(session, store)
         closures = {} if truth is None else _judge_closures(store, truth)
+        edges = [] if truth is None else _judge_edges(store, truth)
     metrics: list[Metric] = []
     for name, trajectory in estimates.items():
         if truth is not None:
@@ -54,6 +56,7 @@ def evaluate_session(folder: Path, reference: Path | None = None, relations: Pat
             metrics += _against_relations(name, trajectory, verified)
     for name, errors in closures.items():
         metrics += _closure_metrics(name, errors)
+    metrics += edges
     session.merge_metrics(metrics)
     return metrics
 
@@ -88,6 +91,15 @@ def _judge_closures(store: MapStore, truth: Trajectory) -> dict[str, ClosureErro
         if name != ODOMETRY:
             judged[name] = closure_errors(experiences, truth, rejected=frozenset(solution.report.rejected_edge_ids))
     return judged
+
+
+def _judge_edges(store: MapStore, truth: Trajectory) -> list[Metric]:
+    solution = store.solutions().get(store.primary)
+    weights = {} if solution is None else solution.report.weights
+    metrics = []
+    for kind, errors in edge_errors(store.map(), truth, weights).items():
+        metrics += _edge_metrics(kind.name.lower(), errors)
+    return metrics
 
 
 def _names(estimate: str) -> tuple[str, str, str]:
@@ -163,3 +175,22 @@ def _closure_metrics(name: str, errors: ClosureErrors) -> list[Metric]:
             ("loop_rot_p95", errors.rot_p95_deg, "deg", "rotational error of right loop edges, 95 %"),
         ]
     return [Metric(f"{measure}/{name}", value, unit, text) for measure, value, unit, text in rows]
+
+
+def _edge_metrics(kind: str, errors: EdgeErrors) -> list[Metric]:
+    which = f"the {errors.count} {kind} edges"
+    rows = [
+        ("edge_trans_median", errors.trans_median_m, "m", f"translational error of {which}, median"),
+        ("edge_trans_p95", errors.trans_p95_m, "m", f"translational error of {which}, 95 %"),
+        ("edge_rot_median", errors.rot_median_deg, "deg", f"rotational error of {which}, median"),
+        ("edge_rot_p95", errors.rot_p95_deg, "deg", f"rotational error of {which}, 95 %"),
+        ("edge_chi2_ratio", errors.chi2_ratio, "1", f"normalised squared error of {which}, median, over the expected median"),
+        ("edges_wrong", errors.wrong_share, "1", f"share of {which} that are wrong by more than 1 m"),
+        (
+            "edges_wrong_kept",
+            float(errors.wrong_kept),
+            "1",
+            "of those, how many the primary back-end gave more than half weight",
+        ),
+    ]
+    return [Metric(f"{measure}/{kind}", value, unit, text) for measure, value, unit, text in rows]
