@@ -34,6 +34,7 @@ class PlaceAttractor:
         self._kernel = np.concatenate([gain[:, None] * np.cos(angle), gain[:, None] * np.sin(angle)]).astype(dtype)
         offset = np.arange(side)[:, None] - np.arange(side)
         self._circulant = np.stack([offset % side, offset % side + side])  # of both axes, in the two lines laid end to end
+        self._twice_round = np.arange(2 * side) % side
         self._silent = np.zeros((side, side), dtype=dtype)
         self._phasors = np.exp(1j * angle[1])
         self._remappings: dict[tuple[int, int], NDArray[np.int64]] = {}
@@ -49,12 +50,15 @@ class PlaceAttractor:
     def step(self, displacement_m: NDArray[np.float64]) -> None:
         """Move the bump by a displacement (2,) in the world, m, and let the cells compete once."""
         x, y = displacement_m.tolist()
-        (whole_x, self._residuals[0, 0]), (whole_y, self._residuals[1, 0]) = (split_shift(d / self.cell_m) for d in (x, y))
+        whole_x, self._residuals[0, 0] = split_shift(x / self.cell_m)
+        whole_y, self._residuals[1, 0] = split_shift(y / self.cell_m)
         phase = np.dot(self._residuals, self._wave)
         np.cos(phase, out=phase)
         lines = np.dot(phase, self._kernel)
-        if whole_x or whole_y:
-            lines = np.stack([np.roll(lines[0], whole_x), np.roll(lines[1], whole_y)])
+        if whole_x:
+            lines[0] = self._rolled(lines[0], whole_x)
+        if whole_y:
+            lines[1] = self._rolled(lines[1], whole_y)
         along_x, along_y = lines.take(self._circulant)
         spread = np.dot(np.dot(along_x, self.activity), along_y.T)
         np.maximum(spread, self._silent, out=spread)
@@ -62,6 +66,11 @@ class PlaceAttractor:
         spread *= spread
         spread *= 1.0 / total
         self.activity = spread
+
+    def _rolled(self, line: NDArray[np.floating], cells: int) -> NDArray[np.floating]:
+        """The line (N,) moved by whole cells round the sheet."""
+        first = -cells % self._side
+        return line.take(self._twice_round[first : first + self._side])
 
     def receive(self, place_input: NDArray[np.floating], share: float) -> None:
         """Mix the input (N * N,) of the place cells into the activity, as a share of its sum; no input changes nothing."""

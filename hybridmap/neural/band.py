@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -13,8 +13,7 @@ ORIENTATIONS_DEG = (0.0, 60.0, 120.0)
 SQUARE_ORIENTATIONS_DEG = (0.0, 45.0, 90.0)
 
 
-@dataclass(frozen=True, slots=True)
-class BandMotion:
+class BandMotion(NamedTuple):
     """What the band rings tell the grid sheets in a step, decoded from their rates before and after it.
 
     Attributes:
@@ -62,8 +61,17 @@ class BandRings:
         self._displacement = np.ones(3, dtype=dtype)
         preferred = 2.0 * np.pi * (np.arange(cells) / cells + 0.5)
         self._weights = np.stack([np.cos(preferred), np.sin(preferred)], axis=1).astype(dtype)
-        self._sharpness = -1.0 / (2.0 * (2.0 * np.pi * width) ** 2)
+        self._sharpness = self._weights.dtype.type(-1.0 / (2.0 * (2.0 * np.pi * width) ** 2))
+        self._cycles = self._weights.dtype.type(0.5 / np.pi)
+        self._shape = (*angles.shape, cells)
         self._complex = np.result_type(np.dtype(dtype), np.complex64)
+        rings = angles.shape
+        self._turn_pairs = np.empty(2 * angles.size, dtype=dtype)
+        self._turn_phasors = self._turn_pairs.view(self._complex).reshape(rings)
+        self._turned = np.empty(rings, dtype=self._complex)
+        self._turned_pairs = self._turned.view(dtype).reshape(-1, 2)
+        self._turned_real, self._turned_imag = self._turned.real, self._turned.imag
+        self._length = np.empty(rings, dtype=dtype)
         inside = 1.0 - 4.0 * float(np.finfo(self._weights.dtype).eps)  # keeps rounding out of arccos' way
         self._tuning = np.ascontiguousarray(self._weights.T) * self._weights.dtype.type(inside)
         self._decoded: tuple[NDArray[np.floating] | None, NDArray[np.complexfloating]] = (None, np.empty(0, self._complex))
@@ -75,8 +83,9 @@ class BandRings:
         if rates is self.activity:
             return known
         vector = np.dot(self.activity.reshape(-1, self._weights.shape[0]), self._weights)
-        z = vector.view(self._complex).reshape(self.activity.shape[:2])
-        z /= np.abs(z)
+        z = vector.view(self._complex).reshape(self._length.shape)
+        np.abs(z, out=self._length)
+        z /= self._length
         if not self.activity.flags.writeable:
             self._decoded = self.activity, z
         return np.asarray(z)
@@ -87,30 +96,32 @@ class BandRings:
 
     def rates_at(self, phases: NDArray[np.float64]) -> NDArray[np.floating]:
         """Return the stationary rates (M, 3, n) at given phases (M, 3), cycles."""
-        return self._rates(np.exp(2j * np.pi * phases).astype(self._complex))
+        return self._rates(np.exp(2j * np.pi * phases.reshape(-1, 1)).astype(self._complex).view(self._weights.dtype))
 
     def step(self, displacement_m: NDArray[np.float64]) -> BandMotion:
         """Move every ring by a displacement (2,) in the world, m; says what the rings tell the sheets."""
         before = self.phasors()
         self._displacement[:2] = displacement_m
-        turn = np.dot(self._displacement, self._turn)
-        np.cos(turn, out=turn)
-        self.activity = self._rates(before * turn.view(self._complex).reshape(before.shape))
+        np.dot(self._displacement, self._turn, out=self._turn_pairs)
+        np.cos(self._turn_pairs, out=self._turn_pairs)
+        np.multiply(before, self._turn_phasors, out=self._turned)
+        self.activity = self._rates(self._turned_pairs)
         after = self.phasors()
-        moved = after * before.conj()
-        advance = np.arctan2(moved.imag, moved.real)
-        advance *= 0.5 / np.pi
+        np.conjugate(before, out=self._turned)
+        self._turned *= after
+        advance = np.arctan2(self._turned_imag, self._turned_real)
+        advance *= self._cycles
         return BandMotion(advance, after)
 
-    def _rates(self, phasors: NDArray[np.complexfloating]) -> NDArray[np.floating]:
-        vector = phasors.reshape(-1, 1).view(self._weights.dtype)
-        offset = np.dot(vector, self._tuning)
+    def _rates(self, phasor_pairs: NDArray[np.floating]) -> NDArray[np.floating]:
+        """The stationary rates (M, 3, n) of rings at unit phasors (3 M, 2), as (real, imaginary); read-only."""
+        offset = np.dot(phasor_pairs, self._tuning)
         np.arccos(offset, out=offset)
         offset *= offset
         offset *= self._sharpness
         np.exp(offset, out=offset)
-        rates = offset.reshape(*phasors.shape, -1)
-        rates.flags.writeable = False
+        rates = offset.reshape(self._shape)
+        rates.setflags(write=False)
         return np.asarray(rates)
 
 

@@ -24,14 +24,15 @@ class HeadDirectionRing:
         self.preferred_rad: NDArray[np.float64] = preferred
         self._kernel = np.stack([np.cos(preferred), np.sin(preferred)]).astype(dtype)
         self._readout = (self._kernel * (2.0 / cells)).astype(dtype)
+        self._tuning = np.concatenate([self._kernel, np.ones_like(self._kernel[:1])])
+        self._vector = np.ones(3, dtype=dtype)
         self.activity: NDArray[np.floating] = 1.0 + self._kernel[0]
 
-    def direction(self, ahead_rad: float = 0.0) -> tuple[float, float]:
-        """Return (cos, sin) of the decoded heading, turned by `ahead_rad` (half of a turn about to be made: the mid-point)."""
-        c, s = (self._readout @ self.activity).tolist()
+    def direction(self) -> tuple[float, float]:
+        """Return (cos, sin) of the decoded heading."""
+        c, s = np.dot(self._readout, self.activity).tolist()
         norm = math.hypot(c, s)
-        cos, sin = math.cos(ahead_rad) / norm, math.sin(ahead_rad) / norm
-        return c * cos - s * sin, c * sin + s * cos
+        return c / norm, s / norm
 
     @property
     def heading_rad(self) -> float:
@@ -45,12 +46,21 @@ class HeadDirectionRing:
         x, y = (self._readout @ activity).tolist()
         return math.atan2(c * y - s * x, c * x + s * y)
 
-    def turn(self, angle_rad: float) -> None:
-        """Rotate the population vector by omega dt, rad, left positive."""
+    def turn(self, angle_rad: float) -> tuple[float, float]:
+        """Rotate the population vector by omega dt, rad, left positive.
+
+        Returns:
+            (cos, sin) of the mid-point heading, half of the turn ahead of where the ring stood.
+        """
+        c, s = self.direction()
         if angle_rad == 0.0:
-            return
-        vector = np.array(self.direction(angle_rad), dtype=self._kernel.dtype)
-        self.activity = 1.0 + vector @ self._kernel
+            return c, s
+        cos, sin = math.cos(0.5 * angle_rad), math.sin(0.5 * angle_rad)
+        middle_c, middle_s = c * cos - s * sin, c * sin + s * cos
+        self._vector[0] = middle_c * cos - middle_s * sin
+        self._vector[1] = middle_c * sin + middle_s * cos
+        self.activity = np.dot(self._vector, self._tuning)
+        return middle_c, middle_s
 
     def rates(self, turn_rate_rad_s: float = 0.0, modulation_s: float = 0.1) -> NDArray[np.floating]:
         """Return the rates (m,) with the turn-rate modulation of real cells, gain 1 + modulation |omega|; no state changes."""

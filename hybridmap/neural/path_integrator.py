@@ -87,11 +87,9 @@ class PathIntegrator:
         if dx == 0.0 and dy == 0.0 and dyaw == 0.0:
             return
         config = self.config
-        half_turn = 0.5 * (config.turn_gain * dyaw + config.heading_bias_rad_m * dx)
         cos, sin = math.cos(0.5 * dyaw), math.sin(0.5 * dyaw)
         forward, left = config.gain * (cos * dx + sin * dy), config.gain * (cos * dy - sin * dx)
-        c, s = self.head_direction.direction(half_turn)
-        self.head_direction.turn(2.0 * half_turn)
+        c, s = self.head_direction.turn(config.turn_gain * dyaw + config.heading_bias_rad_m * dx)
         if config.neuron_noise > 0.0:
             self._disturb()
         if dx != 0.0 or dy != 0.0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,16 +50,20 @@ class PlaceCells:
             self._recruit(drive)
             return self.respond(drive)
         active = np.flatnonzero(rates)
-        grown = self._weights[active] + np.float32(self.config.learning_rate) * rates[active, None] * drive
-        np.maximum(grown, 0.0, out=grown)
-        self._weights[active] = grown / np.linalg.norm(grown, axis=1, keepdims=True)
+        grown = self._weights[active]
+        grown += (np.float32(self.config.learning_rate) * rates[active])[:, None] * drive  # neither is negative
+        grown *= 1.0 / np.sqrt(np.einsum("ij,ij->i", grown, grown))[:, None]
+        self._weights[active] = grown
         return rates
 
     def respond(self, drive: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the rates (cells,) or (cells, P) to inputs (inputs,) or (inputs, P), as `inputs` gives them."""
         inhibition = np.float32(self.config.inhibition)
-        above = np.maximum(self.weights @ drive - inhibition, np.float32(0.0))
-        return np.asarray(above / (np.float32(1.0) - inhibition))
+        above = np.dot(self.weights, drive)
+        above -= inhibition
+        np.maximum(above, np.float32(0.0), out=above)
+        above *= np.float32(1.0) / (np.float32(1.0) - inhibition)
+        return np.asarray(above)
 
     def _recruit(self, drive: NDArray[np.float32]) -> None:
         if self._recruited == self.config.max_cells:
@@ -73,8 +78,11 @@ class PlaceCells:
     def inputs(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
         """Rates above the module's mean of the grid cells that project to place cells, (inputs,), of unit length."""
         sampled = sheets[:, :: self._stride, :: self._stride].reshape(len(sheets), -1).astype(np.float32)
-        above = np.maximum(sampled - sampled.mean(axis=1, keepdims=True), np.float32(0.0)) * self._module_weight
-        return np.asarray(above.reshape(-1) / np.linalg.norm(above))
+        sampled -= np.add.reduce(sampled, axis=1, keepdims=True) * np.float32(1.0 / sampled.shape[1])
+        np.maximum(sampled, np.float32(0.0), out=sampled)
+        sampled *= self._module_weight
+        sampled *= np.float32(1.0 / math.sqrt(float(np.vdot(sampled, sampled))))
+        return np.asarray(sampled.reshape(-1))
 
 
 class PlaceProjection:
