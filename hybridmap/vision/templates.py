@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.vision.profile import Profile
+from hybridmap.vision.search import Blocks, ProfileIndex
 
 Mode = Literal["literal", "ratio", "signed", "plain", "four-band"]
 GBar = Literal["templates", "shifts"]
@@ -17,6 +19,10 @@ Indices = NDArray[np.int64]
 
 MODERATE_THRESHOLD: dict[Mode, float] = {"literal": 1.0, "ratio": 0.4, "signed": -0.38, "plain": 0.28, "four-band": 0.33}
 """c_t of each mode where candidates are not verified and the configuration names none (z-normalised profiles)."""
+RELATIVE: tuple[Mode, ...] = ("literal", "ratio", "signed")
+"""Readings of G that compare with a mean."""
+FEWEST = 5
+"""The search gives at least so many, whatever was asked for; G, with a shift of its own for each band, ranks them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,16 +40,19 @@ class Match:
     shift: Indices
 
 
+_NOTHING = Match(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.int64))
+
+
 class ProfileStore:
-    """Profiles by number, with their differences to a query over all shifts. Grows by doubling."""
+    """Profiles by number, with their differences to a query over all shifts. Grows by blocks: nothing is ever copied."""
 
     def __init__(self, max_shift: int) -> None:
         self._shifts = np.arange(-max_shift, max_shift + 1)
-        self._profiles = np.zeros((0, 0, 0))
-        self._count = 0
+        self._shape = (0, 0)
+        self._rows = Blocks(0, np.float32)
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._rows)
 
     @property
     def shifts(self) -> Indices:
@@ -52,18 +61,15 @@ class ProfileStore:
 
     def add(self, profile: Profile) -> int:
         """Store a (bands, width) profile and return its number."""
-        bands, width = profile.shape
-        if self._count == self._profiles.shape[1]:
-            grown = np.zeros((bands, max(64, 2 * self._count), width))
-            grown[:, : self._count] = self._profiles if self._count else 0.0
-            self._profiles = grown
-        self._profiles[:, self._count] = profile
-        self._count += 1
-        return self._count - 1
+        if not len(self):
+            self._shape = (profile.shape[0], profile.shape[1])
+            self._rows = Blocks(profile.size, np.float32)
+        self._rows.append(profile.ravel())
+        return len(self) - 1
 
     def profile(self, number: int) -> Profile:
         """One stored profile, (bands, width) float32."""
-        return self._profiles[:, number].astype(np.float32)
+        return self._rows.take(np.array([number])).reshape(self._shape).astype(np.float32)
 
     def differences(self, query: Profile, indices: Indices | None = None) -> Floats:
         """g(c) of eq. 12 for each band: mean absolute difference over the overlap of query and stored profile.
@@ -75,8 +81,9 @@ class ProfileStore:
         Returns:
             (n, bands, S) for the shifts of `shifts`.
         """
-        stored = self._profiles[:, : self._count] if indices is None else self._profiles[:, indices]
-        return shifted_differences(np.asarray(query, dtype=np.float64), stored, self._shifts)
+        numbers = np.arange(len(self)) if indices is None else indices
+        stored = self._rows.take(numbers).reshape(len(numbers), *self._shape).transpose(1, 0, 2)
+        return shifted_differences(np.asarray(query, dtype=np.float64), stored.astype(np.float64), self._shifts)
 
 
 def shifted_differences(query: Floats, stored: Floats, shifts: Indices) -> Floats:
@@ -96,17 +103,30 @@ def shifted_differences(query: Floats, stored: Floats, shifts: Indices) -> Float
     from scipy.spatial.distance import cdist
 
     bands, width = query.shape
-    n = stored.shape[1]
-    source = np.arange(width)[None, :] + shifts[:, None]
-    inside = (source >= 0) & (source < width)
-    clipped = source.clip(0, width - 1)
-    magnitude = np.abs(stored)
-    out = np.empty((n, bands, len(shifts)))
+    table = _overlaps(width, tuple(shifts.tolist()))
+    margin = np.zeros((bands, width))
+    padded = np.concatenate([margin, query, margin], axis=1)[:, table.source]
+    out = np.abs(stored) @ table.outside
     for band in range(bands):
-        padded = np.where(inside, query[band][clipped], 0.0)
-        total = cdist(stored[band], padded, "cityblock")
-        out[:, band] = total - magnitude[band] @ (~inside).T
-    return np.asarray(np.maximum(out, 0.0) / (width - np.abs(shifts)))
+        np.subtract(cdist(stored[band], padded[band], "cityblock"), out[band], out=out[band])
+    out = np.maximum(out, 0.0) / table.overlap
+    return out.transpose(1, 0, 2)
+
+
+@dataclass(frozen=True, slots=True)
+class _Overlaps:
+    """Tables of a width and its shifts: columns of the padded query (S, width), what lies outside (width, S), overlaps (S,)."""
+
+    source: Indices
+    outside: Floats
+    overlap: Floats
+
+
+@lru_cache(maxsize=16)
+def _overlaps(width: int, shifts: tuple[int, ...]) -> _Overlaps:
+    source = np.arange(width)[None, :] + np.array(shifts)[:, None]
+    outside = (source < 0) | (source >= width)
+    return _Overlaps(source + width, outside.T.astype(np.float64), width - np.abs(np.array(shifts, dtype=np.float64)))
 
 
 def band_weights(bands: int, mu_r: float, mu_d: float) -> Floats:
@@ -154,26 +174,82 @@ def combine(
 
 
 class Matcher:
-    """A store of profiles with one way of scoring."""
+    """A store of profiles with one way of scoring.
 
-    def __init__(self, mode: Mode, mu_r: float, mu_d: float, max_shift: int, g_bar: GBar = "templates") -> None:
+    Args:
+        mode: the reading of G.
+        mu_r, mu_d: weights of intensity and depth.
+        max_shift: largest shift tried, columns.
+        g_bar: see `combine`.
+        sequence: views in a row that must match (SeqSLAM's idea: neighbours of a true match match too); 1: each by itself.
+    """
+
+    def __init__(
+        self, mode: Mode, mu_r: float, mu_d: float, max_shift: int, g_bar: GBar = "templates", sequence: int = 1
+    ) -> None:
         self.store = ProfileStore(max_shift)
+        self._max_shift = max_shift
+        self._index: ProfileIndex | None = None
         self._mode: Mode = mode
         self._mu = (mu_r, mu_d)
         self._g_bar: GBar = g_bar
+        self._sequence = sequence
 
     def add(self, profile: Profile) -> int:
         """Store a profile and return its number."""
+        if self._index is None:
+            weights = band_weights(len(profile), *self._mu)
+            self._index = ProfileIndex(weights, profile.shape[1], self._max_shift)
+        self._index.add(profile)
         return self.store.add(profile)
 
     def score(self, query: Profile, indices: Indices) -> Match:
         """Score a query against some of the stored profiles; g_bar is over all of them where the mode has one."""
         weights = band_weights(len(query), *self._mu)
-        needs_all = self._g_bar == "templates" and self._mode in ("literal", "ratio", "signed")
-        every = self.store.differences(query) if needs_all else None
+        every = self.store.differences(query) if self._mode in RELATIVE and self._g_bar == "templates" else None
         g = self.store.differences(query, indices) if every is None else every[indices]
         score, shift = combine(g, self.store.shifts, self._mode, weights, self._g_bar, every)
         return Match(np.asarray(indices, dtype=np.int64), score, shift)
+
+    def best(self, query: Profile, count: int, among: Indices | None = None, ending_at: int | None = None) -> Match:
+        """The best of the stored profiles, best first.
+
+        `plain` and `four-band`: an exact search over 8-bit profiles, and G of the nearest in full. The other readings need
+        every G for their mean, or for what lies far from it, and compute them all.
+
+        Args:
+            query: (bands, width).
+            count: how many at most.
+            among: which stored profiles, ascending; all by default.
+            ending_at: number under which the query itself is stored, for `sequence`; None: matched by itself.
+        """
+        numbers = np.arange(len(self.store)) if among is None else among
+        if self._index is None or count < 1 or len(numbers) == 0:
+            return _NOTHING
+        searched = max(count, FEWEST)
+        if self._mode not in RELATIVE and len(numbers) > searched:
+            numbers = np.sort(self._index.nearest(query, searched, among).numbers)
+        match = self.score(query, numbers)
+        if self._sequence > 1 and ending_at is not None:
+            match = Match(match.indices, self._in_sequence(match, ending_at), match.shift)
+        order = np.argsort(match.score, kind="stable")[:count]
+        return Match(match.indices[order], match.score[order], match.shift[order])
+
+    def _in_sequence(self, match: Match, ending_at: int) -> Floats:
+        """Mean of G over the views that end here, each with the best of three stored ones where its partner should be."""
+        total, views = match.score.copy(), np.ones(len(match.score))
+        for back in range(1, min(self._sequence, ending_at + 1)):
+            partners = match.indices[:, None] - back + np.arange(-1, 2)
+            known = (partners >= 0) & (partners < ending_at - back)
+            numbers = np.unique(partners[known])
+            if len(numbers) == 0:
+                break
+            scores = self.score(self.store.profile(ending_at - back), numbers).score
+            at = np.searchsorted(numbers, partners).clip(0, len(numbers) - 1)
+            of_partner = np.where(known, scores[at], np.inf).min(axis=1)
+            total += np.where(known.any(axis=1), of_partner, 0.0)
+            views += known.any(axis=1)
+        return np.asarray(total / views)
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,12 +281,10 @@ class ViewTemplates:
 
     def recognise(self, profile: Profile) -> Recognition:
         """Find the template of a profile, or found one; until a new view is stable it goes by the nearest template."""
-        count = len(self)
-        if count == 0:
+        if len(self) == 0:
             return Recognition(self._matcher.add(profile), True, float("inf"))
-        match = self._matcher.score(profile, np.arange(count))
-        best = int(np.argmin(match.score))
-        difference = float(match.score[best])
+        match = self._matcher.best(profile, 1)
+        best, difference = int(match.indices[0]), float(match.score[0])
         self._new_for = self._new_for + 1 if difference > self._threshold else 0
         if self._new_for < self._stable_frames:
             return Recognition(best, False, difference)

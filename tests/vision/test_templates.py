@@ -35,7 +35,7 @@ def test_differences_are_equation_12():
 
 def test_a_shifted_view_is_found_at_its_shift():
     rng = np.random.default_rng(2)
-    scene = smooth(rng, 1, 100)
+    scene = smooth(rng, 1, 100).astype(np.float32)
     store = ProfileStore(max_shift=16)
     store.add(scene[:, 20:84])
     query = scene[:, 13:77]  # things lie 7 columns farther right

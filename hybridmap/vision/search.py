@@ -1,0 +1,158 @@
+"""Nearest stored profiles by an exact search: weighted L1 distance of 8-bit profiles over shifts.
+
+One shift against every stored profile is one `cv2.batchDistance`: profiles lie column by column, so that the columns two
+views have in common at a shift are one run of bytes in every row. The few nearest of each shift hold the nearest of all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.vision.profile import Profile
+
+Indices = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
+
+BLOCK = 4096
+"""Rows of a block; a full block is followed by another one, nothing is ever copied or moved."""
+HALF_RANGE = 4.0
+"""Values beyond +- this are clipped: standard deviations of a z-normalised profile, means of a mean-normalised one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Nearest:
+    """Stored profiles, the nearest first; at equal distance the older first.
+
+    Attributes:
+        numbers: (k,) numbers of the profiles.
+        distance: (k,) weighted mean absolute difference over the overlap, at the shift where it is least.
+        shift: (k,) that shift, columns; positive when things lie farther right in the query.
+    """
+
+    numbers: Indices
+    distance: NDArray[np.float64]
+    shift: Indices
+
+
+class Blocks:
+    """Rows of one length, appended one by one; memory is taken a block at a time and never moved.
+
+    Args:
+        row_length: values of a row.
+        dtype: of the values.
+    """
+
+    def __init__(self, row_length: int, dtype: type[np.generic]) -> None:
+        self._row_length = row_length
+        self._dtype = dtype
+        self._blocks: list[NDArray[np.generic]] = []
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def append(self, row: NDArray[np.generic]) -> None:
+        """Copy a row (row_length,) to the end."""
+        block, at = divmod(self._count, BLOCK)
+        if block == len(self._blocks):
+            self._blocks.append(np.empty((BLOCK, self._row_length), dtype=self._dtype))
+        self._blocks[block][at] = row
+        self._count += 1
+
+    def filled(self) -> list[NDArray[np.generic]]:
+        """Views of the blocks (<= BLOCK, row_length), as far as they are filled, in order."""
+        full, rest = divmod(self._count, BLOCK)
+        return self._blocks[:full] + ([self._blocks[full][:rest]] if rest else [])
+
+    def take(self, numbers: Indices) -> NDArray[np.generic]:
+        """A copy of some rows, (n, row_length)."""
+        if len(self._blocks) == 1:
+            return self._blocks[0][numbers]
+        out = np.empty((len(numbers), self._row_length), dtype=self._dtype)
+        block, at = np.divmod(numbers, BLOCK)
+        for b in np.unique(block):
+            here = block == b
+            out[here] = self._blocks[b][at[here]]
+        return out
+
+
+class ProfileIndex:
+    """8-bit profiles and their search.
+
+    The weights of the bands lie in the quantisation: a unit of a band with half the weight has half as many steps, so
+    that plain sums of absolute differences are weighted ones. A band of no weight is not stored.
+
+    Args:
+        weights: (bands,) of the bands, summing to 1.
+        width: columns of a profile.
+        max_shift: largest shift tried, columns.
+    """
+
+    def __init__(self, weights: NDArray[np.float64], width: int, max_shift: int) -> None:
+        self._bands = np.flatnonzero(weights > 0)
+        self._width = width
+        self._steps = 127.0 / HALF_RANGE * (weights[self._bands] / weights.max())
+        self._unit = float(weights.max()) * HALF_RANGE / 127.0
+        self._rows = Blocks(width * len(self._bands), np.uint8)
+        self._shifts = np.arange(-max_shift, max_shift + 1)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, profile: Profile) -> int:
+        """Store a (bands, width) profile and return its number."""
+        self._rows.append(self.quantised(profile))
+        return len(self._rows) - 1
+
+    def quantised(self, profile: Profile) -> Bytes:
+        """The bytes of a profile, (width * bands,), column by column."""
+        steps = np.asarray(profile)[self._bands].T * self._steps
+        return np.asarray(np.clip(np.rint(steps) + 128.0, 1.0, 255.0).astype(np.uint8).ravel())
+
+    def nearest(self, query: Profile, count: int, among: Indices | None = None) -> Nearest:
+        """The nearest stored profiles at one shift common to all bands: exact for the 8-bit profiles.
+
+        A profile among the `count` nearest of all is among the `count` nearest at its own best shift, for whatever is
+        nearer there is nearer at all; so the `count` nearest of each shift suffice.
+
+        Args:
+            query: (bands, width).
+            count: how many at most.
+            among: which stored profiles, ascending; all by default.
+        """
+        if among is None:
+            blocks, firsts = self._rows.filled(), range(0, len(self._rows), BLOCK)
+        else:
+            blocks, firsts = ([self._rows.take(among)] if len(among) else []), range(1)
+        sought = self.quantised(query)[None]
+        found = [self._in_block(sought, block, first, count) for block, first in zip(blocks, firsts, strict=False)]
+        if not found:
+            nothing = np.zeros(0, dtype=np.int64)
+            return Nearest(nothing, np.zeros(0), nothing)
+        numbers, distance, shift = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        order = np.lexsort((numbers, distance))
+        _, first_of = np.unique(numbers[order], return_index=True)
+        best = order[np.sort(first_of)[:count]]
+        chosen = numbers[best] if among is None else among[numbers[best]]
+        return Nearest(chosen, distance[best] * self._unit, shift[best])
+
+    def _in_block(
+        self, sought: Bytes, block: NDArray[np.generic], first: int, count: int
+    ) -> tuple[Indices, NDArray[np.float64], Indices]:
+        """Numbers, mean absolute differences in steps, and shifts of the nearest of each shift."""
+        import cv2
+
+        most, bands, length = min(count, len(block)), len(self._bands), sought.shape[1]
+        sums, rows = np.empty((2, len(self._shifts), 1, most), dtype=np.int32)
+        for at, c in enumerate(self._shifts.tolist()):
+            skip, overlap = bands * abs(c), length - bands * abs(c)
+            if c >= 0:
+                ours, theirs = sought[:, skip:], block[:, :overlap]
+            else:
+                ours, theirs = sought[:, :overlap], block[:, skip:]
+            cv2.batchDistance(ours, theirs, cv2.CV_32S, sums[at], rows[at], cv2.NORM_L1, most)
+        distance = sums.reshape(-1, most) / (self._width - np.abs(self._shifts))[:, None]
+        return rows.ravel().astype(np.int64) + first, distance.ravel(), np.repeat(self._shifts, most)
