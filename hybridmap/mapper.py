@@ -20,6 +20,7 @@ from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.graph.uncertainty import relative_covariances
 from hybridmap.metrics import StageClock
 from hybridmap.neural.path_integrator import PathIntegrator
+from hybridmap.neural.reanchoring import Reanchoring
 from hybridmap.streams.base import LaserScan, RgbdFrame, Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.rig import rig_of
 from hybridmap.streams.synchronise import Ready, Synchroniser
@@ -78,6 +79,7 @@ class Mapper:
         self.clock = StageClock()
         self.map = ExperienceMap()
         self.integrator = PathIntegrator(config.neural)
+        self.cells = Reanchoring(self.integrator, config.neural.reanchor_weight)
         self.vision = create_front_end(config.vision, rig if rig is not None else rig_of(config.sensors), config.seed)
         self.backends = Ensemble(config.backends, self.clock)
         self.calibration = OnlineCalibration(config.calibration, Gains.of(config.neural))
@@ -144,7 +146,7 @@ class Mapper:
     def finish(self) -> list[Update]:
         """End of the drive: settle what waits, propose loops again on the optimised map, let every back-end finish."""
         updates = [self.step(ready) for ready in self._synchroniser.flush()]
-        pose_odom = self.integrator.pose
+        pose_odom = self.cells.pose_odom_robot
         while self.vision is not None and len(self.map):
             with self.clock.stage("matching"):
                 proposals = self.vision.finish(self.belief())
@@ -164,7 +166,7 @@ class Mapper:
     @property
     def pose_map_robot(self) -> Array:
         """(3,) where the robot is, by the primary back-end."""
-        return self._update(self.integrator.pose, "").pose_map_robot
+        return self._update(self.cells.pose_odom_robot, "").pose_map_robot
 
     @property
     def pose_map_odom(self) -> Array:
@@ -214,7 +216,7 @@ class Mapper:
         self.calibration.observe(ready.stamp_ns, ready.delta_robot)
         with self.clock.stage("neural"):
             self.integrator.step(ready.delta_robot, ready.dt_s)
-            pose_odom = self.integrator.pose
+            pose_odom = self.cells.pose_odom_robot
         self._stamp_ns, self._pose_odom_given = ready.stamp_ns, ready.pose_odom_robot
         travel_m, turn_rad = float(np.hypot(ready.delta_robot[0], ready.delta_robot[1])), abs(float(ready.delta_robot[2]))
         self._travel_m += travel_m
@@ -233,6 +235,7 @@ class Mapper:
         initial = compose(self.map.initial[self._at_node], moved) if len(self.map) else pose_odom
         node = self.map.add_node(Node(self._stamp_ns, pose_odom, code, template, self._travel_m), initial)
         self._novelty.remember(code)
+        self.cells.remember(node)
         return node
 
     def _join_to_chain(self, node: int) -> list[int]:
@@ -264,15 +267,20 @@ class Mapper:
             proposals = self.vision.close(node, self.belief())
         edges = self._enter(proposals)
         closed = [proposal for proposal in proposals if proposal.verdict is Verdict.ACCEPTED]
-        if closed and self.config.edges.hanging == "ratslam":
-            self._rehang(max(closed, key=lambda proposal: proposal.source))
+        if closed:
+            self._recalibrate(max(closed, key=lambda proposal: proposal.source))
         return edges
 
-    def _rehang(self, matched: Proposal) -> None:
-        """From now on the robot is at the matched node, which lies in `odom` where the match has it (OpenRatSLAM)."""
+    def _recalibrate(self, matched: Proposal) -> None:
+        """Bring the cells back to the matched node, which lies in `odom` where the match has it, and hang the robot on it.
+
+        Both as configured: `neural.reanchor_weight` (paper eq. 16) and `edges.hanging: ratslam` (OpenRatSLAM).
+        """
         assert matched.relative is not None
-        self._at_node = matched.target
-        self._pose_odom_at_node = compose(self.map.node(matched.source).pose_odom, matched.relative.delta)
+        pose_odom_matched = compose(self.map.node(matched.source).pose_odom, matched.relative.delta)
+        self.cells.recalibrate(matched.target, between(pose_odom_matched, self.cells.pose_odom_robot))
+        if self.config.edges.hanging == "ratslam":
+            self._at_node, self._pose_odom_at_node = matched.target, pose_odom_matched
 
     def _enter(self, proposals: list[Proposal]) -> list[int]:
         """Write proposals into the map; a later one with the same key replaces the edge of the earlier."""

@@ -87,6 +87,9 @@ class NeuralConfig(Section):
     """k_w, radians of path integration a radian of odometry."""
     heading_bias_rad_m: float = Field(default=0.0, ge=-1, le=1)
     """Radians added to the heading for each metre forward."""
+    reanchor_weight: float = Field(default=0.0, ge=0, le=1)
+    """At a loop closure, how far the cells are pulled to the activity stored at the matched node, moved by the measured
+    relative pose: 1 puts it back hard, less is a soft pull, 0 leaves them alone. `odom` stays continuous either way."""
     decode_box_m: float = Field(default=1.0, gt=0, le=5)
     """Half side of the box around the prior in which all modules together resolve the wrap, m."""
     place: PlaceConfig = PlaceConfig()

@@ -34,17 +34,20 @@ class HeadDirectionRing:
         norm = math.hypot(c, s)
         return c / norm, s / norm
 
+    def heading_of(self, activity: NDArray[np.floating]) -> float:
+        """Return the heading that an activity (m,) stands for, rad in [-pi, pi]."""
+        c, s = (self._readout @ activity).tolist()
+        return math.atan2(s, c)
+
+    def rates_at(self, heading_rad: float) -> NDArray[np.floating]:
+        """Return the activity (m,) that stands for a heading, rad."""
+        vector = np.array([math.cos(heading_rad), math.sin(heading_rad), 1.0])
+        return np.asarray(np.dot(vector.astype(self._tuning.dtype), self._tuning))
+
     @property
     def heading_rad(self) -> float:
         """Decoded heading, rad in [-pi, pi]."""
-        c, s = self.direction()
-        return math.atan2(s, c)
-
-    def angle_to(self, activity: NDArray[np.floating]) -> float:
-        """Return how far the ring would turn to reach another activity (m,), rad in [-pi, pi]."""
-        c, s = self.direction()
-        x, y = (self._readout @ activity).tolist()
-        return math.atan2(c * y - s * x, c * x + s * y)
+        return self.heading_of(self.activity)
 
     def turn(self, angle_rad: float) -> tuple[float, float]:
         """Rotate the population vector by omega dt, rad, left positive.

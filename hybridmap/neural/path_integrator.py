@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +21,9 @@ from hybridmap.neural.place import PlaceCells, PlaceProjection
 from hybridmap.neural.torus import LowModes, shift_sheets
 
 log = logging.getLogger(__name__)
+
+Snapshot = dict[str, NDArray[Any]]
+"""State of the cells by name, as `PathIntegrator.snapshot` gives it."""
 
 _LARGEST_STEP_M = 1000.0
 _PART_OF_WRAP = 0.1
@@ -149,7 +153,7 @@ class PathIntegrator:
         self.bands.activity = self.bands.rates_at(self.bands.phases() + shift)
         self.grid.activity = shift_sheets(self.grid.activity, shift[:, [0, 2]])
 
-    def snapshot(self) -> dict[str, NDArray[np.generic]]:
+    def snapshot(self) -> Snapshot:
         """Return what a node stores so that `restore` puts the network back where it is now (some 8 kB).
 
         Keys: `heading` (m,), `band_phases` (M, 3), `grid_phases` (M, 2), `attractor` (N, N), and `near_m` (2,): the
@@ -164,22 +168,31 @@ class PathIntegrator:
             "near_m": near.copy(),
         }
 
-    def restore(self, snapshot: dict[str, NDArray[np.generic]], weight: float = 1.0) -> None:
+    def restore(self, snapshot: Snapshot, weight: float = 1.0, delta_snapshot_robot: ArrayLike = (0.0, 0.0, 0.0)) -> None:
         """Put a stored activity back: re-anchoring (paper eq. 16, the visual recalibration).
 
         Args:
             snapshot: what `snapshot` gave.
             weight: 1 puts it back hard; less is a soft pull, by that share of the way: of the turn of the ring, and of the
                 shift of each band, sheet and the attractor, their wraps being taken from both decoded positions.
+            delta_snapshot_robot: (3,) pose of the robot seen from where the snapshot was taken, m and rad: the stored
+                activity is moved by it.
 
         Raises:
             ConfigError: the weight is not in 0..1.
         """
         if not 0.0 <= weight <= 1.0:
             raise ConfigError(f"re-anchoring: expected a weight from 0 to 1, found {weight}")
+        delta = np.asarray(delta_snapshot_robot, dtype=np.float64)
+        here = self._moved(snapshot, delta) if delta.any() else snapshot
         if weight < 1.0:
-            self._pull(snapshot, weight)
+            self._pull(here, weight)
             return
+        self._put_back(here)
+        if delta.any():
+            self.attractor.step(np.asarray(here["near_m"] - snapshot["near_m"], dtype=np.float64))
+
+    def _put_back(self, snapshot: Snapshot) -> None:
         dtype = self.grid.activity.dtype
         self.head_direction.activity = np.asarray(snapshot["heading"], dtype=dtype).copy()
         self.bands.activity = self.bands.rates_at(np.asarray(snapshot["band_phases"], dtype=np.float64))
@@ -188,12 +201,27 @@ class PathIntegrator:
         self.attractor.activity = np.asarray(snapshot["attractor"], dtype=dtype).copy()
         self._last_decoded_m = np.asarray(snapshot["near_m"], dtype=np.float64).copy()
 
-    def _pull(self, snapshot: dict[str, NDArray[np.generic]], weight: float) -> None:
+    def _moved(self, snapshot: Snapshot, delta: Array) -> Snapshot:
+        """The snapshot as if it had been taken at a pose (3,) seen from where it was; all but the place attractor."""
+        ring = self.head_direction
+        heading = ring.heading_of(snapshot["heading"])
+        way = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]]) @ delta[:2]
+        shift = self.bands.wave_vectors @ way
+        return {
+            "heading": ring.rates_at(heading + delta[2]),
+            "band_phases": np.asarray(snapshot["band_phases"], dtype=np.float64) + shift,
+            "grid_phases": np.asarray(snapshot["grid_phases"], dtype=np.float64) + shift[:, [0, 2]],
+            "attractor": snapshot["attractor"],
+            "near_m": np.asarray(snapshot["near_m"], dtype=np.float64) + way,
+        }
+
+    def _pull(self, snapshot: Snapshot, weight: float) -> None:
         here = self.decode().position_m
         way = np.asarray(snapshot["near_m"], dtype=np.float64) - here
         expected = self.bands.wave_vectors @ way
-        stored = np.asarray(snapshot["heading"], dtype=np.float64)
-        self.head_direction.turn(weight * self.head_direction.angle_to(stored))
+        ring = self.head_direction
+        turn = ring.heading_of(snapshot["heading"]) - ring.heading_rad
+        ring.turn(weight * math.remainder(turn, 2.0 * math.pi))
         bands, sheets = self.bands.phases(), self.grid.phases()
         band_way = _unwrapped(np.asarray(snapshot["band_phases"], dtype=np.float64) - bands, expected)
         sheet_way = _unwrapped(np.asarray(snapshot["grid_phases"], dtype=np.float64) - sheets, expected[:, [0, 2]])
