@@ -80,7 +80,7 @@ def edge_errors_on(
 
 
 def normalised_errors(edges: list[Edge], poses: Array) -> tuple[Array, Array]:
-    """Errors (E, 3) of measured edges, twists in the frame of the target, m and rad, and their squared Mahalanobis norms (E,)."""
+    """Errors (E, 3) of measured edges, twists in the target's frame, m and rad, and their squared Mahalanobis norms (E,)."""
     measured = [edge.relative for edge in edges if edge.relative is not None]
     ends = np.array([(e.source, e.target) for e in edges if e.relative is not None], dtype=np.int64).reshape(-1, 2)
     delta = np.array([m.delta for m in measured]).reshape(-1, 3)
