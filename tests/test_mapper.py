@@ -111,6 +111,24 @@ def test_rehanging_mode_hangs_the_next_node_on_the_matched_one():
     assert any(edge.target != edge.source + 1 for edge in edges)
 
 
+def test_reanchoring_brings_old_place_codes_back_and_leaves_odometry_alone():
+    """The wheels drift; at a closure the cells take up the matched node's activity, and `odom` goes on as it was."""
+    likeness, poses = {}, {}
+    for weight in (0.0, 1.0):
+        stream = RoomDrive(laps=4)
+        mapper = Mapper(Config.load("laser", {"neural.reanchor_weight": weight}), stream.rig)
+        drive(mapper, stream)
+        nodes = mapper.map.nodes
+        codes = np.array([node.place_code for node in nodes])
+        on_map, lap = mapper.poses()[:, :2], len(nodes) // 4
+        late = np.arange(3 * lap, len(nodes))
+        first = [int(np.argmin(np.linalg.norm(on_map[: lap + 2] - on_map[node], axis=1))) for node in late]
+        likeness[weight] = float(np.median(np.sum(codes[late] * codes[first], axis=1)))
+        poses[weight] = np.array([node.pose_odom for node in nodes])
+    assert likeness[1.0] > likeness[0.0] + 0.4
+    assert poses[1.0] == pytest.approx(poses[0.0], abs=5e-3)
+
+
 def test_nan_odometry_is_refused_with_its_stamp():
     stream = RoomDrive(laps=1, nan_at=7)
     mapper = Mapper(Config.load("laser"), stream.rig)
