@@ -1,0 +1,73 @@
+"""Re-anchoring: the cells go back to a stored activity, the pose in `odom` goes on."""
+
+from __future__ import annotations
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from hybridmap.config.neural import NeuralConfig
+from hybridmap.geometry import between, compose
+from hybridmap.neural import PathIntegrator
+from hybridmap.neural.reanchoring import Reanchoring
+
+SOFTPLUS = NeuralConfig(rectifier="softplus")
+DELTA = st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6), st.floats(-2.0, 2.0)).map(np.array)
+
+
+def away(integrator: PathIntegrator) -> None:
+    """Drive a few metres off, round a bend."""
+    for _ in range(40):
+        integrator.step((0.07, 0.0, 0.03), 0.1)
+
+
+@settings(max_examples=8, deadline=None)
+@given(delta=DELTA, weight=st.sampled_from([1.0, 1.0 - 1e-12]))
+def test_stored_activity_is_put_back_moved_by_the_measured_pose(delta, weight):
+    integrator = PathIntegrator(SOFTPLUS)
+    integrator.step((0.3, 0.1, 0.7), 0.1)
+    stored, stood = integrator.snapshot(), integrator.pose
+    away(integrator)
+    integrator.restore(stored, weight, delta)
+    assert between(compose(stood, delta), integrator.pose) == pytest.approx(np.zeros(3), abs=1e-4)
+    assert integrator.attractor.unwrapped_m(integrator.pose[:2]) == pytest.approx(integrator.pose[:2], abs=1e-3)
+    assert integrator.decode().agreed
+
+
+@pytest.mark.parametrize("weight", [1.0, 0.5])
+def test_odom_is_continuous_while_the_cells_jump(weight):
+    integrator = PathIntegrator(SOFTPLUS)
+    cells = Reanchoring(integrator, weight)
+    cells.remember(0)
+    away(integrator)
+    odom, of_cells = cells.pose_odom_robot, integrator.pose
+    cells.recalibrate(0, np.array([0.1, 0.0, 0.2]))
+    assert np.linalg.norm(integrator.pose[:2] - of_cells[:2]) > 0.5
+    assert cells.pose_odom_robot == pytest.approx(odom, abs=1e-9)
+    integrator.step((0.2, 0.0, 0.1), 0.1)
+    chord = np.array([0.2, 0.0, 0.1])
+    assert between(odom, cells.pose_odom_robot) == pytest.approx(chord, abs=1e-4)
+
+
+def test_a_known_place_has_its_old_code_again():
+    integrator = PathIntegrator(SOFTPLUS)
+    cells = Reanchoring(integrator, 1.0)
+    cells.remember(0)
+    code = integrator.place_code
+    away(integrator)
+    assert float(code @ integrator.place_code) < 0.1
+    cells.recalibrate(0, np.zeros(3))
+    _ = integrator.pose
+    assert float(code @ integrator.place_code) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_without_a_weight_nothing_happens():
+    integrator = PathIntegrator(SOFTPLUS)
+    cells = Reanchoring(integrator, 0.0)
+    cells.remember(0)
+    away(integrator)
+    before = integrator.pose
+    cells.recalibrate(0, np.zeros(3))
+    assert np.array_equal(integrator.pose, before)
+    assert np.array_equal(cells.pose_odom_robot, before)
