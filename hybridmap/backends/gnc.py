@@ -19,8 +19,8 @@ from hybridmap.backends.batch import run
 from hybridmap.backends.factors import NoiseModels, anchor, factor_graph, factors, poses_of, values
 from hybridmap.backends.following import Change, GraphBackend, Outcome, prefix
 from hybridmap.backends.initial import best_start, trusted_start
-from hybridmap.backends.objective import squared_norms, truncated_cost
-from hybridmap.backends.robust import WarmKernel, gate_of, with_kernel
+from hybridmap.backends.objective import gate_of, squared_norms, truncated_cost
+from hybridmap.backends.robust import WarmKernel, with_kernel
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.connectivity import extend

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from hybridmap.backends.base import Solution, SolveStatus
 from hybridmap.backends.factors import NoiseModels, anchor, factors, poses_of, values
 from hybridmap.backends.following import Change, GraphBackend, Outcome, difference, prefix
-from hybridmap.backends.robust import gate_of, judged, kernel_models
+from hybridmap.backends.objective import gate_of
+from hybridmap.backends.robust import judged, kernel_models
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.connectivity import extend

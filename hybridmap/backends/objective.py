@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.stats import chi2 as chi2_law
 
+from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array, between, compose, inverse, log
 from hybridmap.graph.pose_graph import PoseGraph
 
@@ -36,3 +38,8 @@ def truncated_cost(graph: PoseGraph, poses: Array, bound: float) -> float:
     """Chi2 with the squared residual of each loop cut off at a bound: what judges poses where loops may be false."""
     every = squared_norms(graph, poses)
     return float(np.where(graph.is_loop, np.minimum(every, bound), every).sum())
+
+
+def gate_of(config: BackendsConfig) -> float:
+    """Squared residual from which a loop is held for false: the configured quantile of chi2 with 3 degrees of freedom."""
+    return float(chi2_law.ppf(config.gnc.quantile, df=3))

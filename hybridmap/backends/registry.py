@@ -14,6 +14,7 @@ _TABLE = {
     "relaxation-paper": ("relaxation", "PaperRelaxation"),
     "relaxation-normalised": ("relaxation", "NormalisedRelaxation"),
     "relaxation-ratslam": ("ratslam", "RatslamRelaxation"),
+    "relaxation-robust": ("ratslam", "RobustRelaxation"),
     "gtsam-lm": ("batch", "BatchBackend"),
     "gtsam-gn": ("batch", "BatchBackend"),
     "gtsam-dogleg": ("batch", "BatchBackend"),

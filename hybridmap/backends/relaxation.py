@@ -7,6 +7,7 @@ Divided by the degree it is stable for every theta <= 1, as no eigenvalue of D^-
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +15,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import eigsh
 
-from hybridmap.backends.base import Solution, SolveStatus
-from hybridmap.backends.following import Change, GraphBackend, Outcome
+from hybridmap.backends.base import SolveStatus
+from hybridmap.backends.following import Outcome
+from hybridmap.backends.relaxing import RelaxationBackend
 from hybridmap.config.backends import RelaxationConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
@@ -90,23 +92,8 @@ def relax(rule: LinearRule, positions: Array, rate: float | Array, sweeps: int, 
     return positions, sweeps
 
 
-class _WorldFrameRelaxation(GraphBackend):
-    """Sweeps whenever the graph has grown; the state is the map, so the end of the drive goes on from it."""
-
-    def finish(self, graph: PoseGraph) -> Solution:
-        """See `Backend.finish`: the sweeps of one more update."""
-        return self.update(graph)
-
-    def _must_work(self, change: Change) -> bool:
-        del change
-        return True
-
-    def _follow(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
-        del change
-        return self._relax(graph, start, self._config.relaxation.sweeps_per_node)
-
-    def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
-        return self._relax(graph, start, self._config.relaxation.solve_sweeps)
+class _WorldFrameRelaxation(RelaxationBackend):
+    """Sweeps over positions alone; a subclass says at which rate."""
 
     def _relax(self, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
         config = self._config.relaxation
@@ -121,9 +108,9 @@ class _WorldFrameRelaxation(GraphBackend):
         status = SolveStatus.CONVERGED if done < sweeps else SolveStatus.MAX_ITERATIONS
         return Outcome(poses, status, f"{note}; {done} sweeps", done)
 
+    @abstractmethod
     def _rate(self, rule: LinearRule, config: RelaxationConfig) -> tuple[float | Array | None, str]:
         """The rate of each node, or None to refuse; and a word about it."""
-        raise NotImplementedError
 
 
 class NormalisedRelaxation(_WorldFrameRelaxation):

@@ -8,13 +8,12 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2 as chi2_law
 
 from hybridmap.backends.batch import WarmStart, run
 from hybridmap.backends.factors import NoiseModels, factor_graph
 from hybridmap.backends.following import Change, GraphBackend, Outcome
 from hybridmap.backends.initial import trusted_start
-from hybridmap.backends.objective import squared_norms
+from hybridmap.backends.objective import gate_of, squared_norms
 from hybridmap.config.backends import BackendsConfig, RobustConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
@@ -38,11 +37,6 @@ def judged(outcome: Outcome, kernel: Any, graph: PoseGraph, gate: float) -> Outc
     ids, squared = graph.edge_ids[loops], squared_norms(graph, outcome.poses)[loops]
     weights = {int(edge): float(kernel.weight(distance)) for edge, distance in zip(ids, np.sqrt(squared), strict=True)}
     return replace(outcome, weights=weights, rejected=tuple(ids[squared > gate].tolist()))
-
-
-def gate_of(config: BackendsConfig) -> float:
-    """Squared residual from which a loop is held for false: the configured quantile of chi2 with 3 degrees of freedom."""
-    return float(chi2_law.ppf(config.gnc.quantile, df=3))
 
 
 def with_kernel(name: str, graph: PoseGraph, start: Array, config: BackendsConfig) -> Outcome:

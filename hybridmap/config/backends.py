@@ -18,10 +18,16 @@ class RelaxationConfig(Section):
     """`relaxation-ratslam`: factor on theta after every sweep of one call; below 1 it removes the limit cycle."""
     sweeps_per_node: int = Field(default=20, ge=1)
     """Sweeps each time the graph has grown."""
-    solve_sweeps: int = Field(default=2000, ge=1)
+    solve_sweeps: int = Field(default=5000, ge=1)
     """Most sweeps when a whole graph is solved at once."""
     tolerance_m: float = Field(default=1e-6, ge=0)
     """A sweep that moves no node by more (m; 1 rad counts as 1 m) ends the relaxation."""
+    robust_scale_m: float = Field(default=0.3, gt=0)
+    """`relaxation-robust`: error of position at which a loop's correction is a quarter of the plain one (m)."""
+    robust_scale_rad: float = Field(default=0.1, gt=0)
+    """The same of heading (rad)."""
+    robust_start: float = Field(default=8.0, ge=1)
+    """Factor on both scales at the first sweep of a call, from which they shrink to themselves."""
     on_unstable: Literal["refuse", "normalise", "run"] = "run"
     """`relaxation-paper` where theta >= theta_max = 2/lambda_max: report `diverged` without a sweep, divide theta by each
     node's degree, or run it and report what happened. It never returns a worse map than it got."""
