@@ -31,10 +31,10 @@ class PlaceAttractor:
         quarter = np.full(len(wave), -0.5 * np.pi)  # the cosine of an angle less a quarter is its sine
         self._wave = np.stack([np.tile(wave, 2), np.concatenate([0.0 * wave, quarter])]).astype(dtype)
         self._residuals = np.ones((2, 2), dtype=dtype)
-        self._kernel = np.concatenate([gain[:, None] * np.cos(angle), gain[:, None] * np.sin(angle)]).astype(dtype)
-        offset = np.arange(side)[:, None] - np.arange(side)
-        self._circulant = np.stack([offset % side, offset % side + side])  # of both axes, in the two lines laid end to end
-        self._twice_round = np.arange(2 * side) % side
+        kernel = np.concatenate([gain[:, None] * np.cos(angle), gain[:, None] * np.sin(angle)])
+        self._kernel = np.ascontiguousarray(np.tile(kernel, 3)).astype(dtype)
+        self._lines = np.empty((2, 3 * side), dtype=dtype)
+        self._along_x, self._along_y = (_circulants(line, side) for line in self._lines)
         self._silent = np.zeros((side, side), dtype=dtype)
         self._phasors = np.exp(1j * angle[1])
         self._remappings: dict[tuple[int, int], NDArray[np.int64]] = {}
@@ -54,23 +54,16 @@ class PlaceAttractor:
         whole_y, self._residuals[1, 0] = split_shift(y / self.cell_m)
         phase = np.dot(self._residuals, self._wave)
         np.cos(phase, out=phase)
-        lines = np.dot(phase, self._kernel)
-        if whole_x:
-            lines[0] = self._rolled(lines[0], whole_x)
-        if whole_y:
-            lines[1] = self._rolled(lines[1], whole_y)
-        along_x, along_y = lines.take(self._circulant)
+        np.dot(phase, self._kernel, out=self._lines)
+        side = self._side
+        row, column = -whole_x % side, -whole_y % side
+        along_x, along_y = self._along_x[row : row + side], self._along_y[column : column + side]
         spread = np.dot(np.dot(along_x, self.activity), along_y.T)
         np.maximum(spread, self._silent, out=spread)
         total = float(np.vdot(spread, spread))
         spread *= spread
         spread *= 1.0 / total
         self.activity = spread
-
-    def _rolled(self, line: NDArray[np.floating], cells: int) -> NDArray[np.floating]:
-        """The line (N,) moved by whole cells round the sheet."""
-        first = -cells % self._side
-        return line.take(self._twice_round[first : first + self._side])
 
     def receive(self, place_input: NDArray[np.floating], share: float) -> None:
         """Mix the input (N * N,) of the place cells into the activity, as a share of its sum; no input changes nothing."""
@@ -122,3 +115,9 @@ class PlaceAttractor:
             drawn = np.arange(size) if tx == ty == 0 else np.random.default_rng(seed).permutation(size)
             self._remappings[tx, ty] = drawn.reshape(self._side, self._side)
         return self._remappings[tx, ty]
+
+
+def _circulants(line: NDArray[np.floating], side: int) -> NDArray[np.floating]:
+    """View (2 N, N) of a line that is laid end to end three times (3 N,): rows w to w + N are its circulant, moved by -w cells."""
+    stride = line.strides[0]
+    return np.lib.stride_tricks.as_strided(line[side:], shape=(2 * side, side), strides=(stride, -stride))
