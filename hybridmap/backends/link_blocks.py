@@ -62,9 +62,11 @@ class BlockSweeps:
 
     def run(self, poses: Planar, most: int, tolerance: float) -> Relaxed:
         """Sweep until nothing moves by more than `tolerance` (m or rad), at most so often."""
-        done = 0
+        done, block = 0, _BLOCK
         while done < most:
-            yaw, headings = self._turn(poses.yaw, min(_BLOCK, most - done))
+            asked = min(block, most - done)
+            yaw, headings = self._turn(poses.yaw, asked)
+            block = min(2 * block, _BLOCK) if len(headings) == asked else max(block // 2, 1)
             position = self._shift(poses.position, headings)
             moved = np.maximum(_largest_steps(position.view(np.float64)), _largest_steps(yaw))
             still = np.flatnonzero(moved <= tolerance)

@@ -15,6 +15,7 @@ _TABLE = {
     "relaxation-normalised": ("relaxation", "NormalisedRelaxation"),
     "relaxation-ratslam": ("ratslam", "RatslamRelaxation"),
     "relaxation-robust": ("ratslam", "RobustRelaxation"),
+    "relaxation-gtsam-lm": ("hybrid", "HybridRelaxation"),
     "gtsam-lm": ("batch", "BatchBackend"),
     "gtsam-gn": ("batch", "BatchBackend"),
     "gtsam-dogleg": ("batch", "BatchBackend"),

@@ -15,6 +15,7 @@ from hybridmap.backends.links import Links, Planar, link_levels
 from hybridmap.backends.relaxation import LinearRule, lambda_max, relax
 from hybridmap.config.backends import BackendsConfig, RelaxationConfig
 from hybridmap.geometry import align, transform_points, wrap_angle
+from hybridmap.graph.connectivity import chain
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import EdgeKind
 
@@ -167,7 +168,7 @@ def test_the_paper_s_theta_diverges_and_leaves_the_map_as_it_was():
 @pytest.mark.parametrize("make", [lambda: star(50), lambda: laps(np.random.default_rng(0), noise=40.0)[0]])
 def test_relaxation_never_gives_anything_but_finite_poses(name, make):
     graph = make()
-    assert np.isfinite(backends.create(name, configured(theta=1.0)).solve(graph).poses).all()
+    assert np.isfinite(backends.create(name, configured(theta=1.0, solve_sweeps=1000)).solve(graph).poses).all()
     for solution in backends.replay(backends.create(name, configured(theta=1.0)), graph):
         assert np.isfinite(solution.poses).all()
 
@@ -233,3 +234,27 @@ def test_the_paper_s_theta_diverges_on_intel_and_is_no_map(data_dir):
     solution = backends.create("relaxation-paper", configured(theta=0.5)).solve(graph)
     assert solution.report.status == "diverged"
     assert np.array_equal(solution.poses, graph.initial)
+
+
+def test_the_hybrid_relaxes_while_driving_and_optimises_at_the_end():
+    graph, _ = laps(np.random.default_rng(2), nodes=60, noise=3.0)
+    hybrid, plain = backends.create("relaxation-gtsam-lm"), backends.create("relaxation-ratslam")
+    *_, driven = backends.replay(hybrid, graph)
+    *_, relaxed = backends.replay(plain, graph)
+    assert np.array_equal(driven.poses, relaxed.poses)
+    best = backends.create("gtsam-lm").solve(graph).report.chi2
+    assert driven.report.chi2 > 1.05 * best
+    for final in (hybrid.finish(graph), hybrid.solve(graph)):
+        assert final.report.chi2 <= best * (1 + 1e-6)
+        assert final.report.status == "converged"
+
+
+@pytest.mark.data
+def test_relaxing_first_ends_no_worse_than_either_start_on_a_real_experience_map(data_dir):
+    graph = read_graph(data_dir / "ratslam_maps" / "paper_irat_complete.g2o")
+    hybrid = backends.create("relaxation-gtsam-lm").solve(graph).report
+    for start in (graph, chain(graph)):
+        from_start = backends.create("gtsam-dogleg").solve(start).report.chi2
+        assert hybrid.chi2 <= from_start * (1 + 1e-7)
+    assert hybrid.chi2 <= backends.create("gtsam-lm").solve(graph).report.chi2 * (1 + 1e-7)
+    assert hybrid.chi2 == pytest.approx(143.149, abs=1e-3)
