@@ -21,15 +21,25 @@ def evaluate(
     relations: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Verified relative poses, lines `t1 t2 dx dy dyaw` (s, m, rad).")
     ] = None,
+    loops: Annotated[
+        bool,
+        typer.Option("--loops", help="Also judge the candidates: how well the stored views tell places apart (needs a truth)."),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
 ) -> None:
-    """ATE, RPE (m, deg), drift (%), relation errors (m, deg), loop precision and recall; also put into metrics.json."""
+    """ATE, RPE (m, deg), drift (%), relation errors (m, deg), loop precision and recall; also put into metrics.json.
+
+    Loop precision: share of the accepted loop edges within 1 m and 15 deg of the truth. Recall: share of the nodes that come
+    within 1 m and 30 deg of one at least 10 s older, and have a right loop edge from a node at most 3 away.
+    """
     from hybridmap.cli.show import emit
     from hybridmap.evaluate import evaluate_session
+    from hybridmap.evaluate.loops import evaluate_loops
     from hybridmap.report import write_report
     from hybridmap.store import SessionFolder
 
-    metrics = evaluate_session(folder, reference, relations)
+    candidates = evaluate_loops(folder, reference) if loops else []
+    metrics = evaluate_session(folder, reference, relations) + candidates
     if SessionFolder(folder).report.is_file():
         write_report(SessionFolder(folder))
     emit(SessionFolder(folder).read_metrics().head, metrics, as_json=as_json, title=str(folder))

@@ -35,6 +35,8 @@ class MatchingConfig(Section):
     """What g_bar is: the mean of g_min over the stored templates, or the mean of g over the shifts of the pair."""
     c_t: float | None = Field(default=None)
     """Threshold: a match when G < c_t. None: no threshold where candidates are verified, else a moderate one for the mode."""
+    sequence: int = Field(default=1, ge=1, le=50)
+    """Nodes in a row whose views must match, on average; 1: each view by itself."""
 
 
 class TemplatesConfig(Section):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -231,25 +232,42 @@ class Matcher:
             numbers = np.sort(self._index.nearest(query, searched, among).numbers)
         match = self.score(query, numbers)
         if self._sequence > 1 and ending_at is not None:
-            match = Match(match.indices, self._in_sequence(match, ending_at), match.shift)
+            score = in_sequence(match.score, match.indices, ending_at, self._sequence, self._of_earlier(ending_at))
+            match = Match(match.indices, score, match.shift)
         order = np.argsort(match.score, kind="stable")[:count]
         return Match(match.indices[order], match.score[order], match.shift[order])
 
-    def _in_sequence(self, match: Match, ending_at: int) -> Floats:
-        """Mean of G over the views that end here, each with the best of three stored ones where its partner should be."""
-        total, views = match.score.copy(), np.ones(len(match.score))
-        for back in range(1, min(self._sequence, ending_at + 1)):
-            partners = match.indices[:, None] - back + np.arange(-1, 2)
-            known = (partners >= 0) & (partners < ending_at - back)
-            numbers = np.unique(partners[known])
-            if len(numbers) == 0:
-                break
-            scores = self.score(self.store.profile(ending_at - back), numbers).score
-            at = np.searchsorted(numbers, partners).clip(0, len(numbers) - 1)
-            of_partner = np.where(known, scores[at], np.inf).min(axis=1)
-            total += np.where(known.any(axis=1), of_partner, 0.0)
-            views += known.any(axis=1)
-        return np.asarray(total / views)
+    def _of_earlier(self, ending_at: int) -> Callable[[int, Indices], Floats]:
+        return lambda back, numbers: self.score(self.store.profile(ending_at - back), numbers).score
+
+
+def in_sequence(
+    scores: Floats, indices: Indices, ending_at: int, sequence: int, earlier: Callable[[int, Indices], Floats]
+) -> Floats:
+    """Mean score over the views that end at one, each with the best of three stored ones where its partner should be.
+
+    Args:
+        scores: (n,) of the last view.
+        indices: (n,) the stored profiles that it was compared with.
+        ending_at: number of the last view itself.
+        sequence: views in a row.
+        earlier: (how many views back, (m,) numbers, ascending) -> (m,) scores of that view against those.
+
+    Returns:
+        (n,); a view without a partner, at the beginning of the drive, does not count.
+    """
+    total, views = scores.copy(), np.ones(len(scores))
+    for back in range(1, min(sequence, ending_at + 1)):
+        partners = indices[:, None] - back + np.arange(-1, 2)
+        known = (partners >= 0) & (partners < ending_at - back)
+        numbers = np.unique(partners[known])
+        if len(numbers) == 0:
+            break
+        at = np.searchsorted(numbers, partners).clip(0, len(numbers) - 1)
+        of_partner = np.where(known, earlier(back, numbers)[at], np.inf).min(axis=1)
+        total += np.where(known.any(axis=1), of_partner, 0.0)
+        views += known.any(axis=1)
+    return np.asarray(total / views)
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,3 +33,26 @@ def test_bad_input_is_one_line_and_code_two(tmp_path):
         assert done.stdout == ""
         assert done.stderr.startswith("hybridmap: error: ")
         assert done.stderr.count("\n") == 1
+
+
+def test_loops_judges_the_candidates_too(tmp_path):
+    write_session(tmp_path / "s", ring_map())
+    done = run("evaluate", tmp_path / "s", "--loops", "--json")
+    assert done.returncode == 0, done.stderr
+    values = {row["name"]: row["value"] for row in json.loads(done.stdout)["metrics"]}
+    assert values["pair_auc/four-band"] == 0.5  # every view of this session is the same
+    assert values["loop_recall/graph"] == 1.0
+    assert {metric.name for metric in SessionFolder(tmp_path / "s").read_metrics().metrics} == set(values)
+
+
+def test_loops_needs_a_truth_and_views(tmp_path):
+    blind = write_session(tmp_path / "blind", ring_map(), keyframes=False)
+    done = run("evaluate", tmp_path / "blind", "--loops")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "hold no views" in done.stderr
+    blind.groundtruth.unlink()
+    (tmp_path / "relations").write_text("0.0 1.0 0.3 0.0 0.1\n")
+    done = run("evaluate", tmp_path / "blind", "--relations", tmp_path / "relations", "--loops")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "--reference" in done.stderr
+    assert blind.read_metrics().metrics == []

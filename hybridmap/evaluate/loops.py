@@ -1,0 +1,174 @@
+"""How well the views of a session tell its places apart: from the profiles that it stored, or made again from its keyframes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from hybridmap.config.vision import MatchingConfig, ProfileConfig
+from hybridmap.errors import EvaluationError
+from hybridmap.evaluate.candidates import (
+    CandidateErrors,
+    Reading,
+    all_readings,
+    candidate_errors,
+    judge_pairs,
+    score_matrix,
+)
+from hybridmap.metrics import Metric
+from hybridmap.store import MapStore, SessionFolder
+from hybridmap.streams.base import RgbdFrame
+from hybridmap.trajectory import Trajectory, read_tum
+from hybridmap.vision.profile import Profile, image_profile
+
+Progress = Callable[[int, int | None], None]
+
+
+@dataclass(frozen=True, slots=True)
+class ViewSettings:
+    """What of a session's configuration its profiles depend on."""
+
+    profile: ProfileConfig
+    matching: MatchingConfig
+    mode: str
+    max_width_px: int
+
+
+def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
+    """Judge the candidates of a session's own mode of matching, and put the figures into its `metrics.json`.
+
+    Args:
+        folder: the session folder.
+        reference: true trajectory in the TUM format; without it the session's own.
+
+    Returns:
+        `pair_auc/<mode>`, `candidate_top1/<mode>`, `candidate_ap/<mode>`, `candidate_recall_full_precision/<mode>`.
+
+    Raises:
+        StoreError: no session there.
+        StreamError: the reference is damaged.
+        EvaluationError: no truth, or no profiles.
+    """
+    truth = truth_of(folder, reference)
+    with MapStore.open(folder) as store:
+        settings = view_settings(store)
+        profiles, stamps = stored_profiles(store), node_stamps(store)
+    if not profiles:
+        raise EvaluationError(f"{folder}: its nodes hold no views: there are no candidates to judge")
+    mode = settings.mode if len(profiles[0]) > 1 else "plain"
+    matching = settings.matching
+    reading = Reading(
+        mode,  # type: ignore[arg-type]
+        matching.mu_r,
+        matching.mu_d,
+        min(matching.max_shift, profiles[0].shape[1] - 1),
+        matching.g_bar,
+        matching.sequence,
+    )
+    pairs = judge_pairs(stamps, truth)
+    errors = candidate_errors(score_matrix(profiles, pairs.queries, [reading])[0], pairs)
+    metrics = candidate_metrics(mode, errors)
+    SessionFolder(folder).merge_metrics(metrics)
+    return metrics
+
+
+def every_mode(
+    folder: Path, reference: Path | None = None, progress: Progress | None = None
+) -> Iterator[tuple[str, CandidateErrors]]:
+    """Judge every mode on the frames of an RGB-D session, with its own sizes of profiles and shifts.
+
+    Yields:
+        Name of the mode, and its figures.
+
+    Raises:
+        StoreError: no session there.
+        EvaluationError: no truth, or no frames.
+    """
+    truth = truth_of(folder, reference)
+    named = list(all_readings())
+    with MapStore.open(folder) as store:
+        settings, stamps = view_settings(store), node_stamps(store)
+        pairs = judge_pairs(stamps, truth)
+        for bands in (1, 4):
+            profiles = profiles_again(store, settings, bands, len(stamps), progress)
+            readings = [(name, reading) for name, of, reading in named if of == bands]
+            rows = score_matrix(profiles, pairs.queries, [reading for _, reading in readings])
+            for (name, _), row in zip(readings, rows, strict=True):
+                yield name, candidate_errors(row, pairs)
+
+
+def candidate_metrics(mode: str, errors: CandidateErrors) -> list[Metric]:
+    """The figures of one mode."""
+    views = f"of {errors.revisits} revisits among {errors.queries} views"
+    rows = [
+        ("pair_auc", errors.pair_auc, f"chance that a pair of one place scores better than another, {errors.pairs} pairs"),
+        ("candidate_top1", errors.top1, f"share whose best match of all older nodes is the same place, {views}"),
+        ("candidate_ap", errors.average_precision, f"average precision of the best matches, {views}"),
+        ("candidate_recall_full_precision", errors.recall_full_precision, f"recall without a false match, {views}"),
+    ]
+    return [Metric(f"{measure}/{mode}", value, "1", text) for measure, value, text in rows]
+
+
+def truth_of(folder: Path, reference: Path | None) -> Trajectory:
+    """The reference given, or the session's own.
+
+    Raises:
+        EvaluationError: there is neither.
+    """
+    session = SessionFolder(folder)
+    session.require()
+    if reference is None and not session.groundtruth.is_file():
+        raise EvaluationError(f"{folder}: no truth to judge candidates by; give --reference GT.tum")
+    return read_tum(reference or session.groundtruth)
+
+
+def view_settings(store: MapStore) -> ViewSettings:
+    """The settings that a session's profiles were made with; what an older session did not know has its default."""
+    tree: dict[str, Any] = (yaml.safe_load(store.config_yaml) or {}).get("vision") or {}
+    rgbd = tree.get("rgbd") or {}
+    return ViewSettings(
+        ProfileConfig.model_validate(tree.get("profile") or {}),
+        MatchingConfig.model_validate(tree.get("matching") or {}),
+        str(rgbd.get("matching", "four-band")),
+        int(rgbd.get("max_width_px", 320)),
+    )
+
+
+def node_stamps(store: MapStore) -> np.ndarray[Any, np.dtype[np.int64]]:
+    """(N,) stamps of the nodes, ns."""
+    return np.array([node.stamp_ns for node in store.map().nodes], dtype=np.int64)
+
+
+def stored_profiles(store: MapStore) -> list[Profile]:
+    """The profiles that a session stored, one a node; empty if it stored none."""
+    profiles = [store.keyframe(node).get("profile") for node in range(len(store.map()))]
+    return [profile for profile in profiles if profile is not None]
+
+
+def profiles_again(
+    store: MapStore, settings: ViewSettings, bands: int, count: int, progress: Progress | None = None
+) -> list[Profile]:
+    """Profiles with another number of row bands, from the stored frames.
+
+    Raises:
+        EvaluationError: a node holds no frame.
+    """
+    from hybridmap.vision.rgbd.keyframe import working_factor, working_image
+
+    camera = store.rig.camera
+    out = []
+    for node in range(count):
+        kept = store.keyframe(node)
+        if camera is None or "color" not in kept or "depth_mm" not in kept:
+            raise EvaluationError(f"{store.path}: node {node} holds no colour with depth; expected an RGB-D session")
+        frame = RgbdFrame(0, kept["color"], (kept["depth_mm"] / np.float32(1000.0)).astype(np.float32))
+        image = working_image(frame, working_factor(camera, settings.max_width_px))
+        out.append(image_profile(image.grey, image.depth_m, settings.profile.width, bands, settings.profile.normalise))
+        if progress is not None:
+            progress(node + 1, count)
+    return out

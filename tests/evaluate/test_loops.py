@@ -1,0 +1,80 @@
+"""Candidates of whole sessions: from stored profiles, and from profiles made again of the frames."""
+
+from __future__ import annotations
+
+import importlib
+
+import numpy as np
+import pytest
+
+from hybridmap.config import Config
+from hybridmap.errors import EvaluationError
+from hybridmap.evaluate.loops import evaluate_loops, every_mode, profiles_again, stored_profiles, view_settings
+from hybridmap.session import run
+from hybridmap.store import MapStore, SessionFolder
+from hybridmap.streams.simulated import SimulatedStream
+from tests.store import sessions
+from tests.store.sessions import ring_map, write_session
+
+SMALL = {
+    "simulation.duration_s": 16.0,
+    "simulation.camera.width_px": 96,
+    "simulation.camera.height_px": 72,
+    "simulation.camera.rate_hz": 2.0,
+    "backends.names": ["odometry"],
+}
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    config = Config.load("lab", SMALL)
+    return run(SimulatedStream(config.simulation, 1), config, tmp_path_factory.mktemp("lab") / "s").folder
+
+
+def ring_profile(node: int, _truth: np.ndarray) -> dict[str, np.ndarray]:
+    """A window of a panorama that turns by four columns a node, once round in a lap of 40 nodes, with noise."""
+    panorama = np.random.default_rng(0).normal(size=(4, 160))
+    noise = np.random.default_rng(1000 + node).normal(scale=0.3, size=(4, 64))
+    return {"profile": (np.roll(panorama, -4 * node, axis=1)[:, :64] + noise).astype(np.float32)}
+
+
+def test_stored_profiles_are_judged(tmp_path, monkeypatch):
+    monkeypatch.setattr(sessions, "keyframe_of", ring_profile)
+    write_session(tmp_path / "s", ring_map(1.9))
+    values = {metric.name: metric.value for metric in evaluate_loops(tmp_path / "s")}
+    assert values["pair_auc/four-band"] > 0.8
+    assert values["candidate_top1/four-band"] > 0.9
+    assert {metric.name for metric in SessionFolder(tmp_path / "s").read_metrics().metrics} == set(values)
+
+
+def test_profiles_made_again_are_those_that_the_session_stored(lab):
+    with MapStore.open(lab.path) as store:
+        stored = stored_profiles(store)
+        again = profiles_again(store, view_settings(store), 4, len(stored))
+    assert len(stored) > 8
+    assert np.array_equal(np.stack(stored), np.stack(again))
+
+
+def test_every_mode_is_judged(lab):
+    found = dict(every_mode(lab.path))
+    assert {"literal", "ratio", "signed", "plain", "plain, RGB", "plain, depth", "four-band"} < set(found)
+    assert {errors.queries for errors in found.values()} == {found["plain"].queries}
+    assert found["plain"].pairs > 0
+
+
+def test_a_session_without_frames_or_truth_is_refused(tmp_path):
+    session = write_session(tmp_path / "s", ring_map(), keyframes=False)
+    with pytest.raises(EvaluationError, match="no colour with depth"):
+        dict(every_mode(tmp_path / "s"))
+    session.groundtruth.unlink()
+    with pytest.raises(EvaluationError, match="--reference"):
+        evaluate_loops(tmp_path / "s")
+
+
+def test_the_tool_prints_a_line_a_mode(lab, monkeypatch, capsys):
+    monkeypatch.syspath_prepend("tools")
+    monkeypatch.setattr("sys.argv", ["loop_figures.py", str(lab.path)])
+    importlib.import_module("loop_figures").main()
+    said = capsys.readouterr().out.splitlines()
+    assert "revisits among" in said[0]
+    assert [line.split()[0] for line in said[2:4]] == ["literal", "ratio"]
