@@ -19,6 +19,8 @@ from hybridmap.vision.rgbd.pnp import Verification, Verifier
 from hybridmap.vision.templates import MODERATE_THRESHOLD, Matcher
 
 Indices = NDArray[np.int64]
+RANKED = 6
+"""Profiles ranked for each candidate that is verified: the best of one place lie next to each other."""
 SURE = 4.0
 """While driving, depth alone is trusted only where the map's own uncertainty is below this many `repropose_sigma`."""
 
@@ -58,7 +60,9 @@ class LoopCloser:
         self._verifier = verifier
         self._yaw_of_shift = yaw_of_shift
         self._new_key = new_key
-        self._matcher = Matcher(config.matching, matching.mu_r, matching.mu_d, matching.max_shift, matching.g_bar)
+        self._matcher = Matcher(
+            config.matching, matching.mu_r, matching.mu_d, matching.max_shift, matching.g_bar, matching.sequence
+        )
         unverified = config.verify == "none"
         self._c_t = matching.c_t if matching.c_t is not None or not unverified else MODERATE_THRESHOLD[config.matching]
         self._hypotheses: defaultdict[int, list[_Hypothesis]] = defaultdict(list)
@@ -119,10 +123,10 @@ class LoopCloser:
 
     def _ranked(self, node: int, gated: Indices) -> dict[int, dict[str, float]]:
         """The best candidates by profile, some nodes apart, with their scores."""
-        match = self._matcher.score(self._keyframes[node].profile, gated)
+        ranked = RANKED * self._closing.candidates
+        match = self._matcher.best(self._keyframes[node].profile, ranked, gated, ending_at=node)
         chosen: dict[int, dict[str, float]] = {}
-        for i in np.argsort(match.score, kind="stable"):
-            target = int(gated[i])
+        for i, target in enumerate(match.indices.tolist()):
             if self._c_t is not None and match.score[i] >= self._c_t:
                 break
             if all(abs(target - other) >= self._closing.separation for other in chosen):
