@@ -46,13 +46,25 @@ class RegistrationConfig(Section):
     keypoint_reach_m: float = Field(default=0.3, gt=0)
     """Matched keypoints farther apart than this at the first guess are no matches."""
     correlation: float = Field(default=30.0, ge=1)
-    """Neighbouring points err together: so many count as one in the covariance."""
-    translation_floor_m: float = Field(default=0.002, gt=0)
-    """Floor of the standard deviation of a consecutive edge, m."""
-    rotation_floor_deg: float = Field(default=0.06, gt=0)
-    """Floor of the standard deviation of a consecutive edge, degrees."""
+    """Where it is asked whether surfaces hold each other or slide, so many neighbouring points count as one."""
+    noise_factor: float = Field(default=10.0, ge=1)
+    """What the residuals' covariance is multiplied by, until closures of consecutive registrations have shown by how much."""
+    translation_floor_m: float = Field(default=0.0001, gt=0)
+    """Floor of the standard deviation of a consecutive edge of a mounted camera, m."""
+    rotation_floor_deg: float = Field(default=0.005, gt=0)
+    """Floor of the standard deviation of a consecutive edge of a mounted camera, degrees."""
+    held_translation_floor_m: float = Field(default=0.002, gt=0)
+    """The same for a camera whose tilt comes from the floor plane, m."""
+    held_rotation_floor_deg: float = Field(default=0.06, gt=0)
+    """The same for a camera whose tilt comes from the floor plane, degrees."""
     contradiction_sigma: float = Field(default=8.0, gt=0)
     """A good registration that differs from odometry by more than this many sigma contradicts it."""
+
+    def floors(self, held: bool) -> tuple[float, float]:
+        """Floors of a consecutive edge, m and degrees."""
+        if held:
+            return self.held_translation_floor_m, self.held_rotation_floor_deg
+        return self.translation_floor_m, self.rotation_floor_deg
 
 
 class PnpConfig(Section):
@@ -84,10 +96,20 @@ class PnpConfig(Section):
     """By depth alone: fewest matched points."""
     map_sigma_m: float = Field(default=0.05, gt=0)
     """By depth alone: largest standard deviation in the loosest direction, m."""
-    translation_floor_m: float = Field(default=0.01, gt=0)
-    """Floor of the standard deviation of a loop edge, m."""
-    rotation_floor_deg: float = Field(default=0.2, gt=0)
-    """Floor of the standard deviation of a loop edge, degrees."""
+    translation_floor_m: float = Field(default=0.0001, gt=0)
+    """Floor of the standard deviation of a loop edge of a mounted camera, m."""
+    rotation_floor_deg: float = Field(default=0.005, gt=0)
+    """Floor of the standard deviation of a loop edge of a mounted camera, degrees."""
+    held_translation_floor_m: float = Field(default=0.01, gt=0)
+    """The same for a camera whose tilt comes from the floor plane, m."""
+    held_rotation_floor_deg: float = Field(default=0.2, gt=0)
+    """The same for a camera whose tilt comes from the floor plane, degrees."""
+
+    def floors(self, held: bool) -> tuple[float, float]:
+        """Floors of a loop edge, m and degrees."""
+        if held:
+            return self.held_translation_floor_m, self.held_rotation_floor_deg
+        return self.translation_floor_m, self.rotation_floor_deg
 
 
 class RgbdClosingConfig(Section):

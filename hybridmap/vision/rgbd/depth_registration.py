@@ -19,6 +19,8 @@ from hybridmap.vision.rgbd.stance import LevelPair, Stance, level_pair
 
 PLANAR = np.array([0, 1, 5])
 OUT_OF_PLANE = np.array([2, 3, 4])
+LEAST_UNIT_VARIANCE = 0.1
+"""Residuals are never held for better than this share of the variance that the sensor's model gives."""
 LOOSE = 1.0 / np.array([0.3, 0.3, np.deg2rad(10.0)]) ** 2
 """Information (m^-2, m^-2, rad^-2) that every edge keeps, so that a corridor's long axis stays loose and not infinite."""
 
@@ -70,7 +72,10 @@ class Registration:
     Attributes:
         T_fixed_moving: (4, 4) between the bases as their stances had them.
         level: the same between levelled bases.
-        relative: planar part of it, with the covariance that the data alone give (the prior is taken out).
+        relative: planar part of it, with the covariance that the residuals alone give (the prior is taken out), each point
+            erring by itself; see `noise_level` for what it really is.
+        slack_m: standard deviation in the loosest direction if `correlation` points counted as one: says whether the surfaces
+            hold each other, whatever the noise.
         points: matched points.
         inliers: share of the points in common view that fit.
         residual_m: root mean square point-to-plane distance of the inliers.
@@ -81,6 +86,7 @@ class Registration:
     T_fixed_moving: Array
     level: LevelPair
     relative: RelativePose
+    slack_m: float
     points: int
     inliers: float
     residual_m: float
@@ -91,11 +97,14 @@ class Registration:
 
 @dataclass(frozen=True, slots=True)
 class _Pairing:
-    """Matched points at one iterate: indices of the fixed and moving points, residuals (m), and how many were in view."""
+    """Matched points at one iterate: indices, the moving ones' arms and normals along the fixed axes, residuals (m), and how
+    many were in view.
+    """
 
     fixed: NDArray[np.int64]
     moving: NDArray[np.int64]
     arm: Array
+    turned: Array
     residual: Array
     in_view: int
 
@@ -143,18 +152,17 @@ def _summarise(
     pairing = _pair(fixed, moving, T, config)
     if len(pairing.residual) < config.min_points:
         return None
-    variance = fixed.sigma_m[pairing.fixed] ** 2 + moving.sigma_m[pairing.moving] ** 2
-    unit = max(float(np.mean(pairing.residual**2 / variance)), 0.1)
-    H, _ = _normal_equations(fixed, moving, pairing, T, None, scale=unit * config.correlation)
-    if pairs is not None:
-        H_pairs, _ = _pair_terms(pairs, T)
-        H = H + H_pairs
+    H_depth = _information(fixed, moving, pairing)
+    H_pairs = np.zeros((6, 6)) if pairs is None else _pair_terms(pairs, T)[0]
     flat, level = to_floor(T), level_pair(T, fixed.stance, moving.stance)
     arm = moving.stance.T_base_camera[2, 3] * T[:3, 2]
+    covariance = _planar_covariance(H_depth + H_pairs, arm, level.delta[2], floor)
+    dulled = _planar_covariance(H_depth / config.correlation + H_pairs, arm, level.delta[2], floor)
     return Registration(
         T,
         level,
-        RelativePose(level.delta, _planar_covariance(H, arm, level.delta[2], floor)),
+        RelativePose(level.delta, covariance),
+        float(np.sqrt(np.linalg.eigvalsh(dulled[:2, :2])[-1])),
         len(pairing.residual),
         len(pairing.residual) / max(pairing.in_view, 1),
         float(np.sqrt(np.mean(pairing.residual**2))),
@@ -184,18 +192,38 @@ def _pair(fixed: Surface, moving: Surface, T: Array, config: RegistrationConfig)
     turned = moving.normals[m] @ T[:3, :3].T
     alike = np.einsum("ij,ij->i", turned, fixed.normals[f]) > np.cos(np.deg2rad(config.max_normal_deg))
     keep = (np.abs(residual) < reach) & alike & (np.einsum("ij,ij->i", offset, offset) < (2.0 * reach) ** 2)
-    return _Pairing(f[keep], m[keep], arm[m[keep]], residual[keep], len(m))
+    return _Pairing(f[keep], m[keep], arm[m[keep]], turned[keep], residual[keep], len(m))
+
+
+def _information(fixed: Surface, moving: Surface, pairing: _Pairing) -> Array:
+    """Information (6, 6) of the matched points, each with the variance that the residuals show.
+
+    Normals are noisy, and squared noise passes for information: a bare wall would seem to hold the slide along itself. The
+    product of either point's own normal has no such bias, since they err independently; what comes out below nothing is
+    nothing.
+    """
+    variance = fixed.sigma_m[pairing.fixed] ** 2 + moving.sigma_m[pairing.moving] ** 2
+    unit = max(float(np.mean(pairing.residual**2 / variance)), LEAST_UNIT_VARIANCE)
+    normal = fixed.normals[pairing.fixed]
+    J_fixed = np.concatenate([normal, cross(pairing.arm, normal)], axis=1)
+    J_moving = np.concatenate([pairing.turned, cross(pairing.arm, pairing.turned)], axis=1)
+    weighted = J_fixed / (unit * variance)[:, None]
+    both, biased = weighted.T @ J_moving, weighted.T @ J_fixed
+    root = np.linalg.cholesky(biased + 1e-9 * np.trace(biased) * np.eye(6))
+    share = np.linalg.solve(root, np.linalg.solve(root, 0.5 * (both + both.T)).T)
+    values, vectors = np.linalg.eigh(0.5 * (share + share.T))
+    base = root @ vectors
+    return np.asarray((base * np.maximum(values, 1e-4)) @ base.T)
 
 
 def _normal_equations(
-    fixed: Surface, moving: Surface, pairing: _Pairing, T: Array, pairs: PointPairs | None, scale: float | None = None
+    fixed: Surface, moving: Surface, pairing: _Pairing, T: Array, pairs: PointPairs | None
 ) -> tuple[Array, Array]:
-    """H (6, 6) and b (6,) of the data; with `scale` weights are not robust and information is divided by it."""
+    """H (6, 6) and b (6,) of the data, with Cauchy weights."""
     normal = fixed.normals[pairing.fixed]
     J = np.concatenate([normal, cross(pairing.arm, normal)], axis=1)
     variance = fixed.sigma_m[pairing.fixed] ** 2 + moving.sigma_m[pairing.moving] ** 2
-    dulled = variance + pairing.residual**2 / 4.0 if scale is None else variance * scale
-    weight = 1.0 / dulled
+    weight = 1.0 / (variance + pairing.residual**2 / 4.0)
     weighted = J * weight[:, None]
     H, b = weighted.T @ J, -weighted.T @ pairing.residual
     if pairs is not None:
@@ -249,9 +277,3 @@ def _planar_covariance(H: Array, arm: Array, yaw: float, floor: _FloorPrior) -> 
     axes = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
     turned = axes @ covariance @ axes.T
     return np.asarray(0.5 * (turned + turned.T))
-
-
-def with_floor(relative: RelativePose, translation_m: float, rotation_deg: float) -> RelativePose:
-    """The same measurement with a floor under its standard deviations: real edges err more than their Hessian says."""
-    floor = np.diag([translation_m**2, translation_m**2, np.deg2rad(rotation_deg) ** 2])
-    return RelativePose(relative.delta, relative.covariance + floor)

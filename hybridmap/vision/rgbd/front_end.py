@@ -25,6 +25,7 @@ from hybridmap.vision.rgbd.keyframe import (
     working_factor,
     working_image,
 )
+from hybridmap.vision.rgbd.noise_level import NoiseLevel
 from hybridmap.vision.rgbd.pnp import Verifier
 from hybridmap.vision.rgbd.posture import Posture
 from hybridmap.vision.rgbd.tracking import Tracker
@@ -55,8 +56,9 @@ class RgbdFrontEnd:
         self._keyframes: list[Keyframe] = []
         self._images: deque[tuple[int, RgbdFrame]] = deque(maxlen=rgbd.held_images)
         keys = itertools.count()
-        self._tracker = Tracker(self._keyframes, rgbd, self._camera, keys.__next__)
-        self._verifier = Verifier(self._camera, rgbd.pnp, rgbd.features, rgbd.registration, seed)
+        level = NoiseLevel(rgbd.registration.noise_factor)
+        self._tracker = Tracker(self._keyframes, rgbd, self._camera, level, keys.__next__)
+        self._verifier = Verifier(self._camera, rgbd.pnp, rgbd.features, rgbd.registration, level, seed)
         self._posture = Posture(rgbd.tilt, camera.T_base_camera, self._verifier.solver, rgbd.features.ratio)
         self._closer = LoopCloser(self._keyframes, matching, rgbd, self._verifier, self._yaw_of_shift, keys.__next__)
         self._frame: RgbdFrame | None = None

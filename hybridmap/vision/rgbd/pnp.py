@@ -11,13 +11,10 @@ from numpy.typing import NDArray
 from hybridmap.config.rgbd import FeaturesConfig, PnpConfig, RegistrationConfig
 from hybridmap.geometry import Array, RelativePose, between, wrap_angle
 from hybridmap.streams.base import Camera
-from hybridmap.vision.rgbd.depth_registration import (
-    Registration,
-    register,
-    with_floor,
-)
+from hybridmap.vision.rgbd.depth_registration import Registration, register
 from hybridmap.vision.rgbd.features import Correspondences, match
 from hybridmap.vision.rgbd.keyframe import Keyframe
+from hybridmap.vision.rgbd.noise_level import NoiseLevel
 from hybridmap.vision.rgbd.pairs import point_pairs
 from hybridmap.vision.rgbd.pnp_solver import PnpSolver
 from hybridmap.vision.rgbd.spatial import FloorPose, from_planar, inverse_rigid, to_floor
@@ -37,13 +34,20 @@ class Verifier:
     """Verifies pairs of keyframes of one camera."""
 
     def __init__(
-        self, camera: Camera, pnp: PnpConfig, features: FeaturesConfig, registration: RegistrationConfig, seed: int
+        self,
+        camera: Camera,
+        pnp: PnpConfig,
+        features: FeaturesConfig,
+        registration: RegistrationConfig,
+        level: NoiseLevel,
+        seed: int,
     ) -> None:
         self.solver = PnpSolver(camera, pnp, seed)
         self._focal_px = 0.5 * (camera.fx_px + camera.fy_px)
         self._pnp = pnp
         self._ratio = features.ratio
         self._registration = registration
+        self._level = level
 
     def verify(self, source: Keyframe, target: Keyframe) -> Verification:
         """Measure the target's pose in the source's frame, or say why not."""
@@ -78,15 +82,14 @@ class Verifier:
         fit = register(source.surface, target.surface, from_planar(guess.delta), guess, self._registration)
         if fit is None:
             return Verification(None, "too little depth in common view", {})
-        sigma_m = float(np.sqrt(np.linalg.eigvalsh(fit.relative.covariance[:2, :2])[-1]))
-        scores = {"depth_inliers": fit.inliers, "overlap": fit.overlap, "points": float(fit.points), "sigma_m": sigma_m}
+        scores = {"depth_inliers": fit.inliers, "overlap": fit.overlap, "points": float(fit.points), "slack_m": fit.slack_m}
         if fit.inliers < self._pnp.map_inliers:
             return Verification(None, f"only {fit.inliers:.0%} of the depth in common view fits", scores)
         if fit.overlap < self._pnp.map_overlap or fit.points < self._pnp.map_points:
             return Verification(None, f"only {fit.points} points of depth in common", scores)
-        if sigma_m > self._pnp.map_sigma_m:
-            return Verification(None, f"depth slides: {sigma_m:.2f} m along its loosest direction", scores)
-        return Verification(with_floor(fit.relative, *self._floors()), "depth agrees with the map", scores)
+        if fit.slack_m > self._pnp.map_sigma_m:
+            return Verification(None, f"depth slides: {fit.slack_m:.2f} m along its loosest direction", scores)
+        return Verification(self._calibrated(fit.relative, source, target), "depth agrees with the map", scores)
 
     def _implausible(self, flat: FloorPose, reverse: FloorPose, held: bool, scores: dict[str, float]) -> str | None:
         """Why the two poses cannot be right, or None."""
@@ -127,7 +130,7 @@ class Verifier:
             return Verification(None, "depth leads away from the features' pose", scores)
         if fit.inliers < self._registration.min_inliers:
             return Verification(None, f"only {fit.inliers:.0%} of the depth in common view fits", scores)
-        return Verification(with_floor(fit.relative, *self._floors()), "features and depth agree", scores)
+        return Verification(self._calibrated(fit.relative, source, target), "features and depth agree", scores)
 
     def _features_alone(self, flat: FloorPose, inliers: int, scores: dict[str, float]) -> Verification:
         """No depth to refine on or to object: many features must agree, and the edge is looser."""
@@ -135,10 +138,10 @@ class Verifier:
             return Verification(None, f"only {inliers} features, and too little depth in common view", scores)
         sigma = 0.1 * np.sqrt(self._pnp.min_inliers_alone / inliers)
         loose = RelativePose(flat.delta, np.diag([sigma, sigma, np.deg2rad(1.5)]) ** 2)
-        return Verification(with_floor(loose, *self._floors()), "features agree", scores)
+        return Verification(loose, "features agree", scores)
 
-    def _floors(self) -> tuple[float, float]:
-        return self._pnp.translation_floor_m, self._pnp.rotation_floor_deg
+    def _calibrated(self, relative: RelativePose, source: Keyframe, target: Keyframe) -> RelativePose:
+        return self._level.applied(relative, *self._pnp.floors(source.held or target.held))
 
 
 def _flat(T_source_target: Array, source: Keyframe, target: Keyframe) -> FloorPose:

@@ -12,15 +12,16 @@ from hybridmap.geometry import Array, RelativePose, between, compose, compose_re
 from hybridmap.streams.base import Camera
 from hybridmap.vision.base import Proposal, Verdict
 from hybridmap.vision.rgbd.depth_grid import place
-from hybridmap.vision.rgbd.depth_registration import PointPairs, Registration, register, with_floor
+from hybridmap.vision.rgbd.depth_registration import PointPairs, Registration, register
 from hybridmap.vision.rgbd.features import match
 from hybridmap.vision.rgbd.keyframe import Keyframe
+from hybridmap.vision.rgbd.noise_level import NoiseLevel
 from hybridmap.vision.rgbd.pairs import near, point_pairs
 from hybridmap.vision.rgbd.spatial import from_planar
 from hybridmap.vision.rgbd.stance import Stance
 
 SURE_INLIERS = 0.8
-SURE_SIGMA_M = 0.03
+SURE_SLACK_M = 0.03
 """A registration may overrule odometry only when it fits this well and is this sure in every direction."""
 STRAIGHTENED_RAD = float(np.deg2rad(0.4))
 STRAIGHTENED_M = 0.01
@@ -30,12 +31,16 @@ STRAIGHTENED_M = 0.01
 class Tracker:
     """Registers node k to nodes k-1, k-2, ...; keeps the odometry between consecutive nodes."""
 
-    def __init__(self, keyframes: list[Keyframe], config: RgbdConfig, camera: Camera, new_key: Callable[[], int]) -> None:
+    def __init__(
+        self, keyframes: list[Keyframe], config: RgbdConfig, camera: Camera, level: NoiseLevel, new_key: Callable[[], int]
+    ) -> None:
         self._keyframes = keyframes
         self._config = config.registration
         self._ratio = config.features.ratio
         self._focal_px = 0.5 * (camera.fx_px + camera.fy_px)
+        self._level = level
         self._new_key = new_key
+        self._measured: dict[tuple[int, int], RelativePose] = {}
         self._steps: list[RelativePose] = []
         self._refined: list[Array] = []
 
@@ -51,7 +56,16 @@ class Tracker:
         first = proposals[0]
         if first.verdict is Verdict.ACCEPTED and first.relative is not None:
             self._refined[-1] = first.relative.delta
+        self._learn(node)
         return proposals
+
+    def _learn(self, node: int) -> None:
+        """Let the noise level see how well the newest three registrations close."""
+        sides = [self._measured.get(side) for side in ((node - 2, node - 1), (node - 1, node), (node - 2, node))]
+        if sides[0] is not None and sides[1] is not None and sides[2] is not None:
+            self._level.observe(sides[0], sides[1], sides[2])
+        self._measured.pop((node - 2, node - 1), None)
+        self._measured.pop((node - 2, node), None)
 
     def _register_back(self, node: int, back: int) -> Proposal:
         prior = self._steps[-back]
@@ -64,8 +78,11 @@ class Tracker:
         pairs = self._pairs(fixed, moving, guess) if self._config.keypoints else None
         fit = register(fixed.surface, moving.surface, guess, prior, self._config, pairs)
         proposal = self._judge(node - back, node, fit, prior)
-        if back == 1 and fit is not None and proposal.verdict is Verdict.ACCEPTED:
-            self._keyframes[node] = _straightened(fixed, moving, fit)
+        if fit is not None and proposal.verdict is Verdict.ACCEPTED:
+            if back <= 2:
+                self._measured[node - back, node] = fit.relative
+            if back == 1:
+                self._keyframes[node] = _straightened(fixed, moving, fit)
         return proposal
 
     def _pairs(self, fixed: Keyframe, moving: Keyframe, guess: Array) -> PointPairs | None:
@@ -77,20 +94,20 @@ class Tracker:
         key = self._new_key()
         if fit is None:
             return Proposal(key, "registration", source, target, Verdict.REJECTED, "too little depth in common view")
-        relative = with_floor(fit.relative, self._config.translation_floor_m, self._config.rotation_floor_deg)
+        held = self._keyframes[source].held or self._keyframes[target].held
+        relative = self._level.applied(fit.relative, *self._config.floors(held))
         error = log(between(prior.delta, relative.delta))
         distance = float(np.sqrt(error @ np.linalg.solve(prior.covariance + relative.covariance, error)))
-        sigma_m = float(np.sqrt(np.linalg.eigvalsh(relative.covariance[:2, :2])[-1]))
         scores = {
             "points": float(fit.points),
             "inliers": fit.inliers,
             "residual_m": fit.residual_m,
             "overlap": fit.overlap,
-            "sigma_m": sigma_m,
+            "slack_m": fit.slack_m,
             "odometry_sigma": distance,
         }
         far = distance > self._config.contradiction_sigma
-        sure = fit.inliers > SURE_INLIERS and sigma_m < SURE_SIGMA_M
+        sure = fit.inliers > SURE_INLIERS and fit.slack_m < SURE_SLACK_M
         if fit.inliers < self._config.min_inliers:
             verdict, reason = Verdict.REJECTED, f"only {fit.inliers:.0%} of the depth in common view fits"
         elif far and not sure:

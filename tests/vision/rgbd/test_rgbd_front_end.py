@@ -147,7 +147,8 @@ def test_the_end_joins_by_depth_what_features_cannot(poses):
     """The second lap in other wallpaper: features see nothing, walls and the cupboard are the same."""
     papers = textures(1), textures(2)
     config = VisionConfig(rgbd=RgbdConfig(closing=RgbdClosingConfig(min_age_s=8.0)))
-    repapered = [render(VIEW, p, papers[i >= PER_LAP], i * 10**9) for i, p in enumerate(poses)]
+    rng = np.random.default_rng(5)
+    repapered = [render(VIEW, p, papers[i >= PER_LAP], i * 10**9, 0.002, rng) for i, p in enumerate(poses)]
     front_end, proposals, odometry = drive(config, poses, np.deg2rad(0.1), repapered)
     assert not any(p.verdict is Verdict.ACCEPTED for p in proposals.values() if p.kind == "loop")
     found = [

@@ -1,0 +1,51 @@
+"""What the RGB-D studies say about a drive."""
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybridmap.config import Config
+from hybridmap.graph.pose_graph import EdgeKind
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(autouse=True)
+def tools_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+
+
+@pytest.fixture(scope="module")
+def short_drive():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "tools"))
+        runs = importlib.import_module("mapping_runs")
+        config = Config.load("lab", {"simulation.duration_s": 5.0, "backends.names": ["gtsam-gnc"]})
+        return runs, runs.map_in_memory("lab", config)
+
+
+def test_a_drive_in_memory_has_its_track_its_costs_and_its_errors(short_drive):
+    runs, run = short_drive
+    assert run.frames == 26
+    assert len(run.track) == len(run.truth)
+    assert set(run.cpu_s) >= {"profile", "tracking", "matching", "neural", "backend/gtsam-gnc"}
+    assert run.ate_m("gtsam-gnc") < 0.1
+    edges = runs.edge_errors(run, EdgeKind.REGISTRATION)
+    assert len(edges.numbers) == len(edges.trans_m) == len(edges.rot_deg) == len(edges.chi2) > 5
+    assert 0 < np.median(edges.trans_m) < 0.02
+
+
+def test_figures_of_a_drive_are_held_against_their_bars(short_drive):
+    study = importlib.import_module("rgbd_study")
+    figures = study.figures_of(short_drive[1])
+    assert figures["false"] == 0
+    assert np.isnan(figures["recall"])  # it never comes back
+    assert figures["ms_frame"] == pytest.approx(sum(v for k, v in figures.items() if k.startswith("ms_") and k != "ms_frame"))
+    lines = study.table([("lab", 1, {**figures, "ate_gtsam-gnc": 0.03, "edge_p95_cm": 7.0, "chi2_loop": 0.4, "recall": 0.9})])
+    by_name = {line.split(" | ")[0].strip("| "): line for line in lines}
+    assert "0.03 ✗ | <= 0.02" in by_name["ate_gtsam-gnc"]
+    assert "7 | <= 8" in by_name["edge_p95_cm"]
+    assert "0.4 ✗" in by_name["chi2_loop"]
+    assert "0.9 | >= 0.85" in by_name["recall"]
