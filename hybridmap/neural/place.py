@@ -26,6 +26,8 @@ class PlaceCells:
         self.config = config
         self._stride = sheet_side // config.grid_inputs_side
         self._module_weight = np.sqrt(spacings_m / spacings_m.max()).astype(np.float32)[:, None]
+        inputs = config.grid_inputs_side**2
+        self._less_mean = np.eye(inputs, dtype=np.float32) - np.float32(1.0 / inputs)
         self._weights = np.zeros((256, len(spacings_m) * config.grid_inputs_side**2), dtype=np.float32)
         self._recruited = 0
 
@@ -49,11 +51,10 @@ class PlaceCells:
         if rates.size == 0 or float(rates.max()) < self.config.recruit_threshold:
             self._recruit(drive)
             return self.respond(drive)
-        active = np.flatnonzero(rates)
-        grown = self._weights[active]
-        grown += (np.float32(self.config.learning_rate) * rates[active])[:, None] * drive  # neither is negative
-        grown *= 1.0 / np.sqrt(np.einsum("ij,ij->i", grown, grown))[:, None]
-        self._weights[active] = grown
+        for cell in rates.nonzero()[0].tolist():
+            weights = self._weights[cell]
+            weights += np.float32(self.config.learning_rate * float(rates[cell])) * drive  # neither is negative
+            weights *= np.float32(1.0 / math.sqrt(float(np.dot(weights, weights))))
         return rates
 
     def respond(self, drive: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -78,11 +79,11 @@ class PlaceCells:
     def inputs(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
         """Rates above the module's mean of the grid cells that project to place cells, (inputs,), of unit length."""
         sampled = sheets[:, :: self._stride, :: self._stride].reshape(len(sheets), -1).astype(np.float32)
-        sampled -= np.add.reduce(sampled, axis=1, keepdims=True) * np.float32(1.0 / sampled.shape[1])
-        np.maximum(sampled, np.float32(0.0), out=sampled)
-        sampled *= self._module_weight
-        sampled *= np.float32(1.0 / math.sqrt(float(np.vdot(sampled, sampled))))
-        return np.asarray(sampled.reshape(-1))
+        above = np.dot(sampled, self._less_mean)
+        np.maximum(above, np.float32(0.0), out=above)
+        above *= self._module_weight
+        above *= np.float32(1.0 / math.sqrt(float(np.vdot(above, above))))
+        return np.asarray(above.reshape(-1))
 
 
 class PlaceProjection:
