@@ -6,7 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
+
 from hybridmap.backends.base import Backend, Solution, SolveStatus
+from hybridmap.backends.certificate import Certificate, certify
 from hybridmap.backends.objective import chi2
 from hybridmap.backends.registry import create
 from hybridmap.backends.replay import replay
@@ -26,11 +29,13 @@ class Row:
         backend: its name.
         solution: None where the back-end failed.
         failure: why; empty where it did not.
+        certificate: what could be proved about its solution on the edges that it kept; None where nobody asked.
     """
 
     backend: str
     solution: Solution | None
     failure: str = ""
+    certificate: Certificate | None = None
 
     @property
     def status(self) -> str:
@@ -49,6 +54,7 @@ def compare(
     config: BackendsConfig | None = None,
     *,
     incremental: bool = False,
+    certified: bool = False,
     progress: Progress | None = None,
 ) -> list[Row]:
     """Give one frozen graph to each back-end; one that fails is a row that says so.
@@ -58,6 +64,7 @@ def compare(
         names: back-ends, in the order of the rows.
         config: their settings.
         incremental: replay the graph node by node (as while driving) instead of solving it whole.
+        certified: try to prove each solution optimal (`backends.certificate`).
         progress: called with the units done and their total.
 
     Raises:
@@ -72,7 +79,8 @@ def compare(
         step = partial(_count, progress, before * steps, len(backends) * steps)
         try:
             solution = _replayed(backend, graph, step) if incremental else backend.solve(graph)
-            rows.append(Row(backend.name, solution))
+            proof = certify(graph, solution.poses, solution.report.rejected_edge_ids) if certified else None
+            rows.append(Row(backend.name, solution, certificate=proof))
         except BackendError as error:
             rows.append(Row(backend.name, None, str(error)))
         step(steps)
@@ -104,12 +112,15 @@ def metrics_of(rows: Sequence[Row]) -> list[Metric]:
         if row.solution is None:
             continue
         report = row.solution.report
-        figures = (
+        figures: tuple[tuple[str, float, str, str], ...] = (
             ("chi2_initial", report.chi2_initial, "1", "sum of squared Mahalanobis residuals before"),
             ("chi2", report.chi2, "1", "sum of squared Mahalanobis residuals after, over all edges"),
             ("iterations", float(report.iterations), "1", "iterations, sweeps or updates"),
             ("cpu_s", report.cpu_s, "s", "process time"),
             ("rejected_loops", float(len(report.rejected_edge_ids)), "1", "loop edges that the back-end holds for false"),
         )
+        if row.certificate is not None and np.isfinite(row.certificate.gap):
+            what = "relative gap of the isotropised objective to its lower bound, over the edges kept"
+            figures = (*figures, ("certificate_gap", row.certificate.gap, "1", what))
         metrics += [Metric(f"{measure}/{row.backend}", value, unit, text) for measure, value, unit, text in figures]
     return metrics

@@ -28,7 +28,8 @@ def compare(
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
-    """Compare back-ends on one frozen graph: chi2, status, iterations, CPU seconds, rejected loops, ATE (m) if truth is known.
+    """Compare back-ends on one frozen graph: chi2, status, iterations, CPU seconds, rejected loops, proof of
+    optimality, ATE (m) if truth is known.
 
     A back-end that fails is a row that says so.
     """
@@ -46,7 +47,7 @@ def compare(
     if out is not None and out.exists() and not out.is_dir():
         raise GraphError(f"{out}: is a file; --out names a folder")
     with progress(f"comparing on {source}") as advance:
-        rows = comparison.compare(opened.graph, names, settings, incremental=incremental, progress=advance)
+        rows = comparison.compare(opened.graph, names, settings, incremental=incremental, certified=True, progress=advance)
     ate = _ate(opened, rows)
     cells = _table(rows, ate)
     if out is not None:
@@ -61,6 +62,7 @@ def compare(
         "backends": names,
         "status": {row.backend: row.status for row in rows},
         "message": {row.backend: row.message for row in rows},
+        "certificate": {row.backend: row.certificate.message for row in rows if row.certificate is not None},
     }
     metrics = comparison.metrics_of(rows)
     metrics += [Metric(f"ate_rmse/{name}", value, "m", "RMSE of position after SE(2) alignment") for name, value in ate.items()]
@@ -89,15 +91,16 @@ def _ate(opened: GraphSource, rows: Sequence[Row]) -> dict[str, float]:
 def _table(rows: Sequence[Row], ate: dict[str, float]) -> list[list[str]]:
     """Column titles, then a line of text a row."""
     columns = ["back-end", "chi2 initial", "chi2", *(["ATE (m)"] if ate else []), "status", "iterations", "CPU (s)"]
-    table = [[*columns, "rejected loops"]]
+    table = [[*columns, "rejected loops", "certificate"]]
     for row in rows:
         if row.solution is None:
-            table.append([row.backend, "", "", *([""] if ate else []), row.status, "", "", ""])
+            table.append([row.backend, "", "", *([""] if ate else []), row.status, "", "", "", ""])
             continue
         report = row.solution.report
         error = [f"{ate[row.backend]:.3f}"] if ate else []
         figures = [f"{report.chi2_initial:.7g}", f"{report.chi2:.7g}", *error, row.status, str(report.iterations)]
-        table.append([row.backend, *figures, f"{report.cpu_s:.2f}", str(len(report.rejected_edge_ids))])
+        proof = row.certificate.word if row.certificate is not None else ""
+        table.append([row.backend, *figures, f"{report.cpu_s:.2f}", str(len(report.rejected_edge_ids)), proof])
     return table
 
 

@@ -19,11 +19,12 @@ def optimize(
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
-    """Optimise a graph: chi2 before and after, status, iterations, CPU seconds.
+    """Optimise a graph: chi2 before and after, status, iterations, CPU seconds, proof of optimality.
 
     Exit code 1, and no file, where the back-end failed or diverged.
     """
     from hybridmap.backends import SolveStatus, create
+    from hybridmap.backends.certificate import certify
     from hybridmap.backends.comparison import Row, metrics_of
     from hybridmap.cli.graphs import open_graph, settings_of
     from hybridmap.cli.show import emit
@@ -39,14 +40,21 @@ def optimize(
     solved = report.status not in (SolveStatus.FAILED, SolveStatus.DIVERGED)
     if out is not None and solved:
         write_g2o(out, source.graph, solution.poses)
+    proof = certify(source.graph, solution.poses, report.rejected_edge_ids)
     head = source.head | {
         "backend": backend,
         "status": str(report.status),
         "message": report.message,
+        "certificate": proof.message,
         "rejected_edge_ids": list(report.rejected_edge_ids),
     }
-    emit(head, metrics_of([Row(backend, solution)]), as_json=as_json, title=f"{graph}: {backend}: {report.status}")
+    emit(
+        head,
+        metrics_of([Row(backend, solution, certificate=proof)]),
+        as_json=as_json,
+        title=f"{graph}: {backend}: {report.status}",
+    )
     if not as_json:
-        typer.echo(report.message)
+        typer.echo(f"{report.message}\ncertificate: {proof.message}")
     if not solved:
         raise typer.Exit(1)

@@ -44,7 +44,8 @@ def test_json_has_a_figure_and_a_status_of_each_back_end(monkeypatch, capsys, sq
     told = json.loads(printed)
     figures = {row["name"]: row["value"] for row in told["metrics"]}
     assert told["backends"] == names
-    assert set(told["status"]) == set(names)
+    assert set(told["status"]) == set(told["certificate"]) == set(names)
+    assert figures["certificate_gap/gtsam-lm"] <= 1e-6
     for name in names:
         assert figures[f"chi2/{name}"] <= figures["chi2/odometry"] * (1 + 1e-9)
         assert figures[f"cpu_s/{name}"] >= 0

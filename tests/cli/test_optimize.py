@@ -44,6 +44,8 @@ def test_json_holds_the_figures_and_the_file_has_the_poses_they_are_of(monkeypat
     told = json.loads(printed)
     figures = {row["name"]: row["value"] for row in told["metrics"]}
     assert told["status"] == "converged"
+    assert told["certificate"].startswith("F = ")
+    assert figures["certificate_gap/gtsam-lm"] <= 1e-6
     assert (told["nodes"], told["edges"], told["loops"]) == (4, 4, 1)
     before, after = read_graph(square), read_graph(out)
     assert figures["chi2_initial/gtsam-lm"] == pytest.approx(chi2(before, before.initial))

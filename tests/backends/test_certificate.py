@@ -1,0 +1,107 @@
+"""The certificate proves what is optimal, and never what is not."""
+
+import time
+
+import numpy as np
+import pytest
+from graphs_for_tests import laps
+
+from hybridmap import backends
+from hybridmap.backends.certificate import certify, quadratic_form
+from hybridmap.backends.comparison import compare, metrics_of
+from hybridmap.backends.false_loops import inject
+from hybridmap.geometry import compose
+from hybridmap.graph.io import read_graph
+
+
+def stacked(poses):
+    return np.concatenate([poses[:, 0] + 1j * poses[:, 1], np.exp(1j * poses[:, 2])])
+
+
+def test_the_quadratic_form_is_the_sum_over_edges():
+    graph, _ = laps(np.random.default_rng(0), noise=3.0)
+    x = stacked(graph.initial)
+    total = 0.0
+    for s, t, (dx, dy, turn), information in zip(graph.sources, graph.targets, graph.deltas, graph.information, strict=True):
+        predicted = compose(graph.initial[s], [dx, dy, turn])
+        off = graph.initial[t] - predicted
+        tau = 2.0 / np.trace(np.linalg.inv(information[:2, :2]))
+        total += 2.0 * information[2, 2] * (2.0 - 2.0 * np.cos(off[2])) + tau * (off[0] ** 2 + off[1] ** 2)
+    assert np.vdot(x, quadratic_form(graph) @ x).real == pytest.approx(total, rel=1e-9)
+
+
+def test_least_squares_on_a_mild_graph_is_certified_from_any_frame():
+    graph, _ = laps(np.random.default_rng(1), noise=2.0)
+    poses = backends.create("gtsam-lm").solve(graph).poses
+    first = certify(graph, poses)
+    assert first.certified
+    assert first.gap < 1e-8
+    assert first.objective <= first.objective_given
+    moved = certify(graph, compose([3.0, -2.0, 1.0], poses))
+    assert moved.objective == pytest.approx(first.objective, rel=1e-9)
+
+
+def test_a_local_optimum_is_not_certified():
+    graph, _ = laps(np.random.default_rng(1), nodes=40, per_lap=20, noise=0.1)
+    wound = graph.initial.copy()
+    wound[:, 2] += np.linspace(0.0, 4.0 * np.pi, 40)  # a whole turn too many a lap
+    solution = backends.create("gtsam-gn").solve(graph)
+    assert certify(graph, solution.poses).certified
+    for start in (wound, np.random.default_rng(3).normal(size=wound.shape) * 3.0):
+        proof = certify(graph, start)
+        best = certify(graph, solution.poses).objective
+        assert not proof.certified or proof.objective <= best * (1.0 + 1e-6)
+
+
+def test_a_proved_gap_is_never_below_the_true_one():
+    graph, _ = laps(np.random.default_rng(1), nodes=60, noise=6.0)
+    best = certify(graph, backends.create("gtsam-lm").solve(graph).poses).objective
+    rng = np.random.default_rng(5)
+    for size in (0.01, 0.3, 1.0, 3.0):
+        proof = certify(graph, graph.initial + size * rng.normal(size=graph.initial.shape))
+        assert (proof.objective - best) / proof.objective <= proof.gap + 1e-9
+
+
+def test_edges_that_a_back_end_rejected_do_not_count():
+    graph, _ = laps(np.random.default_rng(0), nodes=90, per_lap=30)
+    false = inject(graph, 0.2, "random", np.random.default_rng(1))
+    solution = backends.create("gtsam-gnc").solve(false)
+    kept = certify(false, solution.poses, solution.report.rejected_edge_ids)
+    assert kept.certified
+    assert kept.objective < 0.01 * certify(false, solution.poses).objective_given
+
+
+def test_poses_that_are_none_are_not_certified():
+    graph, _ = laps(np.random.default_rng(0), nodes=20)
+    proof = certify(graph, np.full((20, 3), np.nan))
+    assert not proof.certified
+    assert proof.word == "not certified"
+
+
+def test_a_comparison_carries_the_proof():
+    graph, _ = laps(np.random.default_rng(0), nodes=40)
+    row, _ = compare(graph, ["gtsam-lm", "odometry"], certified=True)
+    assert row.certificate is not None
+    gaps = [m.value for m in metrics_of([row]) if m.name == "certificate_gap/gtsam-lm"]
+    assert gaps == [row.certificate.gap]
+    assert compare(graph, ["gtsam-lm"])[0].certificate is None
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("file", "objective"),
+    [
+        ("intel.g2o", 52.3482),
+        ("CSAIL.g2o", 31.7037),
+        ("manhattanOlson3500.g2o", 204.943),
+        pytest.param("city10000.g2o", 638.625, marks=pytest.mark.slow),
+    ],
+)
+def test_the_standard_graphs_are_certified_at_their_known_objective(data_dir, file, objective):
+    graph = read_graph(data_dir / "posegraphs" / file)
+    poses = backends.create("gtsam-lm").solve(graph).poses
+    started = time.process_time()
+    proof = certify(graph, poses)
+    assert time.process_time() - started < 2.0
+    assert proof.gap <= 1e-6
+    assert proof.objective == pytest.approx(objective, rel=1e-5)
