@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from hybridmap.streams.simulated import SimulatedStream
 
 Format = Literal["rosbag1", "mcap", "db3", "tum"]
+CARRIED_M = 20.0
 _FORMAT_OF_SUFFIX: dict[str, Format] = {".bag": "rosbag1", ".mcap": "mcap", ".db3": "db3"}
 
 
@@ -25,6 +26,9 @@ def simulate(
     config: Annotated[str | None, typer.Option(help="Configuration: a name or a file. Default: the world's own.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the sensors' errors.", min=0)] = None,
     duration: Annotated[float | None, typer.Option(help="Stop the drive after so many seconds.")] = None,
+    kidnap: Annotated[
+        bool, typer.Option("--kidnap", help="Carry the robot 20 m (simulation.carried_m) to a known place, unseen.")
+    ] = False,
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. simulation.sensors=laser.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a recording that is there.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
@@ -37,6 +41,8 @@ def simulate(
     _check_world(world)
     chosen = format_ or _FORMAT_OF_SUFFIX.get(out.suffix.lower(), "tum")
     overrides: dict[str, Any] = {"simulation.world": world, "simulation.duration_s": duration, "seed": seed}
+    if kidnap:
+        overrides["simulation.carried_m"] = CARRIED_M
     overrides = {key: value for key, value in overrides.items() if value is not None} | parse_settings(setting)
     resolved = Config.load(config or world, overrides)
     stream = SimulatedStream(resolved.simulation, resolved.seed)
@@ -75,4 +81,11 @@ def _figures(stream: SimulatedStream, written: dict[str, int]) -> list[Metric]:
         Metric("travel/simulation", float(travel(truth.poses)[-1]), "m", "way driven, of the ground truth"),
         Metric("ate_rmse/odometry", absolute_error(stream.odometry, truth).rmse_m, "m", "error of the wheels, SE(2)-aligned"),
     ]
+    if stream.carry is not None:
+        up_s, down_s = (float(truth.stamps_s[step] - truth.stamps_s[0]) for step in (stream.carry.first, stream.carry.last))
+        rows += [
+            Metric("carried/simulation", stream.carry.distance_m, "m", "how far the robot was carried, in a straight line"),
+            Metric("picked_up/simulation", up_s, "s", "when, after the start of the drive"),
+            Metric("put_down/simulation", down_s, "s", "when it was on the floor again"),
+        ]
     return rows + [Metric(f"written/{name.strip('/')}", float(count), "1", "written") for name, count in written.items()]

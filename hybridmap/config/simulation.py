@@ -97,6 +97,9 @@ class SimulationConfig(Section):
     """What the robot carries besides its wheels."""
     duration_s: float | None = Field(default=None, gt=0)
     """Stop the drive after so many seconds; nothing: drive to its end."""
+    carried_m: float | None = Field(default=None, gt=0)
+    """Pick the robot up in the middle of its drive and put it down unseen in a known place so far away, m; the wheels feel
+    nothing and there are no frames. Where the world is smaller: as far away as there is one. Nothing: never."""
     speed_m_s: float = Field(default=0.5, gt=0.05, le=2)
     """Cruising speed, m/s."""
     turn_rate_rad_s: float = Field(default=0.8, gt=0.05, le=3)

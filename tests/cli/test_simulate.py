@@ -93,3 +93,17 @@ def test_it_refuses_to_overwrite(run, tmp_path):
 def test_help_names_every_world(run):
     text = " ".join(run("simulate", "--help")[1].split())
     assert all(name in text for name in world_names())
+
+
+def test_kidnap_says_when_and_how_far(run, tmp_path):
+    small = ["--set", "simulation.camera.width_px=32", "--set", "simulation.camera.height_px=24"]
+    rare = ["--set", "simulation.camera.rate_hz=0.5"]
+    code, out, _ = run("simulate", "lab", "--kidnap", "--out", str(tmp_path / "t"), "--json", *rare, *small)
+    assert code == 0
+    values = {row["name"]: row["value"] for row in json.loads(out)["metrics"]}
+    assert values["carried/simulation"] > 5
+    assert values["picked_up/simulation"] < values["put_down/simulation"] < values["duration/simulation"]
+    code, out, err = run("simulate", "lab", "--kidnap", "--out", str(tmp_path / "short"), *SHORT)
+    assert (code, out) == (2, "")
+    assert "carried_m" in err
+    assert not (tmp_path / "short").exists()

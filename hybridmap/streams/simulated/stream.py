@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.simulation import SimulationConfig
+from hybridmap.errors import ConfigError
 from hybridmap.geometry import Array
 from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion, StreamReport
+from hybridmap.streams.simulated.carry import Carry, carry
 from hybridmap.streams.simulated.drive import DriveLimits, drive
 from hybridmap.streams.simulated.surfaces import World
 from hybridmap.streams.simulated.wheels import as_transmitted, wheel_odometry
@@ -40,18 +42,27 @@ class SimulatedStream:
             seed: of the sensors' errors.
 
         Raises:
-            ConfigError: there is no such world.
+            ConfigError: there is no such world, or no known place in it to carry the robot to.
         """
         self._config = config
         self._seed = seed
         self._world: World = build_world(config.world)
         self._report = StreamReport()
-        truth = drive(self._world.legs, DriveLimits(config.speed_m_s, config.turn_rate_rad_s), 1.0 / config.odometry_rate_hz)
-        odometry = wheel_odometry(truth, config.wheels, self._generators()[_WHEELS])
+        step_s = 1.0 / config.odometry_rate_hz
+        truth = felt = drive(self._world.legs, DriveLimits(config.speed_m_s, config.turn_rate_rad_s), step_s)
+        self._carry = None if config.carried_m is None else carry(truth, config.carried_m, step_s)
+        if self._carry is not None:
+            truth, felt = self._carry.truth, self._carry.felt
+        odometry = wheel_odometry(felt, config.wheels, self._generators()[_WHEELS])
         count = len(truth) if config.duration_s is None else max(3, int(config.duration_s * config.odometry_rate_hz) + 1)
         stamps = _stamps_ns(len(truth), config.odometry_rate_hz)[:count]
         self._truth = Trajectory(stamps, np.column_stack([truth[:, :2], as_transmitted(truth[:, 2])])[:count])
         self._odometry = Trajectory(stamps, odometry[:count])
+        if self._carry is not None and self._carry.last >= count:
+            raise ConfigError(
+                f"simulation.carried_m: the robot is put down again after {self._carry.last * step_s:.1f} s, "
+                f"but the drive ends after {config.duration_s:g} s; make simulation.duration_s longer"
+            )
 
     @property
     def name(self) -> str:
@@ -77,6 +88,11 @@ class SimulatedStream:
     def odometry(self) -> Trajectory:
         """What the wheels report: poses of `base_link` in `odom`."""
         return self._odometry
+
+    @property
+    def carry(self) -> Carry | None:
+        """When the robot is carried, and how far; None where it never is."""
+        return self._carry
 
     @property
     def expected_observations(self) -> int:
@@ -143,7 +159,11 @@ class SimulatedStream:
     def _stamps_of(self, rate_hz: float, *, wanted: bool) -> NDArray[np.int64]:
         span_s = float(self._truth.stamps_ns[-1] - _START_NS) / NS_PER_S
         stamps = _stamps_ns(int(span_s * rate_hz) + 2 if wanted else 0, rate_hz)
-        return np.asarray(stamps[stamps <= self._truth.stamps_ns[-1]])
+        stamps = np.asarray(stamps[stamps <= self._truth.stamps_ns[-1]])
+        if self._carry is None:
+            return stamps
+        up, down = self._truth.stamps_ns[self._carry.first], self._truth.stamps_ns[self._carry.last]
+        return np.asarray(stamps[(stamps <= up) | (stamps >= down)])
 
     def _generators(self) -> list[np.random.Generator]:
         return np.random.default_rng(self._seed).spawn(3)
