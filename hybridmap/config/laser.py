@@ -31,12 +31,10 @@ class RegistrationConfig(Section):
     """Most iterations of point-to-line registration."""
     inlier_m: float = Field(default=0.1, gt=0)
     """Largest point-to-line residual of an inlier, m."""
-    sigma_m: float = Field(default=0.03, gt=0)
+    sigma_m: float = Field(default=0.01, gt=0)
     """Standard deviation of a point's residual at least, m."""
     spurious: float = Field(default=0.04, ge=0, lt=1)
     """Share of the inliers whose information along any direction is not believed: normals err by some 10 degrees."""
-    correlation: float = Field(default=3.0, ge=1)
-    """Points that share one independent piece of information: neighbours on a wall err together."""
 
 
 class SearchConfig(Section):
@@ -75,9 +73,9 @@ class TrackingConfig(Section):
     """A good registration this far from the odometry drops the odometry edge, m."""
     contradiction_deg: float = Field(default=3.0, gt=0)
     """The same, degrees."""
-    floor_m: float = Field(default=0.008, gt=0)
-    """Standard deviation of a registration edge at least, m."""
-    floor_deg: float = Field(default=0.2, gt=0)
+    floor_m: float = Field(default=0.001, gt=0)
+    """Standard deviation of a node's place in the submap at least, m."""
+    floor_deg: float = Field(default=0.02, gt=0)
     """The same, degrees."""
 
 
@@ -96,6 +94,8 @@ class ProbeConfig(Section):
     """Points of a probe that score the starts."""
     gate_sigmas: float = Field(default=2.5, gt=0)
     """Width of the gate in standard deviations of the propagated covariance. It has no cap."""
+    gate_inflation: float = Field(default=4.0, ge=1)
+    """Factor on those: a chain bends more than the covariances of its edges, taken as independent, would have it."""
     gate_m: float = Field(default=2.5, ge=0)
     """Width of the gate beside that, m."""
     gate_deg: float = Field(default=4.0, ge=0)
@@ -114,13 +114,13 @@ class ProbeConfig(Section):
     """Least share of inliers among them."""
     violation_max: float = Field(default=0.15, ge=0, le=1)
     """Largest share of points of one submap in the free space of the other, either way."""
-    loosest_max_m: float = Field(default=0.3, gt=0)
+    loosest_max_m: float = Field(default=0.1, gt=0)
     """Largest standard deviation of the registration in any direction: a bare corridor is refused, m."""
     ambiguity_max: float = Field(default=0.9, gt=0, le=1)
     """Largest share of the likelihood that is left after a shift along the direction that the walls hold least."""
-    floor_m: float = Field(default=0.03, gt=0)
-    """Standard deviation of a loop edge at least, m."""
-    floor_deg: float = Field(default=0.4, gt=0)
+    floor_m: float = Field(default=0.005, gt=0)
+    """Standard deviation of the registration of two submaps at least, m: what their bending hides."""
+    floor_deg: float = Field(default=0.05, gt=0)
     """The same, degrees."""
 
 
@@ -166,9 +166,9 @@ class RevisitConfig(Section):
     """Half-width of the grid of starts, degrees."""
     ambiguous_m: float = Field(default=1.5, gt=0)
     """Standard deviation along a direction in which a registration is ambiguous, m."""
-    floor_m: float = Field(default=0.02, gt=0)
-    """Standard deviation of such an edge at least, m."""
-    floor_deg: float = Field(default=0.3, gt=0)
+    floor_m: float = Field(default=0.0025, gt=0)
+    """Standard deviation of such a registration at least, m."""
+    floor_deg: float = Field(default=0.03, gt=0)
     """The same, degrees."""
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
@@ -14,11 +16,28 @@ from hybridmap.graph.pose_graph import PoseGraph
 _MIN_WEIGHT = 1e-12  # csgraph takes an explicit zero for a missing edge
 
 
+@dataclass(frozen=True, slots=True)
+class _Links:
+    """Pairs of nodes that edges join, the lower number first.
+
+    Attributes:
+        low, high: (L,) nodes.
+        delta: (L, 3) pose of the high one in the frame of the low one.
+        covariance: (L, 3, 3) of that, in the frame of the high one.
+    """
+
+    low: NDArray[np.int64]
+    high: NDArray[np.int64]
+    delta: Array
+    covariance: Array
+
+
 def relative_covariances(graph: PoseGraph, node: int) -> Array:
     """Covariance of every node relative to `node`, right perturbation in each node's own frame.
 
-    Paths are shortest in the trace of the edges' position covariance; along a path the covariances of the edges, taken as
-    independent, are carried to the end by adjoints (as `geometry.compose_relative` does for two).
+    Edges that join the same two nodes count together: a registration that is loose along a corridor and the odometry beside
+    it, which knows no heading, hold each other. Paths are shortest in the trace of the position covariance; along a path
+    the covariances, taken as independent, are carried to the end by adjoints (as `geometry.compose_relative` does for two).
 
     Args:
         graph: the measurements.
@@ -33,11 +52,11 @@ def relative_covariances(graph: PoseGraph, node: int) -> Array:
     n = graph.n_nodes
     if not 0 <= node < n:
         raise GraphError(f"graph: node {node} does not exist, expected one of 0..{n - 1}")
-    covariance: Array = np.asarray(np.linalg.inv(graph.information))
-    parent, edge = _shortest_tree(graph, covariance[:, 0, 0] + covariance[:, 1, 1], node)
+    links = _links(graph)
+    parent, edge = _shortest_tree(links, n, node)
     child = np.flatnonzero(edge >= 0)
     delta, step = np.zeros((n, 3)), np.zeros((n, 3, 3))
-    delta[child], step[child] = _away_from_parent(graph, covariance, child, edge[child])
+    delta[child], step[child] = _away_from_parent(links, child, edge[child])
     pose, above = delta, parent.copy()
     while np.any(above != node):
         pose, above = compose(pose[above], pose), above[above]
@@ -53,16 +72,26 @@ def relative_covariances(graph: PoseGraph, node: int) -> Array:
     return np.asarray(out)
 
 
-def _shortest_tree(graph: PoseGraph, weight: Array, node: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Parent of each node (`node` for itself and for the unreached) and the edge to it (-1 for those)."""
-    n = graph.n_nodes
-    low = np.minimum(graph.sources, graph.targets)
-    high = np.maximum(graph.sources, graph.targets)
-    order = np.lexsort((weight, high, low))
-    first = np.ones(len(order), dtype=bool)
-    first[1:] = (low[order][1:] != low[order][:-1]) | (high[order][1:] != high[order][:-1])
-    best = order[first]
-    matrix = csr_array((np.maximum(weight[best], _MIN_WEIGHT), (low[best], high[best])), shape=(n, n))
+def _links(graph: PoseGraph) -> _Links:
+    """All edges from the lower to the higher node, those of one pair fused: their information adds up."""
+    turned = graph.sources > graph.targets
+    delta, information = graph.deltas.copy(), graph.information.copy()
+    delta[turned] = inverse(graph.deltas[turned])
+    back = adjoint(delta[turned])
+    information[turned] = back.transpose(0, 2, 1) @ information[turned] @ back
+    key = np.minimum(graph.sources, graph.targets) * graph.n_nodes + np.maximum(graph.sources, graph.targets)
+    order = np.lexsort((-information[:, 0, 0] - information[:, 1, 1], key))
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    total = np.add.reduceat(information[order], first, axis=0) if len(first) else information
+    pairs = key[order[first]]
+    covariance: Array = np.asarray(np.linalg.inv(total))
+    return _Links(pairs // graph.n_nodes, pairs % graph.n_nodes, delta[order[first]], covariance)
+
+
+def _shortest_tree(links: _Links, n: int, node: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Parent of each node (`node` for itself and for the unreached) and the link to it (-1 for those)."""
+    weight = np.maximum(links.covariance[:, 0, 0] + links.covariance[:, 1, 1], _MIN_WEIGHT)
+    matrix = csr_array((weight, (links.low, links.high)), shape=(n, n))
     _, found = dijkstra(matrix, directed=False, indices=np.array([node]), return_predecessors=True)
     predecessor = found[0]
     reached = predecessor >= 0
@@ -70,17 +99,15 @@ def _shortest_tree(graph: PoseGraph, weight: Array, node: int) -> tuple[NDArray[
     edge = np.full(n, -1, dtype=np.int64)
     child = np.flatnonzero(reached)
     key = np.minimum(child, parent[child]) * n + np.maximum(child, parent[child])
-    edge[child] = best[np.searchsorted(low[best] * n + high[best], key)]
+    edge[child] = np.searchsorted(links.low * n + links.high, key)
     return parent, edge
 
 
-def _away_from_parent(
-    graph: PoseGraph, covariance: Array, child: NDArray[np.int64], edge: NDArray[np.int64]
-) -> tuple[Array, Array]:
-    """Pose and covariance of each child in its parent's frame; edges that lead the other way are turned round."""
-    delta, cov = graph.deltas[edge].copy(), covariance[edge]
-    turned = graph.sources[edge] == child
+def _away_from_parent(links: _Links, child: NDArray[np.int64], edge: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Pose and covariance of each child in its parent's frame; links that lead the other way are turned round."""
+    delta, covariance = links.delta[edge].copy(), links.covariance[edge]
+    turned = links.low[edge] == child
     carry = adjoint(delta[turned])
-    cov[turned] = carry @ cov[turned] @ carry.transpose(0, 2, 1)
+    covariance[turned] = carry @ covariance[turned] @ carry.transpose(0, 2, 1)
     delta[turned] = inverse(delta[turned])
-    return delta, cov
+    return delta, covariance

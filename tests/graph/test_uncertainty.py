@@ -40,12 +40,31 @@ def test_a_chain_is_the_chain_of_its_edges_in_both_directions():
 
 
 def test_the_surer_of_two_ways_counts():
-    graph = graph_of([(0, 1), (1, 2), (2, 3), (0, 3), (0, 3)], np.random.default_rng(1), 4)
+    graph = graph_of([(0, 1), (1, 2), (2, 3), (0, 3)], np.random.default_rng(1), 4)
     information = graph.information.copy()
-    information[4] *= 1e4
+    information[3] *= 1e4
     sure = PoseGraph(graph.initial, graph.sources, graph.targets, graph.deltas, information, graph.kinds, graph.edge_ids)
-    assert np.allclose(relative_covariances(sure, 0)[3], edge(sure, 4).covariance)
-    assert np.allclose(relative_covariances(sure, 3)[0], edge(sure, 4, turned=True).covariance)
+    assert np.allclose(relative_covariances(sure, 0)[3], edge(sure, 3).covariance)
+    assert np.allclose(relative_covariances(sure, 3)[0], edge(sure, 3, turned=True).covariance)
+
+
+def test_edges_of_the_same_two_nodes_hold_each_other():
+    """One loose along x, one without a heading, one of them given the other way round: together they hold all three."""
+    delta = np.array([0.5, 0.1, 0.3])
+    loose, blind = np.diag([1.0, 1e-4, 1e-4]), np.diag([1e-3, 1e-3, 1e-1])
+    turned = invert_relative(RelativePose(delta, blind))
+    graph = PoseGraph(
+        initial=np.zeros((2, 3)),
+        sources=np.array([0, 1]),
+        targets=np.array([1, 0]),
+        deltas=np.array([delta, turned.delta]),
+        information=np.linalg.inv(np.array([loose, turned.covariance])),
+        kinds=np.full(2, EdgeKind.ODOMETRY, dtype=np.int8),
+        edge_ids=np.arange(2),
+    )
+    both = np.linalg.inv(np.linalg.inv(loose) + np.linalg.inv(blind))
+    assert np.allclose(relative_covariances(graph, 0)[1], both)
+    assert np.allclose(relative_covariances(graph, 1)[0], invert_relative(RelativePose(delta, both)).covariance)
 
 
 def test_every_covariance_is_one_on_a_large_graph_and_growth_is_that_of_the_path():

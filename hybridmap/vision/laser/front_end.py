@@ -80,10 +80,10 @@ class LaserFrontEnd:
         number, cloud, scan = self._node
         assert number == node
         if odometry is None:
-            self._atlas.add(cloud, scan.ranges_m, IDENTITY.copy())
+            self._atlas.add(cloud, scan.ranges_m, IDENTITY.copy(), np.zeros((3, 3)))
             return []
         step = self._tracker.step(cloud, odometry, self._clouds_between)
-        self._atlas.add(cloud, scan.ranges_m, compose(self._atlas.chain[-1], step.relative.delta))
+        self._atlas.add(cloud, scan.ranges_m, compose(self._atlas.chain[-1], step.relative.delta), step.scatter)
         return [self._registration(node, step)]
 
     def close(self, node: int, belief: Belief) -> list[Proposal]:

@@ -112,7 +112,7 @@ class Prober:
         anchors = [a for a in self._anchors if atlas.travel_m[a] < limit]
         if not anchors:
             return []
-        covariance = np.nan_to_num(belief.covariance_from(center)[anchors], posinf=UNKNOWN)
+        covariance = c.gate_inflation**2 * np.nan_to_num(belief.covariance_from(center)[anchors], posinf=UNKNOWN)
         sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:, :2, :2])[:, 1])
         radius = c.gate_sigmas * sigma_m + c.gate_m
         heading = c.gate_sigmas * np.sqrt(covariance[:, 2, 2]) + np.deg2rad(c.gate_deg)
@@ -164,7 +164,7 @@ class Prober:
         refusal = self._refusal(mode, alignment, scores)
         if not refusal:
             refusal = self._free_space(mode.target, probe, pose, scores)
-        relative = invert_relative(RelativePose(pose, covariance))
+        relative = invert_relative(self._atlas.joining(mode.gate.anchor, pose, covariance, probe.anchor))
         quality = scores["near"] * scores["fit"]
         return Hypothesis(probe.anchor, mode.gate.anchor, relative, quality, mode.gate.sigma_m, scores, refusal)
 

@@ -48,8 +48,12 @@ class Alignment:
     points: int
 
     def covariance(self, k: int, config: RegistrationConfig, floor_m: float, floor_rad: float) -> Array:
-        """Covariance (3, 3) of registration k in the moving frame: loose along a bare corridor, never below the floors."""
-        variance = max(config.sigma_m, float(self.rms_m[k])) ** 2 * config.correlation
+        """Covariance (3, 3) of registration k in the moving frame: loose along a bare corridor, never below the floors.
+
+        The variance of the residuals times the inverse Hessian, as for least squares with independent points; the floors
+        stand for what residuals do not show: a target that is itself bent.
+        """
+        variance = max(config.sigma_m, float(self.rms_m[k])) ** 2
         trusted = self._without_spurious(k, config.spurious)
         covariance = np.linalg.inv(trusted / variance + np.diag(WEAKEST_INFORMATION))
         floor = np.diag([floor_m**2, floor_m**2, floor_rad**2])

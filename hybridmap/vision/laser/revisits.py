@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.laser import LaserConfig
-from hybridmap.geometry import Array, RelativePose, between, inverse, invert_relative, wrap_angle
+from hybridmap.geometry import Array, between, inverse, invert_relative, wrap_angle
 from hybridmap.streams.base import Laser
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.hypotheses import Hypothesis
@@ -86,7 +86,7 @@ class Reviser:
             "off_deg": float(np.rad2deg(abs(wrap_angle(pose[2] - expected[2])))),
         }
         refusal = self._refusal(figures) or self._free_space(target, probe, pose, figures)
-        relative = invert_relative(RelativePose(pose, covariance))
+        relative = invert_relative(self._atlas.joining(other, pose, covariance, node))
         return Hypothesis(node, other, relative, figures["near"] * figures["fit"], 0.0, figures, refusal)
 
     def _refusal(self, figures: dict[str, float]) -> str:

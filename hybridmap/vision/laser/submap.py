@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.laser import LaserConfig
-from hybridmap.geometry import Array, between
+from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose_relative
 from hybridmap.vision.laser.cloud import Cloud, merged
 from hybridmap.vision.laser.likelihood import LikelihoodField, build_field
 
@@ -75,7 +75,14 @@ class _Recent(Generic[Key, Value]):
 
 
 class Atlas:
-    """The clouds of all nodes with the chain of refined poses; makes submaps and targets of them."""
+    """The clouds of all nodes with the chain of refined poses; makes submaps and targets of them.
+
+    Attributes:
+        clouds, ranges: of each node's scan, the points in its frame and the ranges (B,) as they came.
+        chain: pose (3,) of each node.
+        scatter: covariance (3, 3), in each node's own frame, of its place in the submap of the nodes about it.
+        travel_m: path length along the chain.
+    """
 
     def __init__(self, config: LaserConfig) -> None:
         self._config = config
@@ -85,18 +92,34 @@ class Atlas:
         self.clouds: list[Cloud] = []
         self.ranges: list[NDArray[np.float32]] = []
         self.chain: list[Array] = []
+        self.scatter: list[Array] = []
         self.travel_m: list[float] = []
 
     def __len__(self) -> int:
         return len(self.clouds)
 
-    def add(self, cloud: Cloud, ranges_m: NDArray[np.float32], pose: Array) -> None:
-        """Append a node by its pose (3,) in the chain."""
+    def add(self, cloud: Cloud, ranges_m: NDArray[np.float32], pose: Array, scatter: Array) -> None:
+        """Append a node by its pose (3,) in the chain and the covariance (3, 3) of that."""
         step = float(np.hypot(*(pose - self.chain[-1])[:2])) if self.chain else 0.0
         self.travel_m.append(self.travel_m[-1] + step if self.travel_m else 0.0)
         self.clouds.append(cloud)
         self.ranges.append(ranges_m)
         self.chain.append(pose)
+        self.scatter.append(scatter)
+
+    def joining(self, target: int, pose: Array, covariance: Array, probe: int | None = None) -> RelativePose:
+        """The edge that a registration gives: the probe's node in the frame of the target's.
+
+        A registration joins two submaps (or a scan and a submap); where the two nodes lie in theirs is as uncertain as
+        their scatter says, and the edge between them is, too.
+
+        Args:
+            target: anchor of the submap that was registered to.
+            pose, covariance: (3,) and (3, 3) of the moving frame in the target's.
+            probe: anchor of the submap that was registered; None for a single scan.
+        """
+        edge = compose_relative(RelativePose(IDENTITY, self.scatter[target]), RelativePose(pose, covariance))
+        return edge if probe is None else compose_relative(edge, RelativePose(IDENTITY, self.scatter[probe]))
 
     def along(self, low_m: float, high_m: float) -> NDArray[np.int64]:
         """Nodes whose travel lies in [low, high], as far as there are any."""

@@ -29,6 +29,7 @@ class Step:
         contradicts_odometry: a good registration says that the odometry is wrong.
         inliers, fit: of the registration.
         reason: one line for people.
+        scatter: covariance (3, 3) of the new node's place in the submap.
     """
 
     relative: RelativePose
@@ -37,6 +38,7 @@ class Step:
     inliers: float
     fit: float
     reason: str
+    scatter: Array
 
 
 class Tracker:
@@ -120,15 +122,18 @@ class Tracker:
         pose, inliers, fit = alignment.poses[0], float(alignment.inliers[0]), float(alignment.fit[0])
         off_m = float(np.hypot(*(pose - odometry.delta)[:2]))
         if inliers < c.inliers_weak:
-            return Step(odometry, False, False, inliers, fit, f"inliers {inliers:.2f} < {c.inliers_weak}: odometry kept")
+            reason = f"inliers {inliers:.2f} < {c.inliers_weak}: odometry kept"
+            return Step(odometry, False, False, inliers, fit, reason, odometry.covariance)
         if off_m > c.translation_max_m and inliers < c.inliers_min:
-            return Step(odometry, False, False, inliers, fit, f"{off_m:.2f} m from the odometry > {c.translation_max_m} m")
+            reason = f"{off_m:.2f} m from the odometry > {c.translation_max_m} m"
+            return Step(odometry, False, False, inliers, fit, reason, odometry.covariance)
         covariance = alignment.covariance(0, self._config.registration, c.floor_m, np.deg2rad(c.floor_deg))
         if self._doubtful(alignment, odometry.delta):
             covariance = covariance + np.diag([0.05**2, 0.05**2, np.deg2rad(1.5) ** 2])
         wrong = inliers >= c.inliers_min and self._contradicts(pose, odometry.delta)
         reason = "contradicts the odometry" if wrong else "agrees with the odometry"
-        return Step(RelativePose(pose, covariance), True, wrong, inliers, fit, f"inliers {inliers:.2f}, {reason}")
+        edge = self._atlas.joining(len(self._atlas) - 1, pose, covariance)
+        return Step(edge, True, wrong, inliers, fit, f"inliers {inliers:.2f}, {reason}", covariance)
 
 
 def _better(first: Alignment, second: Alignment, gain: float) -> Alignment:

@@ -43,7 +43,7 @@ def test_merging_averages_a_cell_and_forgets_the_order():
 def _submap(world, pose):
     atlas = Atlas(LaserConfig())
     ranges = cast(world, pose)
-    atlas.add(cloud_of_scan(ranges, LASER, ScanConfig()), ranges, IDENTITY.copy())
+    atlas.add(cloud_of_scan(ranges, LASER, ScanConfig()), ranges, IDENTITY.copy(), np.zeros((3, 3)))
     return atlas.submap(0, [0]), [ranges]
 
 

@@ -9,7 +9,7 @@ from laser_worlds import LASER, cast, corridor, drifting, ring, ring_drive, room
 from hybridmap.config.laser import LaserConfig
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
-from hybridmap.geometry import IDENTITY, RelativePose, between, compose
+from hybridmap.geometry import IDENTITY, RelativePose, between, compose, log
 from hybridmap.streams.base import LaserScan, RgbdFrame
 from hybridmap.vision.base import Belief, RetracingFrontEnd, Verdict
 from hybridmap.vision.laser.front_end import LaserFrontEnd
@@ -48,8 +48,8 @@ class Run:
 
         def covariance_from(node):
             way = np.abs(travel - travel[node])
-            sigma_rad = np.deg2rad(0.45) * np.sqrt(way)
-            sigma_m = 0.02 * np.sqrt(way) + sigma_rad * way / 2
+            sigma_rad = np.deg2rad(0.11) * np.sqrt(way)
+            sigma_m = 0.005 * np.sqrt(way) + sigma_rad * way / 2
             return np.stack([np.diag([s**2, s**2, r**2]) for s, r in zip(sigma_m, sigma_rad, strict=True)])
 
         return Belief(np.array(self.poses) if poses is None else poses, np.zeros(len(travel)), travel, covariance_from)
@@ -112,6 +112,17 @@ def test_re_proposal_on_the_right_map_is_right_and_ends(two_laps):
     for _ in range(VisionConfig().laser.revisits.rounds):
         proposals = two_laps.front_end.finish(two_laps.belief(final))
     assert proposals == []
+
+
+def test_covariances_say_how_wrong_edges_are(two_laps):
+    start = two_laps.truth[0]
+    proposals = [p for p in two_laps.proposals if p.verdict is Verdict.ACCEPTED]
+    proposals += two_laps.front_end.finish(two_laps.belief(between(start, two_laps.truth[two_laps.node_at])))
+    for kind in ("registration", "loop"):
+        edges = [p for p in proposals if p.kind == kind and p.verdict is Verdict.ACCEPTED]
+        errors = [log(two_laps.error(p)) for p in edges]
+        chi2 = [e @ np.linalg.solve(p.relative.covariance, e) for e, p in zip(errors, edges, strict=True)]
+        assert 0.5 * 2.366 < np.median(chi2) < 2.0 * 2.366, kind
 
 
 def test_scans_between_nodes_are_put_right_on_the_final_map(two_laps):

@@ -27,7 +27,7 @@ def atlas_of(world, poses, rng):
     atlas = Atlas(LaserConfig())
     for pose in poses:
         ranges = cast(world, pose, rng)
-        atlas.add(cloud_of_scan(ranges, LASER, ScanConfig()), ranges, between(poses[0], pose))
+        atlas.add(cloud_of_scan(ranges, LASER, ScanConfig()), ranges, between(poses[0], pose), np.zeros((3, 3)))
     return atlas
 
 
@@ -64,7 +64,7 @@ def test_covariance_is_calibrated_within_a_room():
         alignment = align(target.fine, cloud, truth[None], SETTINGS)
         error = log(between(truth, alignment.poses[0]))
         chi2.append(error @ np.linalg.solve(alignment.covariance(0, SETTINGS, 1e-3, 1e-3), error))
-    assert np.median(chi2) < 2.0 * 2.37
+    assert 0.5 * 2.37 < np.median(chi2) < 2.0 * 2.37
     assert np.percentile(chi2, 95) < 2.0 * 7.81
 
 

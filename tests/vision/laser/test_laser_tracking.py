@@ -23,7 +23,7 @@ class Drive:
         self.atlas = Atlas(LaserConfig())
         self.tracker = Tracker(LaserConfig(), self.atlas)
         ranges = cast(world, start, self.rng)
-        self.atlas.add(self.cloud(ranges), ranges, IDENTITY.copy())
+        self.atlas.add(self.cloud(ranges), ranges, IDENTITY.copy(), np.zeros((3, 3)))
 
     def cloud(self, ranges):
         return cloud_of_scan(ranges, LASER, ScanConfig())
@@ -33,7 +33,7 @@ class Drive:
         ranges = cast(self.world, self.pose, self.rng)
         cloud = self.cloud(ranges)
         step = self.tracker.step(cloud, RelativePose(np.asarray(odometry, float), LOOSE), lambda: between_nodes)
-        self.atlas.add(cloud, ranges, compose(self.atlas.chain[-1], step.relative.delta))
+        self.atlas.add(cloud, ranges, compose(self.atlas.chain[-1], step.relative.delta), step.scatter)
         return step
 
 
