@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import pytest
 
+from hybridmap.metrics import Metric, to_json
 from tests.store.sessions import ring_map, write_session
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -55,6 +56,21 @@ def test_figures_are_held_against_their_bars(tmp_path: Path) -> None:
     assert results.table_line(rows[0]) == "| `ate_rmse/gtsam-lm` | 0.3 | m | <= 0.2 ✗ missed |"
     with pytest.raises(SystemExit, match="gave no figure"):
         results.read(studies.Step("x", (studies.Figure("other"),)), done, 1.0, [])
+
+
+def test_a_command_s_own_bars_are_taken_with_their_side(tmp_path: Path) -> None:
+    results, studies = importlib.import_module("results"), importlib.import_module("result_studies")
+    metrics = [
+        Metric("speed", 7.5, "1", "of the baseline; at least 8", 8.0, False),
+        Metric("error", 0.1, "m", "largest; at most 0.2", 0.2, True),
+        Metric("unjudged", 3.0, "m", "only shown"),
+    ]
+    done = subprocess.CompletedProcess([], 1, to_json({}, metrics), "")
+    rows = results.read(studies.Step("python tools/bench.py", own_bars=True), done, 1.0, [])
+    assert [results.table_line(row) for row in rows] == [
+        "| `speed` | 7.5 |  | >= 8 ✗ missed |",
+        "| `error` | 0.1 | m | <= 0.2 ✓ |",
+    ]
 
 
 def test_results_names_its_studies() -> None:

@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
@@ -26,6 +28,7 @@ from hybridmap.cli.choose import choose
 from hybridmap.evaluate.association import Pairs, known_at, travel
 from hybridmap.evaluate.trajectory import motion_errors
 from hybridmap.geometry import Array
+from hybridmap.metrics import Metric, to_json
 from hybridmap.streams.base import SelfMotion, Velocity
 from hybridmap.streams.synchronise import Synchroniser
 from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
@@ -105,7 +108,7 @@ def windows(log: Log, gains: Gains, delay_s: float, length_m: float) -> tuple[Ar
     return (pairs.stamps_ns[first[near]] - stamps[0]) / NS_PER_S, errors
 
 
-def judge(log: Log, how: str, estimate: Estimate) -> list[dict[str, object]]:
+def judge(log: Log, how: str, estimate: Estimate, table: TextIO) -> list[dict[str, object]]:
     """Errors of raw and calibrated dead reckoning, for each length of window."""
     rows: list[dict[str, object]] = []
     for length in LENGTHS_M:
@@ -140,7 +143,7 @@ def judge(log: Log, how: str, estimate: Estimate) -> list[dict[str, object]]:
             },
         }
         rows.append(row)
-        print(line(row), flush=True)
+        print(line(row), flush=True, file=table)
     return rows
 
 
@@ -168,12 +171,29 @@ def line(row: dict[str, object]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def summary(rows: list[dict[str, object]], how: str) -> None:
-    """Median over the motion-capture robots."""
-    ratios = [float(str(r["gains_mean"])) for r in rows if r["trained"] == how and r["length_m"] == LENGTHS_M[0]]
-    if ratios:
-        better = sum(ratio < 1.0 for ratio in ratios)
-        print(f"mrclam6, {how}: median {np.median(ratios):.0%} of raw (bar 75 %), better in {better} of {len(ratios)} (bar 4)")
+def judged(rows: list[dict[str, object]]) -> list[Metric]:
+    """The figures that have a bar: end error of calibrated dead reckoning in % of raw, and how many robots get better."""
+    metrics = []
+    for found in rows:
+        length = float(str(found["length_m"]))
+        bar = BARS.get((str(found["log"]), length))
+        if bar is not None:
+            name = f"end_error/{found['log']}-{length:g}m-{found['trained']}"
+            metrics.append(at_most(name, 100.0 * float(str(found["delay_mean"])), 100.0 * bar, "mean over all windows"))
+    for how in ("reference", "reference, all robots"):
+        ratios = [float(str(r["gains_mean"])) for r in rows if r["trained"] == how and r["length_m"] == LENGTHS_M[0]]
+        if ratios:
+            name = f"mrclam6-{how.replace(', ', '-').replace(' ', '-')}"
+            metrics.append(at_most(f"end_error/{name}", 100.0 * float(np.median(ratios)), 75.0, "median over the robots"))
+            better = float(sum(ratio < 1.0 for ratio in ratios))
+            what = f"of {len(ratios)} robots better calibrated than raw; at least 4"
+            metrics.append(Metric(f"better/{name}", better, "1", what, 4.0, better >= 4.0))
+    return metrics
+
+
+def at_most(name: str, percent: float, bar: float, what: str) -> Metric:
+    """An error in % of raw, held against its bar."""
+    return Metric(name, percent, "%", f"end error in % of raw, {what}; at most {bar:g}", bar, percent <= bar)
 
 
 def main() -> None:
@@ -183,25 +203,29 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only", default="")
     parser.add_argument("--estimators", nargs="+", default=["alternating", "joint"])
+    parser.add_argument("--json", action="store_true", help="print the figures with bars; the table goes to stderr")
     options = parser.parse_args()
     rows: list[dict[str, object]] = []
-    print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", flush=True)
+    table = sys.stderr if options.json else sys.stdout
+    print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", flush=True, file=table)
     for name, (source, reference) in LASER.items():
         if options.only in name:
             log = read_log(name, options.data / source, options.data / reference)
             drive = first_half(log, options.out)
             for estimator in options.estimators:
-                rows += judge(log, estimator, estimate_of([drive], [], estimator))
+                rows += judge(log, estimator, estimate_of([drive], [], estimator), table)
     robots = [read_log(n, options.data / s, options.data / r) for n, (s, r) in ROBOTS.items() if options.only in n]
     drives = [first_half(log, options.out) for log in robots]
     for log, drive in zip(robots, drives, strict=True):
-        rows += judge(log, "reference", estimate_of([drive], [log.reference], ""))
+        rows += judge(log, "reference", estimate_of([drive], [log.reference], ""), table)
     if len(robots) > 1:
         together = estimate_of(drives, [log.reference for log in robots], "")
         for log in robots:
-            rows += judge(log, "reference, all robots", together)
-    for how in ("reference", "reference, all robots"):
-        summary(rows, how)
+            rows += judge(log, "reference, all robots", together, table)
+    if options.json:
+        print(to_json({}, judged(rows)))
+    else:
+        print("\n".join(f"{m.name}: {m.value:.3g} {m.unit}, {m.description}" for m in judged(rows)))
     (options.out / "windows.json").write_text(json.dumps(rows, indent=1))
 
 

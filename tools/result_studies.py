@@ -7,10 +7,17 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of a command's `--json`; `PRIMARY` in its name stands for the session's primary back-end."""
+    """A figure of a command's `--json`; `PRIMARY` in its name stands for the session's primary back-end.
+
+    Attributes:
+        name: of the metric.
+        bar: what it is held against.
+        at_least: the bar is a lower one.
+    """
 
     name: str
     bar: float | None = None
+    at_least: bool = False
 
 
 @dataclass(frozen=True)
@@ -20,6 +27,7 @@ class Step:
     Attributes:
         command: as one would type it; `$HYBRIDMAP_DATA` is the folder of recordings.
         figures: taken from its `--json`.
+        own_bars: every figure that the command itself holds against a bar is taken.
         wall_bar_s: its wall time is a figure, held against this.
         holds: what is shown by the command's success; without it a failing command is an error.
         same_graph: the graph must be that of the steps before.
@@ -30,6 +38,7 @@ class Step:
     wall_bar_s: float | None = None
     holds: str = ""
     same_graph: bool = False
+    own_bars: bool = False
 
 
 @dataclass(frozen=True)
@@ -172,6 +181,30 @@ STUDIES = (
                 holds="at 30 Hz every module stays within 0.5 % of its spacing, the position within 0.3 mm (3 seeds)",
             ),
         ),
+    ),
+    Study(
+        "verify",
+        "The cells against physiology, three seeds",
+        "Every row that has a bar; the page of each run shows the maps and curves behind it.",
+        tuple(
+            Step(f"hybridmap verify --seed {seed} --out verify-{seed}", own_bars=True, wall_bar_s=180.0)
+            for seed in (1, 7, 2026)
+        ),
+    ),
+    Study(
+        "speed-cells",
+        "The speed of the cells",
+        "Steps per CPU-second of the sheets against a plain `numpy.fft` implementation of the same dynamics, and of the whole "
+        "front-end at 100 Hz, in one run on one core.",
+        (Step("python tools/bench_neural.py", own_bars=True),),
+    ),
+    Study(
+        "calibration",
+        "Calibration of odometry",
+        "Trained on the first half of each log, tested on every window of the second: end error of dead reckoning in % of raw. "
+        "The table of every row is in docs/calibration.md.",
+        (Step("python tools/calibration_study.py --data $HYBRIDMAP_DATA/real --out $OUT", own_bars=True),),
+        needs="real/mrclam6",
     ),
 )
 

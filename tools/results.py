@@ -79,11 +79,11 @@ def run(study: Study) -> dict[str, Any]:
 
 def execute(step: Step, folder: Path) -> subprocess.CompletedProcess[str]:
     """Run one command; `$HYBRIDMAP_DATA` in it is the folder of recordings."""
-    program, *arguments = shlex.split(step.command.replace(DATA, str(data_folder())))
+    program, *arguments = shlex.split(step.command.replace(DATA, str(data_folder())).replace("$OUT", str(folder)))
     cwd = ROOT if program == "python" else folder
-    command = [*PROGRAMS[program], *arguments, *(["--json"] if step.figures and program == "hybridmap" else [])]
+    command = [*PROGRAMS[program], *arguments, *(["--json"] if step.figures or step.own_bars else [])]
     done = subprocess.run(command, cwd=cwd, capture_output=True, text=True)
-    if done.returncode != 0 and not step.holds:
+    if done.returncode != 0 and not (step.holds or step.own_bars):
         raise SystemExit(f"{step.command}: exit code {done.returncode}\n{done.stdout}\n{done.stderr}")
     return done
 
@@ -93,7 +93,7 @@ def read(step: Step, done: subprocess.CompletedProcess[str], elapsed_s: float, h
     rows = []
     if step.holds:
         rows.append(row(step, step.holds, "holds" if done.returncode == 0 else "fails", "", None, done.returncode == 0))
-    if step.figures:
+    if step.figures or step.own_bars:
         output = json.loads(done.stdout)
         values = {metric["name"]: metric for metric in output["metrics"]}
         primary = output.get("primary_backend", "")
@@ -102,6 +102,8 @@ def read(step: Step, done: subprocess.CompletedProcess[str], elapsed_s: float, h
             if name not in values:
                 raise SystemExit(f"{step.command}: gave no figure {name}; there are {', '.join(values)}")
             rows.append(figure_row(step, figure, values[name], primary))
+        if step.own_bars:
+            rows += [own_row(step, metric) for metric in output["metrics"] if metric.get("bar") is not None]
         hashes.append(output.get("graph_hash", ""))
     if step.same_graph:
         same = len(set(hashes)) == 1
@@ -114,14 +116,31 @@ def read(step: Step, done: subprocess.CompletedProcess[str], elapsed_s: float, h
 def figure_row(step: Step, figure: Figure, metric: dict[str, Any], primary: str) -> dict[str, Any]:
     """One figure, held against its bar if it has one."""
     value = metric["value"]
-    passed = None if figure.bar is None else value is not None and value <= figure.bar
+    passed = None
+    if figure.bar is not None:
+        passed = value is not None and (value >= figure.bar if figure.at_least else value <= figure.bar)
     name = figure.name.replace("PRIMARY", primary)
-    return row(step, f"`{name}`", "–" if value is None else f"{value:.5g}", metric["unit"], figure.bar, passed)
+    return row(step, f"`{name}`", shown(value), metric["unit"], figure.bar, passed, at_least=figure.at_least)
 
 
-def row(step: Step, what: str, value: str, unit: str, bar: float | None, passed: bool | None) -> dict[str, Any]:
+def own_row(step: Step, metric: dict[str, Any]) -> dict[str, Any]:
+    """One figure that the command itself holds against a bar; its description says on which side it must lie."""
+    at_least = f"at least {metric['bar']:g}" in metric["description"]
+    what = f"`{metric['name']}`"
+    return row(step, what, shown(metric["value"]), metric["unit"], metric["bar"], metric["passed"], at_least=at_least)
+
+
+def shown(value: float | None) -> str:
+    """A value as it stands in the table."""
+    return "–" if value is None else f"{value:.5g}"
+
+
+def row(
+    step: Step, what: str, value: str, unit: str, bar: float | None, passed: bool | None, *, at_least: bool = False
+) -> dict[str, Any]:
     """A line of the table."""
-    return {"what": what, "value": value, "unit": unit, "bar": bar, "passed": passed, "command": step.command}
+    line = {"what": what, "value": value, "unit": unit, "bar": bar, "passed": passed, "command": step.command}
+    return {**line, "at_least": True} if at_least else line
 
 
 def machine() -> str:
@@ -180,7 +199,8 @@ def section(study: Study, result: dict[str, Any]) -> list[str]:
 def table_line(line: dict[str, Any]) -> str:
     """A figure as a line of a Markdown table."""
     verdict = {None: "", True: "✓", False: "✗ missed"}[line["passed"]]
-    bar = f"<= {line['bar']:g} {verdict}" if line["bar"] is not None else verdict
+    side = ">=" if line.get("at_least") else "<="
+    bar = f"{side} {line['bar']:g} {verdict}" if line["bar"] is not None else verdict
     unit = "" if line["unit"] == "1" else line["unit"]
     return f"| {line['what']} | {line['value']} | {unit} | {bar} |"
 
