@@ -61,8 +61,8 @@ class BandRings:
         self._displacement = np.ones(3, dtype=dtype)
         preferred = 2.0 * np.pi * (np.arange(cells) / cells + 0.5)
         self._weights = np.stack([np.cos(preferred), np.sin(preferred)], axis=1).astype(dtype)
-        self._sharpness = self._weights.dtype.type(-1.0 / (2.0 * (2.0 * np.pi * width) ** 2))
-        self._cycles = self._weights.dtype.type(0.5 / np.pi)
+        self._sharpness = np.array(-1.0 / (2.0 * (2.0 * np.pi * width) ** 2), dtype=dtype)
+        self._cycles = np.array(0.5 / np.pi, dtype=dtype)
         self._shape = (*angles.shape, cells)
         self._complex = np.result_type(np.dtype(dtype), np.complex64)
         rings = angles.shape
@@ -71,7 +71,8 @@ class BandRings:
         self._turned = np.empty(rings, dtype=self._complex)
         self._turned_pairs = self._turned.view(dtype).reshape(-1, 2)
         self._turned_real, self._turned_imag = self._turned.real, self._turned.imag
-        self._length = np.empty(rings, dtype=dtype)
+        self._length = np.zeros(rings, dtype=self._complex)  # complex, since a division of mixed types is slow
+        self._length_real = self._length.real
         inside = 1.0 - 4.0 * float(np.finfo(self._weights.dtype).eps)  # keeps rounding out of arccos' way
         self._tuning = np.ascontiguousarray(self._weights.T) * self._weights.dtype.type(inside)
         self._decoded: tuple[NDArray[np.floating] | None, NDArray[np.complexfloating]] = (None, np.empty(0, self._complex))
@@ -84,7 +85,7 @@ class BandRings:
             return known
         vector = np.dot(self.activity.reshape(-1, self._weights.shape[0]), self._weights)
         z = vector.view(self._complex).reshape(self._length.shape)
-        np.abs(z, out=self._length)
+        np.abs(z, out=self._length_real)
         z /= self._length
         if not self.activity.flags.writeable:
             self._decoded = self.activity, z
