@@ -164,3 +164,10 @@ def align(poses_a: ArrayLike, poses_b: ArrayLike) -> Array:
     yaw = np.arctan2(np.sum(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]), np.sum(u * v))
     rotated = transform_points(np.array([0.0, 0.0, yaw]), mean_b[None])[0]
     return np.array([*(mean_a - rotated), yaw])
+
+
+def loosest_direction(covariance: Array) -> tuple[float, float]:
+    """Largest standard deviation (m) of a position with covariance (3, 3), and its direction: an axis in [-pi/2, pi/2) rad."""
+    values, vectors = np.linalg.eigh(covariance[:2, :2])
+    angle = float(np.arctan2(vectors[1, 1], vectors[0, 1]))
+    return float(np.sqrt(max(values[1], 0.0))), (angle + 0.5 * np.pi) % np.pi - 0.5 * np.pi

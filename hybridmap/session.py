@@ -17,6 +17,7 @@ from hybridmap.errors import HybridMapError, StreamError
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.experience_map import Status
 from hybridmap.graph.hashing import graph_hash
+from hybridmap.graph.observability import unobserved
 from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.mapper import Mapper, Update
 from hybridmap.metrics import Metric
@@ -190,6 +191,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
             folder.write_trajectory(f"{name}_online", store.online(name))
     if stream.groundtruth is not None:
         folder.write_groundtruth(stream.groundtruth)
+    free = unobserved(mapper.map, mapper.poses())
     head = {
         "graph_hash": graph_hash(mapper.map),
         "primary_backend": mapper.backends.primary,
@@ -197,11 +199,17 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
         "source": stream.name,
         "failed_backends": dict(mapper.backends.failures),
         "stream": dict(stream.report.counts),
-        "remarks": [*stream.report.remarks, *map(str, mapper.calibration.changes)],
+        "remarks": [
+            *stream.report.remarks,
+            *map(str, mapper.calibration.changes),
+            *([str(free)] if free is not None and free.matters else []),
+        ],
     }
     for key in ("graph_hash", "primary_backend"):
         store.put_info(key, head[key])
     metrics = _figures(mapper, recorder, float(track.stamps_ns[-1] - track.stamps_ns[0]) / NS_PER_S)
+    if free is not None:
+        metrics.append(Metric("unobserved", free.sliding_m + free.blind_m, "m", str(free)))
     folder.write_metrics(head, metrics)
     return Session(folder, head, metrics)
 

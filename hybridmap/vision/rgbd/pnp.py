@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.rgbd import FeaturesConfig, PnpConfig, RegistrationConfig
-from hybridmap.geometry import Array, RelativePose, between, wrap_angle
+from hybridmap.geometry import Array, RelativePose, between, loosest_direction, wrap_angle
 from hybridmap.streams.base import Camera
 from hybridmap.vision.rgbd.depth_registration import Registration, register
 from hybridmap.vision.rgbd.features import Correspondences, match
@@ -88,7 +88,8 @@ class Verifier:
         if fit.overlap < self._pnp.map_overlap or fit.points < self._pnp.map_points:
             return Verification(None, f"only {fit.points} points of depth in common", scores)
         if fit.slack_m > self._pnp.map_sigma_m:
-            return Verification(None, f"depth slides: {fit.slack_m:.2f} m along its loosest direction", scores)
+            direction = round(np.degrees(loosest_direction(fit.relative.covariance)[1]))
+            return Verification(None, f"depth slides: free along {direction} deg ({fit.slack_m:.2f} m)", scores)
         return Verification(self._calibrated(fit.relative, source, target), "depth agrees with the map", scores)
 
     def _implausible(self, flat: FloorPose, reverse: FloorPose, held: bool, scores: dict[str, float]) -> str | None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from hybridmap.config.rgbd import RgbdConfig
-from hybridmap.geometry import Array, RelativePose, between, compose, compose_relative, log
+from hybridmap.geometry import Array, RelativePose, between, compose, compose_relative, log, loosest_direction
 from hybridmap.streams.base import Camera
 from hybridmap.vision.base import Proposal, Verdict
 from hybridmap.vision.rgbd.depth_grid import place
@@ -104,6 +104,7 @@ class Tracker:
             "residual_m": fit.residual_m,
             "overlap": fit.overlap,
             "slack_m": fit.slack_m,
+            "sigma_m": loosest_direction(relative.covariance)[0],
             "odometry_sigma": distance,
         }
         far = distance > self._config.contradiction_sigma
@@ -114,8 +115,18 @@ class Tracker:
             verdict, reason = Verdict.REJECTED, f"{distance:.1f} sigma from odometry without being sure"
         else:
             verdict, reason = Verdict.ACCEPTED, "depth overrules odometry" if far else "depth registered"
+            reason += _what_slides(relative, prior)
         overrules = far and sure and verdict is Verdict.ACCEPTED
         return Proposal(key, "registration", source, target, verdict, reason, relative, scores, overrules)
+
+
+def _what_slides(relative: RelativePose, odometry: RelativePose) -> str:
+    """Which direction, seen from the new node, odometry knows better than depth and features do; empty if none."""
+    sigma_m, direction = loosest_direction(relative.covariance)
+    along = np.array([np.cos(direction), np.sin(direction)])
+    if sigma_m**2 < along @ odometry.covariance[:2, :2] @ along:
+        return ""
+    return f"; free along {round(np.degrees(direction))} deg ({sigma_m:.2f} m), where odometry holds it"
 
 
 def _straightened(fixed: Keyframe, moving: Keyframe, fit: Registration) -> Keyframe:

@@ -169,6 +169,18 @@ def test_while_driving_depth_alone_joins_only_where_the_map_is_sure(sigma, joins
     assert bool(accepted) == joins
 
 
+def test_a_bare_wall_leaves_the_way_along_it_to_odometry_and_says_so(poses, frames):
+    rng = np.random.default_rng(1)
+    bare = np.full((VIEW.height_px, VIEW.width_px, 3), 128, np.uint8)
+    walls = [RgbdFrame(k * 10**9, bare, (2.5 + 0.01 * rng.normal(size=bare.shape[:2])).astype(np.float32)) for k in range(3)]
+    sideways = np.array([[0.0, 0.1 * k, 0.0] for k in range(3)])
+    _, proposals, _ = drive(VisionConfig(), sideways, 0.0, walls)
+    free = [p for p in proposals.values() if p.kind == "registration"]
+    assert all("free along" in p.reason and "90 deg" in p.reason and "odometry holds it" in p.reason for p in free)
+    _, proposals, _ = drive(VisionConfig(), poses[:3], 0.0, frames[:3])
+    assert not any("free along" in p.reason for p in proposals.values())
+
+
 def test_a_wrong_map_is_not_confirmed_by_depth(poses, frames):
     front_end, _, _ = drive(VisionConfig(), poses[:PER_LAP], 0.0, frames[:PER_LAP])
     keyframes = front_end._keyframes

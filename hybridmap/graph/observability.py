@@ -1,0 +1,100 @@
+"""What of the way no registration could hold: a bare corridor leaves its long axis to the wheels, and the map should say so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridmap.geometry import Array, loosest_direction
+from hybridmap.graph.experience_map import Edge, ExperienceMap, Status
+from hybridmap.graph.pose_graph import EdgeKind
+
+_ALIKE = 0.7  # mean resultant length of doubled angles from which stretches are said to share a direction
+
+
+@dataclass(frozen=True, slots=True)
+class Unobserved:
+    """Stretches between consecutive nodes that odometry alone holds, in one direction or in all.
+
+    Attributes:
+        sliding_m: length of those where registration knew one direction no better than odometry did.
+        blind_m: length of those without any registration.
+        travel_m: length of the whole way.
+        direction_rad: the free direction in the map, an axis in [-pi/2, pi/2), mean over the sliding stretches by length.
+        alike: how much they share that direction, 0 to 1.
+    """
+
+    sliding_m: float
+    blind_m: float
+    travel_m: float
+    direction_rad: float
+    alike: float
+
+    @property
+    def matters(self) -> bool:
+        """Odometry alone holds more than a tenth of the way."""
+        return self.sliding_m + self.blind_m > 0.1 * self.travel_m
+
+    def __str__(self) -> str:
+        """One line for people."""
+        parts = []
+        if self.sliding_m > 0:
+            degrees = round(np.degrees(self.direction_rad)) + 0
+            where = f"along {degrees} deg of the map" if self.alike > _ALIKE else "in one direction"
+            parts.append(f"on {self.sliding_m:.1f} m of {self.travel_m:.1f} m nothing seen held the motion {where}")
+        if self.blind_m > 0:
+            parts.append(f"on {self.blind_m:.1f} m of {self.travel_m:.1f} m nothing seen held it at all")
+        return "; ".join(parts) + ": there the map rests on odometry" if parts else "registration held all of the way"
+
+
+def unobserved(experiences: ExperienceMap, poses: Array) -> Unobserved | None:
+    """Find the stretches that registration left to odometry.
+
+    A stretch slides where the registration's standard deviation in its loosest direction is no less than that of the
+    odometry edge in the same direction.
+
+    Args:
+        experiences: the map.
+        poses: (N, 3) of its nodes, m and rad; they bring directions into the map.
+
+    Returns:
+        None where the front-end registers nothing at all.
+    """
+    steps, registered = _by_target(experiences, EdgeKind.ODOMETRY), _by_target(experiences, EdgeKind.REGISTRATION)
+    accepted = {node: [e for e in edges if e.status is Status.ACCEPTED] for node, edges in registered.items()}
+    if not any(accepted.values()):
+        return None
+    sliding, blind, total, axis = 0.0, 0.0, 0.0, 0.0 + 0.0j
+    for node in range(1, len(experiences)):
+        length = experiences.node(node).travel_m - experiences.node(node - 1).travel_m
+        total += length
+        edges = accepted.get(node, [])
+        if not edges:
+            blind += length
+            continue
+        direction = _free_direction(edges, steps.get(node, []))
+        if direction is not None:
+            sliding += length
+            axis += length * np.exp(2j * (direction + poses[node, 2]))
+    alike = float(abs(axis)) / sliding if sliding > 0 else 0.0
+    mean = 0.5 * float(np.angle(axis)) if sliding > 0 else 0.0
+    return Unobserved(sliding, blind, total, mean, alike)
+
+
+def _by_target(experiences: ExperienceMap, kind: EdgeKind) -> dict[int, list[Edge]]:
+    found: dict[int, list[Edge]] = {}
+    for edge in experiences.edges:
+        if edge.kind is kind and edge.relative is not None:
+            found.setdefault(edge.target, []).append(edge)
+    return found
+
+
+def _free_direction(registrations: list[Edge], odometry: list[Edge]) -> float | None:
+    """Direction (rad, in the node's frame) in which the best registration knows no more than odometry; None if it does."""
+    nearest = max(registrations, key=lambda edge: edge.source)
+    assert nearest.relative is not None
+    sigma_m, direction = loosest_direction(nearest.relative.covariance)
+    along = np.array([np.cos(direction), np.sin(direction)])
+    held = [along @ edge.relative.covariance[:2, :2] @ along for edge in odometry if edge.relative is not None]
+    return direction if held and sigma_m**2 >= min(held) else None
