@@ -50,6 +50,29 @@ class TemplatesConfig(Section):
     """Largest shift tried against the templates, columns."""
 
 
+class RelocalisingConfig(Section):
+    """A robot that has lost its place (it was carried, or its view fits no node before) is looked for on the whole map."""
+
+    candidates: int = Field(default=5, ge=0)
+    """Views of the whole map that are verified for a node, the best first; 0: never look outside the gate."""
+    separation: int = Field(default=4, ge=0)
+    """They lie at least this many nodes apart."""
+    support: int = Field(default=4, ge=2)
+    """Nodes whose closures must put the robot at one and the same place."""
+    span_m: float = Field(default=0.75, ge=0)
+    """Travel that they must cover, m."""
+    agree_m: float = Field(default=0.3, gt=0)
+    """They agree if they put the robot within this of each other, m (plus 5 % of the travel between them)."""
+    agree_deg: float = Field(default=5.0, gt=0)
+    """The same for its heading, degrees (plus 1 per metre)."""
+    unrecognised_nodes: int = Field(default=16, ge=0)
+    """Nodes in a row at places that the map knows, none of them recognised, after which the robot is lost too; 0: never."""
+    known_m: float = Field(default=0.7, gt=0)
+    """A node this near to an old one, looking the same way, is at a place that the map knows, m."""
+    known_deg: float = Field(default=20.0, gt=0)
+    """The same for the heading, degrees."""
+
+
 class VisionConfig(Section):
     """Which sensor closes loops, and how."""
 
@@ -61,6 +84,8 @@ class VisionConfig(Section):
     """Comparison of profiles."""
     templates: TemplatesConfig = TemplatesConfig()
     """View templates."""
+    relocalising: RelocalisingConfig = RelocalisingConfig()
+    """What a lost robot does (RGB-D)."""
     laser: LaserConfig = LaserConfig()
     """Laser front-end."""
     rgbd: RgbdConfig = RgbdConfig()

@@ -9,6 +9,10 @@ from hybridmap.geometry import Array, wrap_angle
 
 Indices = NDArray[np.int64]
 
+GATE_FIELDS = ("radius_m", "heading_deg", "older", "inside", "whole_map")
+"""What a map file keeps of a node's gate: its widths, how many nodes were old enough, how many of those inside, and whether
+all of them were compared (1) because the robot was not sure where it was."""
+
 
 def nodes_within(poses: Array, node: int, radius_m: float | Array, turn_rad: float, before: int | None = None) -> Indices:
     """Nodes before one of them that lie near it and look nearly the same way.

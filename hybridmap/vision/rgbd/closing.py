@@ -10,17 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.rgbd import RgbdConfig
-from hybridmap.config.vision import MatchingConfig
+from hybridmap.config.vision import MatchingConfig, RelocalisingConfig
 from hybridmap.geometry import Array, RelativePose, between, compose, wrap_angle
 from hybridmap.vision.base import Belief, Proposal, Verdict
+from hybridmap.vision.gating import GATE_FIELDS, nodes_within
 from hybridmap.vision.profile import Profile
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp import Verification, Verifier
+from hybridmap.vision.rgbd.relocalising import Relocaliser
 from hybridmap.vision.templates import MODERATE_THRESHOLD, Matcher
 
 Indices = NDArray[np.int64]
 RANKED = 6
 """Profiles ranked for each candidate that is verified: the best of one place lie next to each other."""
+DEFAULT_RELOCALISING = RelocalisingConfig()
 SURE = 4.0
 """While driving, depth alone is trusted only where the map's own uncertainty is below this many `repropose_sigma`."""
 
@@ -53,6 +56,7 @@ class LoopCloser:
         verifier: Verifier,
         yaw_of_shift: Callable[[int], float],
         new_key: Callable[[], int],
+        relocalising: RelocalisingConfig = DEFAULT_RELOCALISING,
     ) -> None:
         self._keyframes = keyframes
         self._config = config
@@ -63,6 +67,8 @@ class LoopCloser:
         self._matcher = Matcher(
             config.matching, matching.mu_r, matching.mu_d, matching.max_shift, matching.g_bar, matching.sequence
         )
+        self._relocaliser = Relocaliser(keyframes, self._matcher, verifier, relocalising, new_key)
+        self._relocalising = relocalising
         unverified = config.verify == "none"
         self._c_t = matching.c_t if matching.c_t is not None or not unverified else MODERATE_THRESHOLD[config.matching]
         self._hypotheses: defaultdict[int, list[_Hypothesis]] = defaultdict(list)
@@ -70,6 +76,7 @@ class LoopCloser:
         self._filed: set[tuple[int, int]] = set()
         self._tried: set[tuple[int, int]] = set()
         self._travel_at_closure = 0.0
+        self._noted, self._note = -1, dict[str, Array]()
         sigma_m, sigma_rad = config.closing.repropose_sigma_m, np.deg2rad(config.closing.repropose_sigma_deg)
         self._map_covariance = np.diag([sigma_m, sigma_m, sigma_rad]) ** 2
         self._rounds_left = config.closing.repropose_rounds
@@ -82,10 +89,39 @@ class LoopCloser:
         """Look for loops of one node, and settle what was pending."""
         gated = self._gate(node, belief)
         changed = self._try_candidates(node, self._ranked(node, gated), belief) if len(gated) else []
-        if self._config.verify != "none" and not any(p.verdict is Verdict.ACCEPTED for p in changed):
-            near = self._nearest(node, 1, belief)
-            changed += self._try_again(node, near, belief, {j for j in near if self._is_sure(node, j, belief)})
+        if self._config.verify != "none":
+            if not self._relocaliser.whereabouts.lost and not any(p.verdict is Verdict.ACCEPTED for p in changed):
+                near = self._nearest(node, 1, belief)
+                changed += self._try_again(node, near, belief, {j for j in near if self._is_sure(node, j, belief)})
+            changed += self._relocalise(node, gated, changed, belief)
         return [*changed, *self._give_up(before=node - self._closing.pending_nodes)]
+
+    def tracked(self, node: int, steps: Sequence[Proposal]) -> None:
+        """Take notice of how a new node was registered to the ones before it."""
+        if steps:
+            self._relocaliser.whereabouts.tracked(node, any(step.verdict is Verdict.ACCEPTED for step in steps))
+
+    def note(self, node: int) -> dict[str, Array]:
+        """What the map file keeps of the newest node's search: `gate` (see `GATE_FIELDS`), `ranked` (n, 3): node, G, shift."""
+        return dict(self._note) if node == self._noted else {}
+
+    def _relocalise(self, node: int, gated: Indices, changed: list[Proposal], belief: Belief) -> list[Proposal]:
+        """Keep account of whether the robot knows where it is; while it does not, look for it on the whole map."""
+        whereabouts = self._relocaliser.whereabouts
+        if any(p.verdict is Verdict.ACCEPTED for p in changed):
+            whereabouts.recognised()
+            return self._relocaliser.dismiss("the robot is where the map had it")
+        near, turn = self._relocalising.known_m, np.deg2rad(self._relocalising.known_deg)
+        if len(np.intersect1d(nodes_within(belief.poses_map_node, node, near, turn), gated)):
+            whereabouts.unrecognised()
+        if not whereabouts.lost:
+            return []
+        self._note["gate"][GATE_FIELDS.index("whole_map")] = 1.0
+        old = np.flatnonzero(belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s)
+        found = self._relocaliser.search(node, np.setdiff1d(old, gated).astype(np.int64), belief)
+        if any(p.verdict is Verdict.ACCEPTED for p in found):
+            self._travel_at_closure = float(belief.travel_m[node])
+        return found
 
     def finish(self, belief: Belief) -> list[Proposal]:
         """Try pairs that the optimised map puts side by side and that are not joined yet; then settle everything."""
@@ -97,6 +133,7 @@ class LoopCloser:
                 if accepted < self._closing.accept:
                     near = self._nearest(node, self._closing.repropose_per_node, belief)
                     out += self._try_again(node, near, belief, near)
+        out += self._relocaliser.dismiss("too few others put the robot there")
         return [*out, *self._give_up(before=len(self._keyframes))]
 
     def _is_sure(self, node: int, target: int, belief: Belief) -> bool:
@@ -119,12 +156,15 @@ class LoopCloser:
         turned = np.abs(wrap_angle(poses[:node, 2] - poses[node, 2]))
         old = belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s
         inside = old & (np.hypot(offset[:, 0], offset[:, 1]) <= radii) & (turned <= heading)
+        widths = float(radii.max(initial=radius)), float(np.rad2deg(min(heading, np.pi)))
+        self._noted, self._note = node, {"gate": np.array([*widths, old.sum(), inside.sum(), 0.0])}
         return np.flatnonzero(inside).astype(np.int64)
 
     def _ranked(self, node: int, gated: Indices) -> dict[int, dict[str, float]]:
         """The best candidates by profile, some nodes apart, with their scores."""
         ranked = RANKED * self._closing.candidates
         match = self._matcher.best(self._keyframes[node].profile, ranked, gated, ending_at=node)
+        self._note["ranked"] = np.column_stack([match.indices, match.score, match.shift])
         chosen: dict[int, dict[str, float]] = {}
         for i, target in enumerate(match.indices.tolist()):
             if self._c_t is not None and match.score[i] >= self._c_t:

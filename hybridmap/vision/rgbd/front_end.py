@@ -60,7 +60,9 @@ class RgbdFrontEnd:
         self._tracker = Tracker(self._keyframes, rgbd, self._camera, level, keys.__next__)
         self._verifier = Verifier(self._camera, rgbd.pnp, rgbd.features, rgbd.registration, level, seed)
         self._posture = Posture(rgbd.tilt, camera.T_base_camera, self._verifier.solver, rgbd.features.ratio)
-        self._closer = LoopCloser(self._keyframes, matching, rgbd, self._verifier, self._yaw_of_shift, keys.__next__)
+        self._closer = LoopCloser(
+            self._keyframes, matching, rgbd, self._verifier, self._yaw_of_shift, keys.__next__, config.relocalising
+        )
         self._frame: RgbdFrame | None = None
         self._image: WorkingImage | None = None
 
@@ -99,7 +101,9 @@ class RgbdFrontEnd:
 
     def track(self, node: int, odometry: RelativePose | None) -> list[Proposal]:
         """Register the new node to the ones before it."""
-        return self._tracker.track(node, odometry)
+        steps = self._tracker.track(node, odometry)
+        self._closer.tracked(node, steps)
+        return steps
 
     def close(self, node: int, belief: Belief) -> list[Proposal]:
         """Look for loop closures of the new node."""
@@ -111,6 +115,8 @@ class RgbdFrontEnd:
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
         """`profile` float32, `color` (H, W, 3) uint8 RGB, `depth_mm` (H, W) uint16, `T_base_camera` (4, 4) as it was then.
+
+        Of the newest node also what its search for loops found, see `LoopCloser.note`.
 
         Raises:
             StreamError: the node is not one of the newest `held_images`; the map file has what it had.
@@ -127,6 +133,7 @@ class RgbdFrontEnd:
             "color": held[0].color,
             "depth_mm": depth_in_mm(held[0].depth_m),
             "T_base_camera": kept.surface.stance.T_base_camera,
+            **self._closer.note(node),
         }
 
     def _yaw_of_shift(self, shift: int) -> float:
