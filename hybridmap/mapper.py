@@ -12,6 +12,7 @@ from hybridmap.backends.ensemble import Ensemble
 from hybridmap.calibration.gains import Gains
 from hybridmap.calibration.online import OnlineCalibration
 from hybridmap.config import Config
+from hybridmap.edge_book import EdgeBook
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, inverse
 from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
 from hybridmap.graph.motion_noise import odometry_covariance
@@ -26,10 +27,7 @@ from hybridmap.streams.rig import rig_of
 from hybridmap.streams.synchronise import Ready, Synchroniser
 from hybridmap.trajectory import NS_PER_S, stamp_ns_from_s
 from hybridmap.vision import create_front_end
-from hybridmap.vision.base import Belief, Proposal, Retraced, RetracingFrontEnd, Verdict, View
-
-_KINDS = {"loop": EdgeKind.LOOP, "registration": EdgeKind.REGISTRATION}
-_STATUS = {Verdict.ACCEPTED: Status.ACCEPTED, Verdict.PENDING: Status.PENDING, Verdict.REJECTED: Status.REJECTED}
+from hybridmap.vision.base import Belief, Proposal, Retraced, RetracingFrontEnd, Verdict, VerifyingFrontEnd, View
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +76,7 @@ class Mapper:
         self.config = config
         self.clock = StageClock()
         self.map = ExperienceMap()
+        self.book = EdgeBook(self.map, config.edges)
         self.integrator = PathIntegrator(config.neural)
         self.cells = Reanchoring(self.integrator, config.neural.reanchor_weight)
         self.vision = create_front_end(config.vision, rig if rig is not None else rig_of(config.sensors), config.seed)
@@ -93,7 +92,6 @@ class Mapper:
         self._pose_odom_at_node: Array = IDENTITY
         self._pose_map_at_node: dict[str, Array] = {}
         self._since_node = (0.0, 0.0)
-        self._edge_of_proposal: dict[int, int] = {}
 
     def add_odometry(self, stamp_s: float, pose_odom_robot: ArrayLike) -> Update | None:
         """Take in a pose (3,) of `base_link` in `odom`; returns the newest update, None while nothing is ready."""
@@ -150,7 +148,7 @@ class Mapper:
         while self.vision is not None and len(self.map):
             with self.clock.stage("matching"):
                 proposals = self.vision.finish(self.belief())
-            edges = self._enter(proposals)
+            edges = self.book.enter(proposals)
             if not edges:
                 break
             self._correct()
@@ -159,8 +157,11 @@ class Mapper:
                 break
         if len(self.map):
             self._correct(final=True)
+            if edges := self._verify_again():
+                self._correct(final=True)
+                updates.append(self._update(pose_odom, "loops without weight measured again", None, edges))
             self._retrace()
-            updates.append(self._update(pose_odom, "end of the drive"))
+            updates.append(self._update(pose_odom, "end of the drive", None, self._report_rejected()))
         return updates
 
     @property
@@ -197,6 +198,20 @@ class Mapper:
             self.backends.update(graph)
         names = self.config.backends.names
         self._pose_map_at_node = {name: self.backends.poses(graph, name)[self._at_node] for name in names}
+
+    def _verify_again(self) -> list[int]:
+        """Have the loops that the primary back-end gave no weight measured again, from where they lie on its map."""
+        solution = self.backends.solutions.get(self.backends.primary)
+        if solution is None or not isinstance(self.vision, VerifyingFrontEnd) or self.config.edges.gate == "odometry":
+            return []
+        doubted = self.book.doubted(solution.report)
+        with self.clock.stage("matching"):
+            proposals = self.vision.verify(doubted, self.belief()) if doubted else []
+        return self.book.enter_again(proposals, self.backends.primary)
+
+    def _report_rejected(self) -> list[int]:
+        solution = self.backends.solutions.get(self.backends.primary)
+        return self.book.report(solution.report) if solution is not None else []
 
     def _retrace(self) -> None:
         """Once the map is final, measure on it where the robot was between nodes."""
@@ -259,13 +274,13 @@ class Mapper:
             self.vision.add_node(node, view)
             odometry = self._odometry_from(self.map.node(node - 1).pose_odom, node) if node > 0 else None
             proposals = self.vision.track(node, odometry)
-        return self._enter(proposals) if self.config.edges.hanging == "chain" else []
+        return self.book.enter(proposals) if self.config.edges.hanging == "chain" else []
 
     def _close_loops(self, node: int) -> list[int]:
         assert self.vision is not None
         with self.clock.stage("matching"):
             proposals = self.vision.close(node, self.belief())
-        edges = self._enter(proposals)
+        edges = self.book.enter(proposals)
         closed = [proposal for proposal in proposals if proposal.verdict is Verdict.ACCEPTED]
         if closed:
             self._recalibrate(max(closed, key=lambda proposal: proposal.source))
@@ -281,40 +296,6 @@ class Mapper:
         self.cells.recalibrate(matched.target, between(pose_odom_matched, self.cells.pose_odom_robot))
         if self.config.edges.hanging == "ratslam":
             self._at_node, self._pose_odom_at_node = matched.target, pose_odom_matched
-
-    def _enter(self, proposals: list[Proposal]) -> list[int]:
-        """Write proposals into the map; a later one with the same key replaces the edge of the earlier."""
-        changed = []
-        for proposal in proposals:
-            edge = Edge(
-                proposal.source,
-                proposal.target,
-                _KINDS[proposal.kind],
-                _STATUS[proposal.verdict],
-                proposal.reason,
-                proposal.relative,
-                proposal.scores,
-            )
-            if proposal.key in self._edge_of_proposal:
-                number = self._edge_of_proposal[proposal.key]
-                self.map.update_edge(number, edge)
-            else:
-                number = self._edge_of_proposal[proposal.key] = self.map.add_edge(edge)
-            changed.append(number)
-            if proposal.contradicts_odometry and self.config.edges.drop_contradicted:
-                changed += self._drop_odometry(proposal)
-        return changed
-
-    def _drop_odometry(self, proposal: Proposal) -> list[int]:
-        ends = {proposal.source, proposal.target}
-        dropped = [
-            number
-            for number in self.map.edges_into(max(ends))
-            if self.map.edge(number).kind is EdgeKind.ODOMETRY and self.map.edge(number).source in ends
-        ]
-        for number in dropped:
-            self.map.set_status(number, Status.REJECTED, f"contradicted by registration: {proposal.reason}")
-        return dropped
 
     def _update(self, pose_odom: Array, reason: str, node: int | None = None, edges: list[int] | None = None) -> Update:
         moved = between(self._pose_odom_at_node, pose_odom)

@@ -214,6 +214,17 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
     return Session(folder, head, metrics)
 
 
+def _second_look(mapper: Mapper) -> list[Metric]:
+    tried, edges = mapper.book.tried_again, mapper.map.edges
+    solution = mapper.backends.solutions.get(mapper.backends.primary)
+    without = set(solution.report.rejected_edge_ids) if solution is not None else set()
+    kept = [number for number in tried if edges[number].status is Status.ACCEPTED and number not in without]
+    return [
+        Metric("loops_tried_again", len(tried), "1", "loops without weight, measured again on the final map"),
+        Metric("loops_readmitted", len(kept), "1", "of those, the ones that now agree with it"),
+    ]
+
+
 def _figures(mapper: Mapper, recorder: _Recorder, duration_s: float) -> list[Metric]:
     edges = mapper.map.edges
     loops = [edge for edge in edges if edge.kind is EdgeKind.LOOP]
@@ -224,6 +235,7 @@ def _figures(mapper: Mapper, recorder: _Recorder, duration_s: float) -> list[Met
         Metric("loops_accepted", count[Status.ACCEPTED], "1", "loop closures in the graph"),
         Metric("loops_pending", count[Status.PENDING], "1", "loop closures still waiting at the end"),
         Metric("loops_rejected", count[Status.REJECTED], "1", "loop closures refused, each with its reason"),
+        *_second_look(mapper),
         Metric("odometry_dropped", len(dropped), "1", "odometry edges that a registration contradicted"),
         Metric("largest_correction", recorder.largest_correction_m, "m", "largest shift of a node at one closure"),
         Metric("travel", mapper.map.node(len(mapper.map) - 1).travel_m, "m", "path length by odometry"),

@@ -118,9 +118,9 @@ class ProbeConfig(Section):
     """Largest standard deviation of the registration in any direction: a bare corridor is refused, m."""
     ambiguity_max: float = Field(default=0.9, gt=0, le=1)
     """Largest share of the likelihood that is left after a shift along the direction that the walls hold least."""
-    floor_m: float = Field(default=0.005, gt=0)
+    floor_m: float = Field(default=0.004, gt=0)
     """Standard deviation of the registration of two submaps at least, m: what their bending hides."""
-    floor_deg: float = Field(default=0.05, gt=0)
+    floor_deg: float = Field(default=0.04, gt=0)
     """The same, degrees."""
 
 
@@ -166,9 +166,9 @@ class RevisitConfig(Section):
     """Half-width of the grid of starts, degrees."""
     ambiguous_m: float = Field(default=1.5, gt=0)
     """Standard deviation along a direction in which a registration is ambiguous, m."""
-    floor_m: float = Field(default=0.0025, gt=0)
+    floor_m: float = Field(default=0.002, gt=0)
     """Standard deviation of such a registration at least, m."""
-    floor_deg: float = Field(default=0.03, gt=0)
+    floor_deg: float = Field(default=0.025, gt=0)
     """The same, degrees."""
 
 

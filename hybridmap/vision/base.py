@@ -6,7 +6,7 @@ solver: what they know reaches it as a `Belief`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol, runtime_checkable
@@ -112,6 +112,23 @@ class FrontEnd(Protocol):
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
         """What the map file keeps of a node's frame: `profile`, and `ranges_m`, or `color` and `depth_mm` (compact dtypes)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Doubted:
+    """A loop that a back-end holds for false: key of its proposal, and the nodes that it joins."""
+
+    key: int
+    source: int
+    target: int
+
+
+@runtime_checkable
+class VerifyingFrontEnd(FrontEnd, Protocol):
+    """A front-end that can measure loops again."""
+
+    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Proposal]:
+        """Measure loops again from where their nodes lie on the map; each keeps its key. What is left out stays as it is."""
 
 
 @dataclass(frozen=True, slots=True)

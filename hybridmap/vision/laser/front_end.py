@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, Array, RelativePose, compose
 from hybridmap.streams.base import Laser, LaserScan, Observation
-from hybridmap.vision.base import Belief, Proposal, Retraced, Verdict, View
+from hybridmap.vision.base import Belief, Doubted, Proposal, Retraced, Verdict, View
 from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan
 from hybridmap.vision.laser.clusters import Commitment, Settled
 from hybridmap.vision.laser.hypotheses import Hypothesis, Prober
@@ -118,6 +118,15 @@ class LaserFrontEnd:
         for hypothesis in self._reviser.round(belief):
             verdict = Verdict.REJECTED if hypothesis.refusal else Verdict.ACCEPTED
             out.append(_loop(self._next_key(), hypothesis, verdict, hypothesis.refusal or "near on the optimised map"))
+        return out
+
+    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Proposal]:
+        """Register again, from where they lie on the map, nodes whose loop a back-end holds for false."""
+        out = []
+        for d in doubted:
+            hypothesis = self._reviser.register(d.source, d.target, belief.poses_map_node)
+            verdict = Verdict.REJECTED if hypothesis.refusal else Verdict.ACCEPTED
+            out.append(_loop(d.key, hypothesis, verdict, hypothesis.refusal or "agrees with the map"))
         return out
 
     def retrace(self, belief: Belief) -> Retraced:

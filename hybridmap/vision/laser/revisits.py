@@ -37,7 +37,7 @@ class Reviser:
         for node in grid:
             for other in self._partners(int(node), grid, belief.poses_map_node):
                 self._done.add((int(node), other))
-                found.append(self._register(int(node), other, belief.poses_map_node))
+                found.append(self.register(int(node), other, belief.poses_map_node))
         return found
 
     def _grid(self) -> NDArray[np.int64]:
@@ -60,7 +60,8 @@ class Reviser:
                 chosen.append(other)
         return [o for o in chosen[: c.partners] if (node, o) not in self._done]
 
-    def _register(self, node: int, other: int, poses: Array) -> Hypothesis:
+    def register(self, node: int, other: int, poses: Array) -> Hypothesis:
+        """Register the scans about a node to those about an older one, from where the poses (N, 3) have them."""
         c, settings = self._config.revisits, self._config.registration
         target, probe = self._atlas.around(other, c.target_half_m), self._atlas.around(node, c.probe_half_m)
         sharp, fine = self._atlas.scoring_field(target, Field.SHARP), self._atlas.fine_field(target)

@@ -11,7 +11,7 @@ from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, RelativePose, between, compose, log
 from hybridmap.streams.base import LaserScan, RgbdFrame
-from hybridmap.vision.base import Belief, RetracingFrontEnd, Verdict
+from hybridmap.vision.base import Belief, Doubted, RetracingFrontEnd, Verdict, VerifyingFrontEnd
 from hybridmap.vision.laser.front_end import LaserFrontEnd
 
 SIGMAS = np.array([0.03, 0.03, np.deg2rad(0.5)])
@@ -125,9 +125,21 @@ def test_covariances_say_how_wrong_edges_are(two_laps):
         assert 0.5 * 2.366 < np.median(chi2) < 2.0 * 2.366, kind
 
 
+def test_a_doubted_loop_is_measured_again_and_one_of_two_places_is_not_found(two_laps):
+    final = between(two_laps.truth[0], two_laps.truth[two_laps.node_at])
+    loop = two_laps.loops(Verdict.ACCEPTED)[0]
+    other_side = int(np.argmax(np.hypot(*(final[: loop.source, :2] - final[loop.source, :2]).T)))
+    doubted = [Doubted(loop.key, loop.source, loop.target), Doubted(4711, loop.source, other_side)]
+    found, lost = two_laps.front_end.verify(doubted, two_laps.belief(final))
+    assert (found.key, found.source, found.target, found.verdict) == (loop.key, loop.source, loop.target, Verdict.ACCEPTED)
+    assert np.hypot(*two_laps.error(found)[:2]) < 0.05
+    assert (lost.key, lost.verdict) == (4711, Verdict.REJECTED)
+
+
 def test_scans_between_nodes_are_put_right_on_the_final_map(two_laps):
     final = between(two_laps.truth[0], two_laps.truth[two_laps.node_at])
     assert isinstance(two_laps.front_end, RetracingFrontEnd)
+    assert isinstance(two_laps.front_end, VerifyingFrontEnd)
     retraced = two_laps.front_end.retrace(two_laps.belief(final))
     assert len(retraced.nodes) > 0.95 * len(two_laps.truth)
     assert (np.diff(retraced.stamps_ns) > 0).all()

@@ -1,0 +1,91 @@
+"""Proposals become edges; loops that a back-end gave no weight are reported and measured again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hybridmap.backends.base import SolveReport, SolveStatus
+from hybridmap.config import Config
+from hybridmap.config.mapping import EdgesConfig
+from hybridmap.edge_book import EdgeBook
+from hybridmap.geometry import IDENTITY, RelativePose, between
+from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
+from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.mapper import Mapper
+from hybridmap.vision.base import Doubted, Proposal, Verdict
+from tests.streams_for_tests import RoomDrive
+
+COVARIANCE = np.diag([1e-4, 1e-4, 1e-5])
+
+
+def proposal(key: int, verdict: Verdict = Verdict.ACCEPTED, kind: str = "loop", contradicts: bool = False) -> Proposal:
+    relative = None if verdict is Verdict.REJECTED else RelativePose(np.array([1.0, 0, 0]), COVARIANCE)
+    return Proposal(key, kind, 3, 2 if contradicts else 0, verdict, "as it is", relative, {}, contradicts)
+
+
+@pytest.fixture
+def book() -> EdgeBook:
+    experiences = ExperienceMap()
+    for k in range(4):
+        experiences.add_node(Node(k, IDENTITY, np.zeros(1, np.float32), -1, float(k)), IDENTITY)
+        if k:
+            chain = RelativePose(np.array([1.0, 0, 0]), COVARIANCE)
+            experiences.add_edge(Edge(k - 1, k, EdgeKind.ODOMETRY, Status.ACCEPTED, "consecutive", chain))
+    return EdgeBook(experiences, EdgesConfig())
+
+
+def report(*rejected: int) -> SolveReport:
+    return SolveReport("gtsam-gnc", SolveStatus.CONVERGED, "", 1, 2.0, 1.0, 0.0, rejected)
+
+
+def test_a_later_proposal_of_the_same_key_replaces_the_edge(book):
+    assert book.enter([proposal(7, Verdict.PENDING)]) == [3]
+    assert book.enter([proposal(7), proposal(8, Verdict.REJECTED)]) == [3, 4]
+    assert [edge.status for edge in book._map.edges[3:]] == [Status.ACCEPTED, Status.REJECTED]
+
+
+def test_a_contradicted_odometry_edge_is_dropped(book):
+    assert book.enter([proposal(0, kind="registration", contradicts=True)]) == [3, 2]
+    assert book._map.edge(2).status is Status.REJECTED
+    assert "contradicted" in book._map.edge(2).reason
+
+
+def test_loops_without_weight_are_named_with_their_keys(book):
+    book.enter([proposal(5), proposal(6)])
+    assert book.doubted(report(4)) == [Doubted(6, 3, 0)]
+    assert book.doubted(report()) == []
+    assert book.report(report(3)) == [3]
+    assert book._map.edge(3).reason == "as it is; given no weight by gtsam-gnc at the end"
+    assert book._map.edge(3).status is Status.ACCEPTED
+
+
+def test_what_became_of_them_is_said(book):
+    book.enter([proposal(5), proposal(6)])
+    assert book.enter_again([proposal(5), proposal(6, Verdict.REJECTED)], "gtsam-gnc") == [3, 4]
+    found, lost = book._map.edge(3), book._map.edge(4)
+    assert found.status is Status.ACCEPTED
+    assert "measured again" in found.reason
+    assert lost.status is Status.REJECTED
+    assert "not found again" in lost.reason
+    assert book.tried_again == (3, 4)
+
+
+def test_a_loop_that_was_measured_wrongly_is_measured_again_at_the_end():
+    stream = RoomDrive(laps=2.2)
+    mapper = Mapper(Config.load("laser", {"backends.names": ["gtsam-gnc"]}), stream.rig)
+    for sample in stream:
+        mapper.add(sample)
+    mapper.finish()
+    loop = next(e for e in mapper.map.edges if e.kind is EdgeKind.LOOP and e.status is Status.ACCEPTED)
+    wrong = RelativePose(np.array([0.9, 0.8, 0.4]), COVARIANCE)
+    [spoilt] = mapper.book.enter([Proposal(900, "loop", loop.source, loop.target, Verdict.ACCEPTED, "made up", wrong)])
+    updates = mapper.finish()
+    solution, edge = mapper.backends.solutions["gtsam-gnc"], mapper.map.edge(spoilt)
+    assert mapper.book.tried_again == (spoilt,)
+    assert any(spoilt in update.edges for update in updates)
+    assert edge.status is Status.ACCEPTED
+    assert edge.reason.startswith("measured again, as gtsam-gnc had given it no weight")
+    assert spoilt not in solution.report.rejected_edge_ids
+    off = between(edge.relative.delta, between(*solution.poses[[edge.source, edge.target]]))
+    assert np.hypot(off[0], off[1]) < 0.03
