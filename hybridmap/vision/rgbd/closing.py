@@ -90,7 +90,8 @@ class LoopCloser:
         gated = self._gate(node, belief)
         changed = self._try_candidates(node, self._ranked(node, gated), belief) if len(gated) else []
         if self._config.verify != "none":
-            if not self._relocaliser.whereabouts.lost and not any(p.verdict is Verdict.ACCEPTED for p in changed):
+            broken = self._relocaliser.whereabouts.broken_at is not None
+            if not broken and not any(p.verdict is Verdict.ACCEPTED for p in changed):
                 near = self._nearest(node, 1, belief)
                 changed += self._try_again(node, near, belief, {j for j in near if self._is_sure(node, j, belief)})
             changed += self._relocalise(node, gated, changed, belief)
