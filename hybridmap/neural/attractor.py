@@ -52,13 +52,13 @@ class PlaceAttractor:
         x, y = displacement_m.tolist()
         whole_x, self._residuals[0, 0] = split_shift(x / self.cell_m)
         whole_y, self._residuals[1, 0] = split_shift(y / self.cell_m)
-        phase = np.dot(self._residuals, self._wave)
+        phase = self._residuals.dot(self._wave)
         np.cos(phase, out=phase)
-        np.dot(phase, self._kernel, out=self._lines)
+        phase.dot(self._kernel, out=self._lines)
         side = self._side
         row, column = -whole_x % side, -whole_y % side
         along_x, along_y = self._along_x[row : row + side], self._along_y[column : column + side]
-        spread = np.dot(np.dot(along_x, self.activity), along_y.T)
+        spread = along_x.dot(self.activity).dot(along_y.T)
         np.maximum(spread, self._silent, out=spread)
         total = float(np.vdot(spread, spread))
         spread *= spread
@@ -118,6 +118,6 @@ class PlaceAttractor:
 
 
 def _circulants(line: NDArray[np.floating], side: int) -> NDArray[np.floating]:
-    """View (2 N, N) of a line that is laid end to end three times (3 N,): rows w to w + N are its circulant, moved by -w cells."""
+    """View (2 N, N) of a line laid end to end three times (3 N,): rows w to w + N are its circulant, moved by -w cells."""
     stride = line.strides[0]
     return np.lib.stride_tricks.as_strided(line[side:], shape=(2 * side, side), strides=(stride, -stride))

@@ -83,7 +83,7 @@ class BandRings:
         rates, known = self._decoded
         if rates is self.activity:
             return known
-        vector = np.dot(self.activity.reshape(-1, self._weights.shape[0]), self._weights)
+        vector = self.activity.reshape(-1, self._weights.shape[0]).dot(self._weights)
         z = vector.view(self._complex).reshape(self._length.shape)
         np.abs(z, out=self._length_real)
         z /= self._length
@@ -103,7 +103,7 @@ class BandRings:
         """Move every ring by a displacement (2,) in the world, m; says what the rings tell the sheets."""
         before = self.phasors()
         self._displacement[:2] = displacement_m
-        np.dot(self._displacement, self._turn, out=self._turn_pairs)
+        self._displacement.dot(self._turn, out=self._turn_pairs)
         np.cos(self._turn_pairs, out=self._turn_pairs)
         np.multiply(before, self._turn_phasors, out=self._turned)
         self.activity = self._rates(self._turned_pairs)
@@ -116,7 +116,7 @@ class BandRings:
 
     def _rates(self, phasor_pairs: NDArray[np.floating]) -> NDArray[np.floating]:
         """The stationary rates (M, 3, n) of rings at unit phasors (3 M, 2), as (real, imaginary); read-only."""
-        offset = np.dot(phasor_pairs, self._tuning)
+        offset = phasor_pairs.dot(self._tuning)
         np.arccos(offset, out=offset)
         offset *= offset
         offset *= self._sharpness

@@ -30,7 +30,7 @@ class HeadDirectionRing:
 
     def direction(self) -> tuple[float, float]:
         """Return (cos, sin) of the decoded heading."""
-        c, s = np.dot(self._readout, self.activity).tolist()
+        c, s = self._readout.dot(self.activity).tolist()
         norm = math.hypot(c, s)
         return c / norm, s / norm
 
@@ -42,7 +42,7 @@ class HeadDirectionRing:
     def rates_at(self, heading_rad: float) -> NDArray[np.floating]:
         """Return the activity (m,) that stands for a heading, rad."""
         vector = np.array([math.cos(heading_rad), math.sin(heading_rad), 1.0])
-        return np.asarray(np.dot(vector.astype(self._tuning.dtype), self._tuning))
+        return np.asarray(vector.astype(self._tuning.dtype).dot(self._tuning))
 
     @property
     def heading_rad(self) -> float:
@@ -62,7 +62,7 @@ class HeadDirectionRing:
         middle_c, middle_s = c * cos - s * sin, c * sin + s * cos
         self._vector[0] = middle_c * cos - middle_s * sin
         self._vector[1] = middle_c * sin + middle_s * cos
-        self.activity = np.dot(self._vector, self._tuning)
+        self.activity = self._vector.dot(self._tuning)
         return middle_c, middle_s
 
     def rates(self, turn_rate_rad_s: float = 0.0, modulation_s: float = 0.1) -> NDArray[np.floating]:

@@ -66,6 +66,8 @@ class PathIntegrator:
         self._last_decoded_m: Array = np.zeros(2)
         self._since_theta_s = 0.0
         self._since_decoding_m = 0.0
+        self._read_out_every_m = _PART_OF_WRAP * self.attractor.extent_m
+        self._theta_period_s = 1.0 / place.theta_hz - 1e-9
         self._warned = False
         self.place.learn(self.grid.activity)
 
@@ -97,7 +99,7 @@ class PathIntegrator:
         if config.neuron_noise > 0.0:
             self._disturb()
         if dx != 0.0 or dy != 0.0:
-            self._translate(np.array([c * forward - s * left, s * forward + c * left]), dt_s)
+            self._translate(c * forward - s * left, s * forward + c * left, dt_s)
 
     def use_gains(self, gain: float, turn_gain: float, heading_bias_rad_m: float) -> None:
         """Integrate the steps to come with other gains (their meaning: `config/neural.py: NeuralConfig`)."""
@@ -234,11 +236,11 @@ class PathIntegrator:
         """Where the attractor's bump may be, (S, 2), m: nearest to the last decoded position first."""
         return self.attractor.unwrapped_m(self._last_decoded_m) + _WRAPS * self.attractor.extent_m
 
-    def _translate(self, displacement_m: Array, dt_s: float) -> None:
+    def _translate(self, x_m: float, y_m: float, dt_s: float) -> None:
         """Move the network; a jump is taken in parts, so that the read-out sees each turn of the attractor's wrap."""
-        way_m, most_m = math.hypot(*displacement_m), _PART_OF_WRAP * self.attractor.extent_m
-        parts = math.ceil(way_m / most_m)
-        part = displacement_m if parts == 1 else displacement_m / parts
+        way_m, most_m = math.hypot(x_m, y_m), self._read_out_every_m
+        parts = max(math.ceil(way_m / most_m), 1)
+        part = np.array((x_m / parts, y_m / parts))
         for _ in range(parts):
             motion = self.bands.step(part)
             self.grid.step(motion.advance, motion.phasors)
@@ -247,7 +249,7 @@ class PathIntegrator:
             if self._since_decoding_m >= most_m:
                 self.decode()
         self._since_theta_s += dt_s
-        if self._since_theta_s >= 1.0 / self.config.place.theta_hz - 1e-9:
+        if self._since_theta_s >= self._theta_period_s:
             self._since_theta_s = 0.0
             self._learn()
 

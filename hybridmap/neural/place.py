@@ -54,13 +54,13 @@ class PlaceCells:
         for cell in rates.nonzero()[0].tolist():
             weights = self._weights[cell]
             weights += np.float32(self.config.learning_rate * float(rates[cell])) * drive  # neither is negative
-            weights *= np.float32(1.0 / math.sqrt(float(np.dot(weights, weights))))
+            weights *= np.float32(1.0 / math.sqrt(float(weights.dot(weights))))
         return rates
 
     def respond(self, drive: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the rates (cells,) or (cells, P) to inputs (inputs,) or (inputs, P), as `inputs` gives them."""
         inhibition = np.float32(self.config.inhibition)
-        above = np.dot(self.weights, drive)
+        above = self.weights.dot(drive)
         above -= inhibition
         np.maximum(above, np.float32(0.0), out=above)
         above *= np.float32(1.0) / (np.float32(1.0) - inhibition)
@@ -79,7 +79,7 @@ class PlaceCells:
     def inputs(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
         """Rates above the module's mean of the grid cells that project to place cells, (inputs,), of unit length."""
         sampled = sheets[:, :: self._stride, :: self._stride].reshape(len(sheets), -1).astype(np.float32)
-        above = np.dot(sampled, self._less_mean)
+        above = sampled.dot(self._less_mean)
         np.maximum(above, np.float32(0.0), out=above)
         above *= self._module_weight
         above *= np.float32(1.0 / math.sqrt(float(np.vdot(above, above))))

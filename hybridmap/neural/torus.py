@@ -45,19 +45,19 @@ class LowModes:
 
     def forward(self, stack: NDArray[np.floating]) -> NDArray[np.complexfloating]:
         """Return the modes of a contiguous stack of sheets (N, M, N)."""
-        np.dot(stack.reshape(-1, self.side), self._columns, out=self._half_real)
-        np.dot(self._left, self._half, out=self._modes_flat)
+        stack.reshape(-1, self.side).dot(self._columns, out=self._half_real)
+        self._left.dot(self._half, out=self._modes_flat)
         return self._modes
 
     def inverse(self, modes: NDArray[np.complexfloating]) -> NDArray[np.floating]:
         """Return the stack of sheets (N, M, N) that have these modes and no others: a new array."""
-        np.dot(self._right, modes.reshape(self._modes_flat.shape), out=self._back)
-        return np.asarray(np.dot(self._back_real, self._rows)).reshape(self.side, -1, self.side)
+        self._right.dot(modes.reshape(self._modes_flat.shape), out=self._back)
+        return np.asarray(self._back_real.dot(self._rows)).reshape(self.side, -1, self.side)
 
     def shift(self, shift_cycles: NDArray[np.floating]) -> NDArray[np.complexfloating]:
         """Return the factors (2K+1, M, K+1) that move sheets by shifts (M, 2), cycles of the sheet."""
         self._shift_pairs[...] = shift_cycles
-        np.dot(self._shifts, self._angles, out=self._cosines)
+        self._shifts.dot(self._angles, out=self._cosines)
         np.cos(self._cosines, out=self._cosines)
         return self._factors
 

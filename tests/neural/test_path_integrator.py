@@ -154,6 +154,13 @@ def test_a_displacement_that_is_not_finite_is_refused():
     assert np.array_equal(integrator.pose, before)
 
 
+@pytest.mark.parametrize("way", [5e-324, 1e-300])
+def test_a_way_too_short_for_a_number_does_no_harm(way):
+    integrator = PathIntegrator(NeuralConfig(gain=0.1))
+    integrator.step((way, 0.0, 0.0), 0.1)
+    assert integrator.pose == pytest.approx(np.zeros(3), abs=1e-4)
+
+
 def test_an_absurd_jump_is_refused_with_its_size():
     with pytest.raises(StreamError, match="found 20000 m"):
         PathIntegrator(NeuralConfig()).step((2e4, 0.0, 0.0), 0.1)
