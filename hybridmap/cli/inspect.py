@@ -8,22 +8,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hybridmap.cli.options import OdometryFile, Source, Topic, sensor_settings
+
 if TYPE_CHECKING:
     from hybridmap.metrics import Metric
     from hybridmap.streams.inspection import Inspection
 
-Topic = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic to use instead of the one found.")]
-
 
 def inspect(
-    source: Annotated[str, typer.Argument(help="A .bag, .mcap or .db3 file, a ROS 2 bag or TUM folder, a .csv, or a world.")],
+    source: Source,
     config: Annotated[str | None, typer.Option(help="Configuration to map with: a name or a file.")] = None,
     odometry_topic: Topic = None,
     scan_topic: Topic = None,
     color_topic: Topic = None,
     depth_topic: Topic = None,
     camera_info_topic: Topic = None,
-    odometry_file: Annotated[str | None, typer.Option(help="TUM folder: the odometry file to use.")] = None,
+    odometry_file: OdometryFile = None,
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. sensors.sync_tolerance_s=0.05.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
@@ -33,15 +33,15 @@ def inspect(
     from hybridmap.metrics import to_json
     from hybridmap.streams.inspection import inspect_source
 
-    overrides: dict[str, Any] = {
-        "sensors.odometry_topic": odometry_topic,
-        "sensors.scan_topic": scan_topic,
-        "sensors.color_topic": color_topic,
-        "sensors.depth_topic": depth_topic,
-        "sensors.camera_info_topic": camera_info_topic,
-        "sensors.odometry_file": odometry_file,
-    }
-    overrides = {key: value for key, value in overrides.items() if value is not None} | parse_settings(setting)
+    topics = sensor_settings(
+        odometry_topic=odometry_topic,
+        scan_topic=scan_topic,
+        color_topic=color_topic,
+        depth_topic=depth_topic,
+        camera_info_topic=camera_info_topic,
+        odometry_file=odometry_file,
+    )
+    overrides = {**topics, **parse_settings(setting)}
     found = inspect_source(source, Config.load(config, overrides))
     if as_json:
         sys.stdout.write(to_json(_head(found), _metrics(found)) + "\n")

@@ -8,16 +8,15 @@ from typing import Annotated, Any
 
 import typer
 
+from hybridmap.cli.options import OdometryFile, Source, Topic, sensor_settings
 from hybridmap.cli.show import emit, progress
 from hybridmap.errors import EvaluationError
 
 log = logging.getLogger(__name__)
 
-Topic = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic to use instead of the one found.")]
-
 
 def map_source(
-    source: Annotated[str, typer.Argument(help="A .bag, .mcap or .db3 file, a ROS 2 bag or TUM folder, a .csv, or a world.")],
+    source: Source,
     out: Annotated[Path, typer.Option(help="The session folder itself.")],
     config: Annotated[str | None, typer.Option(help="Configuration: a name or a file. Default: by the sensors found.")] = None,
     backend: Annotated[
@@ -30,7 +29,7 @@ def map_source(
     color_topic: Topic = None,
     depth_topic: Topic = None,
     camera_info_topic: Topic = None,
-    odometry_file: Annotated[str | None, typer.Option(help="TUM folder: the odometry file to use.")] = None,
+    odometry_file: OdometryFile = None,
     seed: Annotated[int | None, typer.Option(help="Seed of every random draw.", min=0)] = None,
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. nodes.distance_m=0.3.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a session that is there.")] = False,
@@ -39,17 +38,17 @@ def map_source(
     """Map a recording: nodes, edges, back-ends, trajectories and a page, in one session folder."""
     from hybridmap.cli.choose import choose, parse_settings
 
-    overrides: dict[str, Any] = {
-        "sensors.odometry_topic": odometry_topic,
-        "sensors.scan_topic": scan_topic,
-        "sensors.color_topic": color_topic,
-        "sensors.depth_topic": depth_topic,
-        "sensors.camera_info_topic": camera_info_topic,
-        "sensors.odometry_file": odometry_file,
-        "backends.names": backend or None,
-        "seed": seed,
-    }
-    overrides = {key: value for key, value in overrides.items() if value is not None} | parse_settings(setting)
+    topics = sensor_settings(
+        odometry_topic=odometry_topic,
+        scan_topic=scan_topic,
+        color_topic=color_topic,
+        depth_topic=depth_topic,
+        camera_info_topic=camera_info_topic,
+        odometry_file=odometry_file,
+    )
+    named: dict[str, Any] = {"backends.names": backend or None, "seed": seed}
+    chosen_here = {key: value for key, value in named.items() if value is not None}
+    overrides = {**topics, **chosen_here, **parse_settings(setting)}
     chosen = choose(source, config, overrides, start_s=start, end_s=end)
     head, metrics = map_and_report(chosen.stream, chosen.config, out, overwrite=overwrite)
     emit(head, metrics, as_json=as_json, title=f"{out}: {chosen.stream.name}")
