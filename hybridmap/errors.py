@@ -39,3 +39,7 @@ class ExportError(HybridMapError):
 
 class EvaluationError(HybridMapError):
     """A comparison without enough common data."""
+
+
+class StudyError(HybridMapError):
+    """A study that cannot go on: its folder, its workers or its cluster."""

@@ -19,6 +19,7 @@ from hybridmap.cli.inspect import inspect
 from hybridmap.cli.map import map_source
 from hybridmap.cli.optimize import optimize
 from hybridmap.cli.simulate import simulate
+from hybridmap.cli.study import study
 from hybridmap.cli.verify import verify
 from hybridmap.errors import HybridMapError
 
@@ -57,6 +58,7 @@ app.command("evaluate")(evaluate)
 app.command("export")(export)
 app.command("optimize")(optimize)
 app.command("compare")(compare)
+app.command("study")(study)
 app.command("calibrate")(calibrate)
 app.command("simulate")(simulate)
 app.command("inspect")(inspect)

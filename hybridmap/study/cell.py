@@ -1,0 +1,231 @@
+"""One cell of a study: one graph, disturbed, through one back-end, and what the referee says of the outcome."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from hybridmap.backends.base import Solution, SolveStatus
+from hybridmap.backends.initial import angular_start
+from hybridmap.backends.objective import chi2
+from hybridmap.backends.odometry import dead_reckoning
+from hybridmap.backends.registry import create
+from hybridmap.backends.replay import replay
+from hybridmap.config.backends import BackendsConfig
+from hybridmap.errors import BackendError, HybridMapError
+from hybridmap.geometry import Array, align, between, compose
+from hybridmap.graph.connectivity import chain
+from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.study import provenance
+from hybridmap.study.disturb import Kind, with_drift, with_false_loops
+from hybridmap.study.model import BackendVariant, DriftConfig
+from hybridmap.study.sources import Frozen
+
+KEPT = 0.5
+"""A loop whose final weight is above this counts as kept."""
+
+UNMAPPED = "unmapped"
+"""Status of a cell whose source gave no graph."""
+
+MEASURES = {
+    "ate_m": ("m", "RMSE of position against the reference after SE(2) alignment, over the nodes"),
+    "yaw_deg": ("deg", "RMSE of heading against the reference after that alignment"),
+    "chi2_initial": ("1", "referee's chi2 of the poses to begin with, false loops included"),
+    "chi2": ("1", "referee's chi2 at the end, false loops included"),
+    "chi2_own": ("1", "referee's chi2 at the end over the graph's own edges, without the false loops put into it"),
+    "false_kept": ("1", f"false loops of weight above {KEPT}"),
+    "own_lost": ("1", f"of the graph's own loops, those of weight {KEPT} or below"),
+    "iterations": ("1", "iterations, sweeps or updates"),
+}
+"""Figure of merit -> unit and meaning, in the order of the tables."""
+
+
+@dataclass(frozen=True, slots=True)
+class CellTask:
+    """All that a cell needs; it may be sent to another machine.
+
+    Attributes:
+        key: digest of all that determines the figures.
+        frozen: the graph with its reference, packed.
+        drift, kind, rate, seed: what is done to it first.
+        backend, settings, start, way: as in `model.BackendVariant`.
+    """
+
+    key: str
+    frozen: bytes
+    drift: DriftConfig
+    kind: Kind
+    rate: float
+    seed: int
+    backend: str
+    settings: BackendsConfig
+    start: Literal["graph", "odometry", "chain", "angular", "reference"]
+    way: Literal["solve", "replay", "drive"]
+
+
+@dataclass(frozen=True, slots=True)
+class CellResult:
+    """What came out.
+
+    Attributes:
+        key: of the task.
+        status: the back-end's word, `failed` for a typed error, `unmapped` where there was no graph.
+        message: one line for people.
+        figures: `MEASURES` and counts of the graph; None where there is no such figure (a map that is none has no error).
+        cpu_s: process time of the back-end; apart from all results.
+        code: digest of the code that computed it.
+    """
+
+    key: str
+    status: str
+    message: str
+    figures: dict[str, float | None]
+    cpu_s: float
+    code: str
+
+
+def key_of(
+    source_key: str, drift: DriftConfig, false_loops: tuple[str, float, int], variant: BackendVariant, settings: Any
+) -> str:
+    """Digest of all that determines a cell; what plays no part (a rate of 0 has no kind and no seed) does not enter.
+
+    Args:
+        source_key: of the clean graph.
+        drift: put on its odometry.
+        false_loops: kind, rate and seed.
+        variant: the back-end's name, start and way.
+        settings: its whole section, a `BackendsConfig`.
+    """
+    kind, rate, seed = false_loops
+    return provenance.digest(
+        {
+            "code": provenance.solving(),
+            "source": source_key,
+            "drift": None if drift.idle else drift.model_dump(),
+            "drift_seed": seed if drift.noise > 0.0 else None,
+            "false_loops": [kind, rate, seed] if rate > 0.0 else None,
+            "backend": [variant.backend, variant.start, variant.way],
+            "settings": settings.model_dump(mode="json", exclude={"names"}),
+        }
+    )
+
+
+def run(task: CellTask) -> CellResult:
+    """Disturb the graph, solve it, judge it. A typed error is a result; anything else is a mistake of ours and raised."""
+    frozen = Frozen.unpack(task.frozen)
+    if frozen.graph is None:
+        return CellResult(task.key, UNMAPPED, frozen.failure, {}, 0.0, provenance.solving())
+    started = time.process_time()
+    counts: dict[str, float | None] = {}
+    try:
+        drifted = with_drift(frozen.graph, task.drift, task.seed)
+        graph = with_false_loops(drifted, task.kind, task.rate, task.seed)
+        counts = _counts(drifted, graph)
+        started = time.process_time()
+        solution = _solve(task, _begun(graph, task.start, frozen.reference))
+    except HybridMapError as error:
+        message = " ".join(str(error).split())
+        return CellResult(
+            task.key, str(SolveStatus.FAILED), message, counts, time.process_time() - started, provenance.solving()
+        )
+    cpu_s = time.process_time() - started
+    report = solution.report
+    figures = counts | {"iterations": float(report.iterations), "chi2_initial": _finite(report.chi2_initial)}
+    if report.status not in (SolveStatus.FAILED, SolveStatus.DIVERGED):
+        figures |= judge(drifted, graph, solution, frozen.reference)
+    return CellResult(task.key, str(report.status), report.message, figures, cpu_s, provenance.solving())
+
+
+def judge(own: PoseGraph, graph: PoseGraph, solution: Solution, reference: Array) -> dict[str, float | None]:
+    """Figures of a solution of `graph`, which is `own` with false loops appended; `reference` (N, 3) may hold NaN."""
+    weights = _weights(graph, solution)
+    false = np.arange(graph.n_edges) >= own.n_edges
+    loop = graph.is_loop
+    ate_m, yaw_deg = errors(solution.poses, reference)
+    return {
+        "ate_m": _finite(ate_m),
+        "yaw_deg": _finite(yaw_deg),
+        "chi2": _finite(solution.report.chi2),
+        "chi2_own": _finite(chi2(own, solution.poses)),
+        "false_kept": float(np.count_nonzero(false & (weights > KEPT))),
+        "own_lost": float(np.count_nonzero(loop & ~false & (weights <= KEPT))),
+    }
+
+
+def errors(poses: Array, reference: Array) -> tuple[float, float]:
+    """RMSE of position (m) and of heading (deg) after SE(2) alignment, over the nodes whose reference is known; else NaN."""
+    known = np.isfinite(reference).all(axis=1)
+    if np.count_nonzero(known) < 3:
+        return math.nan, math.nan
+    apart = between(reference[known], compose(align(reference[known], poses[known]), poses[known]))
+    position = np.hypot(apart[:, 0], apart[:, 1])
+    return float(np.sqrt(np.mean(position**2))), float(np.degrees(np.sqrt(np.mean(apart[:, 2] ** 2))))
+
+
+def _solve(task: CellTask, graph: PoseGraph) -> Solution:
+    """At once, node by node, or node by node with the end of the drive; the report counts everything."""
+    backend = create(task.backend, task.settings)
+    if task.way == "solve":
+        return backend.solve(graph)
+    iterations, last = 0, None
+    for last in replay(backend, graph):
+        iterations += last.report.iterations
+    if task.way == "drive":
+        last = backend.finish(graph)
+        iterations += last.report.iterations
+    assert last is not None
+    return replace(last, report=replace(last.report, iterations=iterations, chi2_initial=chi2(graph, graph.initial)))
+
+
+def _begun(graph: PoseGraph, start: str, reference: Array) -> PoseGraph:
+    """The graph with the poses to begin with; node 0 stays where it is.
+
+    Raises:
+        BackendError: there is no such start for this graph.
+    """
+    if start == "odometry":
+        return replace(graph, initial=dead_reckoning(graph, graph.initial[:1]))
+    if start == "chain":
+        return chain(graph)
+    if start == "angular":
+        poses = angular_start(graph)
+        if poses is None:
+            raise BackendError("start: angular: the linear equations are singular; choose another start")
+        return replace(graph, initial=poses)
+    if start == "reference":
+        if not np.isfinite(reference).all():
+            raise BackendError("start: reference: it is not known for every node; choose another start")
+        return replace(graph, initial=compose(graph.initial[0], between(reference[0], reference)))
+    return graph
+
+
+def _weights(graph: PoseGraph, solution: Solution) -> Array:
+    """(E,) final weight of each edge: as reported, else 0 for rejected ones; dead reckoning uses no loop at all."""
+    report = solution.report
+    weights = np.ones(graph.n_edges)
+    ids = graph.edge_ids.tolist()
+    if report.backend == "odometry":
+        weights[graph.is_loop] = 0.0
+    elif report.weights:
+        weights = np.array([report.weights.get(edge, 1.0) for edge in ids])
+    else:
+        weights[np.isin(graph.edge_ids, np.array(report.rejected_edge_ids, dtype=np.int64))] = 0.0
+    return weights
+
+
+def _counts(own: PoseGraph, graph: PoseGraph) -> dict[str, float | None]:
+    loops = float(np.count_nonzero(own.is_loop))
+    return {
+        "nodes": float(graph.n_nodes),
+        "edges": float(graph.n_edges),
+        "own_loops": loops,
+        "false_loops": float(graph.n_edges - own.n_edges),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

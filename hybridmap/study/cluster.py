@@ -1,0 +1,70 @@
+"""The work done by a Dask cluster: any number of machines that have the same hybridmap installed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
+
+from hybridmap.errors import StudyError
+from hybridmap.study.pools import ATTEMPTS, Lost
+
+Task = TypeVar("Task")
+Outcome = TypeVar("Outcome")
+
+_CONNECT_S = 30
+
+
+class DaskCluster:
+    """A scheduler and whatever workers it has; a task whose worker dies goes to another one.
+
+    Start the workers with one thread each (`dask worker --nthreads 1`), which also pins their numerical libraries to one.
+    """
+
+    def __init__(self, address: str) -> None:
+        """Connect to `tcp://host:port`.
+
+        Raises:
+            StudyError: the extra `cluster` is not installed, or nobody answers there, or no worker comes.
+        """
+        try:
+            import distributed
+        except ImportError:
+            raise StudyError("--scheduler needs the extra `cluster`: pip install 'hybridmap[cluster]'") from None
+        self._dask: Any = distributed
+        try:
+            self._client = distributed.Client(address, timeout=f"{_CONNECT_S}s", set_as_default=False)
+        except (OSError, ValueError, TimeoutError) as error:
+            said = " ".join(str(error).split())[:160] or type(error).__name__
+            raise StudyError(f"{address}: no Dask scheduler answers: {said}; expected tcp://HOST:PORT") from None
+        try:
+            self._client.wait_for_workers(1, timeout=_CONNECT_S)
+        except TimeoutError:
+            self.close()
+            raise StudyError(f"{address}: the scheduler has no worker; start some with `dask worker {address}`") from None
+
+    def run(self, work: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[tuple[int, Outcome | Lost]]:
+        """See `pools.Pool.run`.
+
+        Raises:
+            StudyError: the connection to the scheduler is lost; what is done so far has been yielded.
+        """
+        futures = {self._client.submit(work, task, pure=False, retries=ATTEMPTS): index for index, task in enumerate(tasks)}
+        try:
+            for future in self._dask.as_completed(list(futures)):
+                if future.status == "cancelled":
+                    raise StudyError("the connection to the Dask scheduler is lost; run again to go on")
+                error = future.exception()
+                yield futures[future], future.result() if error is None else self._lost(error)
+                future.release()
+        finally:
+            self._client.cancel(list(futures))
+
+    def close(self) -> None:
+        """End the connection; scheduler and workers stay."""
+        self._client.close()
+
+    def _lost(self, error: BaseException) -> Lost:
+        """What to say of a task that raised or that killed its workers; a worker without our package ends the study."""
+        if isinstance(error, ImportError):
+            raise StudyError(f"a worker cannot import hybridmap: {error}; install the same version on all") from None
+        return Lost.by(error)

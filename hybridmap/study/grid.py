@@ -1,0 +1,120 @@
+"""The grid: every cell of a study in its order, with the key that its result is kept under."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from itertools import product
+
+from hybridmap.study.cell import CellTask, key_of
+from hybridmap.study.disturb import Kind
+from hybridmap.study.model import SettingConfig, SourceConfig, StudyConfig, backend_settings
+from hybridmap.study.sources import Frozen, SourceTask, depends_on_seed, read_source, task_of
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One line of the table.
+
+    Attributes:
+        source, setting, backend: titles in the study.
+        kind: of the false loops; empty at rate 0.
+        rate: share of false loops.
+        seed: None where nothing in the cell is left to chance.
+        source_key: of the clean graph.
+        key: of the result; two cells that must have the same result have the same key.
+    """
+
+    source: str
+    setting: str
+    kind: str
+    rate: float
+    seed: int | None
+    backend: str
+    source_key: str
+    key: str
+
+    @property
+    def group(self) -> tuple[str, str, str, float]:
+        """What the cells of all back-ends and seeds have in common that are summed up together."""
+        return self.source, self.setting, self.kind, self.rate
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """All cells of a study, and how to come to their graphs.
+
+    Attributes:
+        study: what they were laid out from.
+        cells: in the order of the tables.
+        sources: key -> task, for every graph that a cell needs.
+    """
+
+    study: StudyConfig
+    cells: tuple[Cell, ...]
+    sources: dict[str, SourceTask]
+
+    def task(self, cell: Cell, frozen: bytes) -> CellTask:
+        """The work of a cell on its packed graph."""
+        setting = next(setting for setting in self.study.settings if setting.name == cell.setting)
+        variant = next(variant for variant in self.study.backends if variant.title == cell.backend)
+        kind: Kind = "aliased" if cell.kind == "aliased" else "random"
+        return CellTask(
+            key=cell.key,
+            frozen=frozen,
+            drift=setting.drift,
+            kind=kind,
+            rate=cell.rate,
+            seed=cell.seed or 0,
+            backend=variant.backend,
+            settings=backend_settings(variant),
+            start=variant.start,
+            way=variant.way,
+        )
+
+
+def lay_out(study: StudyConfig) -> Grid:
+    """Lay out the cells: sources, settings, kinds and rates, seeds, back-ends, the last one fastest.
+
+    Files and sessions are read, since their content is part of the keys; nothing is mapped.
+
+    Raises:
+        GraphError, StoreError, StreamError: a file or session is missing or damaged.
+        ConfigError: the mapping configuration of a world cannot be used.
+    """
+    read = {source.title: read_source(source) for source in study.sources if source.graph or source.session}
+    cells: list[Cell] = []
+    tasks: dict[str, SourceTask] = {}
+    variants = [(variant, backend_settings(variant)) for variant in study.backends]
+    for source, setting in product(study.sources, study.settings):
+        key_at = cache(partial(_enter, tasks, read, source, setting))
+        for kind, rate in _false_loops(study):
+            for seed in _seeds(study, source, setting, rate):
+                source_key = key_at((seed or 0) if depends_on_seed(source) else 0)
+                for variant, settings in variants:
+                    key = key_of(source_key, setting.drift, (kind, rate, seed or 0), variant, settings)
+                    cells.append(Cell(source.title, setting.name, kind, rate, seed, variant.title, source_key, key))
+    return Grid(study, tuple(cells), tasks)
+
+
+def _enter(
+    tasks: dict[str, SourceTask], read: Mapping[str, Frozen], source: SourceConfig, setting: SettingConfig, seed: int
+) -> str:
+    """Note the task for a graph; its key."""
+    task = task_of(source, setting, seed, read)
+    tasks[task.key] = task
+    return task.key
+
+
+def _false_loops(study: StudyConfig) -> list[tuple[str, float]]:
+    """Kinds and rates; a rate of 0 is of no kind, and there once."""
+    rates = study.false_loops.rates
+    none = [("", 0.0)] if 0.0 in rates else []
+    return none + [(kind, rate) for kind in study.false_loops.kinds for rate in rates if rate > 0.0]
+
+
+def _seeds(study: StudyConfig, source: SourceConfig, setting: SettingConfig, rate: float) -> Sequence[int | None]:
+    """Every seed where chance plays a part; a single None where every seed would give the same."""
+    by_chance = rate > 0.0 or setting.drift.noise > 0.0 or depends_on_seed(source)
+    return study.seeds if by_chance else (None,)

@@ -1,0 +1,65 @@
+"""What computes: versions and source text, so that results of different code are never taken for one another."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping
+from functools import cache
+from importlib import resources
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+SCHEMA = 1
+"""Raised when the meaning of a figure changes."""
+
+_LIBRARIES = ("gtsam", "numpy", "scipy", "opencv-python-headless")
+_SHOWING = ("cli", "evaluate", "export", "plots.py", "report", "session.py", "study")
+_SOLVING = ("backends", "config/backends.py", "geometry.py", "graph", "study/cell.py", "study/disturb.py", "study/sources.py")
+
+
+def digest(tree: Mapping[str, Any]) -> str:
+    """SHA-256 of plain values, whatever the order of their keys; 64 hexadecimal digits."""
+    text = json.dumps(tree, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@cache
+def solving() -> str:
+    """Digest of all that turns a graph into figures: our code, the libraries' versions, the machine's kind."""
+    return digest({"code": _digest_of(solving_only=True), **_surroundings()})
+
+
+@cache
+def mapping() -> str:
+    """The same of all that turns a simulated world into a graph."""
+    return digest({"code": _digest_of(solving_only=False), **_surroundings()})
+
+
+def _surroundings() -> dict[str, Any]:
+    return {
+        "schema": SCHEMA,
+        "hybridmap": version("hybridmap"),
+        "machine": platform.machine(),
+        "libraries": {name: _version(name) for name in _LIBRARIES},
+    }
+
+
+def _version(library: str) -> str:
+    try:
+        return version(library)
+    except PackageNotFoundError:  # the same library under another distribution's name
+        return ""
+
+
+def _digest_of(*, solving_only: bool) -> str:
+    package = Path(str(resources.files("hybridmap")))
+    total = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        name = path.relative_to(package).as_posix()
+        wanted = name.startswith(_SOLVING) or not (solving_only or name.startswith(_SHOWING))
+        if wanted:
+            total.update(f"{name}\0".encode() + path.read_bytes() + b"\0")
+    return total.hexdigest()

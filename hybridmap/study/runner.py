@@ -1,0 +1,117 @@
+"""A study from its grid to its results: graphs first, then cells, each kept as soon as it is known."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+from hybridmap.errors import StudyError
+from hybridmap.study import cell as cells
+from hybridmap.study import provenance, sources
+from hybridmap.study.cell import CellResult
+from hybridmap.study.folder import StudyFolder
+from hybridmap.study.grid import Grid
+from hybridmap.study.pools import Lost, Pool
+from hybridmap.study.sources import SourceTask
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[int, int], None]
+
+CRASHED = "crashed"
+"""Status of a cell that raised what no back-end may raise, or that killed its workers; not kept, tried again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcomes:
+    """What a run knows at its end.
+
+    Attributes:
+        results: key -> result, for every cell of the grid.
+        computed: cells that were computed in this run; the others were known.
+    """
+
+    results: dict[str, CellResult]
+    computed: int
+
+
+def run(grid: Grid, folder: StudyFolder, pool: Pool, progress: Progress | None = None) -> Outcomes:
+    """Compute what the folder does not know yet; call it within `folder.in_use()`.
+
+    Killed at any time, it goes on from there the next time; the results are the same bit for bit.
+
+    Args:
+        grid: the cells.
+        folder: where results are kept.
+        pool: who does the work.
+        progress: called with cells done and their total, after each cell.
+
+    Raises:
+        StudyError: the folder cannot be written to, or the workers have other code or libraries than this process.
+    """
+    unique = {cell.key: cell for cell in grid.cells}
+    results = {key: result for key in unique if (result := folder.result(key)) is not None}
+    missing = [cell for key, cell in unique.items() if key not in results]
+    graphs: dict[str, bytes | Lost] = {}
+    needed = list(dict.fromkeys(cell.source_key for cell in missing))
+
+    def count() -> None:
+        if progress is not None:
+            progress(len(results) + len(graphs), len(unique) + len(needed))
+
+    count()
+    for key, graph in _graphs([grid.sources[key] for key in needed], folder, pool):
+        graphs[key] = graph
+        count()
+    tasks = []
+    for cell in missing:
+        graph = graphs[cell.source_key]
+        if isinstance(graph, Lost):
+            results[cell.key] = _crashed(cell.key, graph)
+        else:
+            tasks.append(grid.task(cell, graph))
+    for index, outcome in pool.run(cells.run, tasks):
+        results[tasks[index].key] = _kept(tasks[index].key, outcome, folder)
+        count()
+    return Outcomes(results, computed=len(tasks))
+
+
+def _graphs(tasks: Sequence[SourceTask], folder: StudyFolder, pool: Pool) -> Iterator[tuple[str, bytes | Lost]]:
+    """(key, packed graph) for each task: kept from an earlier run, or made now and kept."""
+    missing = []
+    for task in tasks:
+        data = folder.frozen(task.key)
+        if data is None:
+            missing.append(task)
+        else:
+            yield task.key, data
+    for index, outcome in pool.run(sources.prepare, missing):
+        key = missing[index].key
+        if isinstance(outcome, Lost):
+            yield key, outcome
+            continue
+        _require_same_code(outcome.code)
+        folder.keep_frozen(key, outcome.frozen)
+        yield key, outcome.frozen
+
+
+def _kept(key: str, outcome: CellResult | Lost, folder: StudyFolder) -> CellResult:
+    """The result, which the folder knows from now on; a lost one is not kept."""
+    if isinstance(outcome, Lost):
+        return _crashed(key, outcome)
+    _require_same_code(outcome.code)
+    folder.keep_result(outcome)
+    return outcome
+
+
+def _crashed(key: str, loss: Lost) -> CellResult:
+    log.warning("a cell crashed: %s", loss.message)
+    return CellResult(key, CRASHED, loss.message, {}, 0.0, provenance.solving())
+
+
+def _require_same_code(code: str) -> None:
+    if code != provenance.solving():
+        raise StudyError(
+            "a worker has another version of hybridmap or its libraries than this machine; install the same on all"
+        )

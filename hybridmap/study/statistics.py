@@ -1,0 +1,176 @@
+"""Sums over the seeds, and paired differences to the first back-end, each with a confidence interval."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridmap.geometry import Array
+from hybridmap.study.cell import MEASURES, CellResult
+from hybridmap.study.grid import Cell, Grid
+from hybridmap.study.model import StatisticsConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A mean with its confidence interval; both limits are NaN with fewer than two values.
+
+    Attributes:
+        value, low, high: the mean and its limits; NaN without any value.
+        count: values.
+        confidence: of the interval.
+    """
+
+    value: float
+    low: float
+    high: float
+    count: int
+    confidence: float
+
+    def __str__(self) -> str:
+        if math.isnan(self.low):
+            return f"{self.count} values: no interval"
+        return f"{100 * self.confidence:g} % interval {self.low:.4g} to {self.high:.4g} of {self.count}"
+
+    @property
+    def excludes_zero(self) -> bool:
+        """Whether the whole interval is on one side of zero."""
+        return self.low > 0.0 or self.high < 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """One measure of one back-end over the seeds of one group (source, setting, kind and rate of false loops).
+
+    Attributes:
+        source, setting, kind, rate, backend, measure, unit: what is summed up.
+        cells, solved: in the group, and those of them that have the figure; the others are not part of the sums.
+        median, mean: over the seeds.
+        baseline: the first back-end.
+        difference: mean over the seeds of this back-end's figure minus the baseline's, where both have one; None for
+            the baseline itself.
+        better: share of these seeds in which this back-end's figure is the lower one; NaN without any.
+    """
+
+    source: str
+    setting: str
+    kind: str
+    rate: float
+    backend: str
+    measure: str
+    unit: str
+    cells: int
+    solved: int
+    median: float
+    mean: Interval
+    baseline: str
+    difference: Interval | None
+    better: float
+
+    @property
+    def label(self) -> str:
+        """The group in words."""
+        return f"{self.source}/{self.setting}" + (f"/{self.kind} {100 * self.rate:g} %" if self.kind else "")
+
+
+def summarise(grid: Grid, results: Mapping[str, CellResult]) -> list[Summary]:
+    """A summary for each group, back-end and measure, in the order of the grid."""
+    groups: dict[tuple[str, str, str, float], dict[str, dict[int | None, CellResult]]] = {}
+    for cell in grid.cells:
+        groups.setdefault(cell.group, {}).setdefault(cell.backend, {})[cell.seed] = results[cell.key]
+    baseline = grid.study.backends[0].title
+    rows = []
+    for group, by_backend in groups.items():
+        for backend, by_seed in by_backend.items():
+            against = None if backend == baseline else by_backend[baseline]
+            for measure, (unit, _) in MEASURES.items():
+                rows.append(_summary(group, backend, (measure, unit), by_seed, baseline, against, grid.study.statistics))
+    return rows
+
+
+def mean_of(values: Array, config: StatisticsConfig) -> Interval:
+    """The mean of (N,) values with its confidence interval, by Student's t or the BCa bootstrap; no draw is left to chance.
+
+    Values that are all alike have an interval of no width.
+    """
+    count = len(values)
+    mean = float(np.mean(values)) if count else math.nan
+    if count < 2:
+        return Interval(mean, math.nan, math.nan, count, config.confidence)
+    if np.ptp(values) == 0.0:
+        return Interval(mean, mean, mean, count, config.confidence)
+    low, high = _student(values, config) if config.method == "t" else _bootstrap(values, config)
+    return Interval(mean, low, high, count, config.confidence)
+
+
+def _student(values: Array, config: StatisticsConfig) -> tuple[float, float]:
+    from scipy.stats import t
+
+    reach = (
+        float(t.ppf(0.5 + 0.5 * config.confidence, len(values) - 1)) * float(np.std(values, ddof=1)) / math.sqrt(len(values))
+    )
+    mean = float(np.mean(values))
+    return mean - reach, mean + reach
+
+
+def _bootstrap(values: Array, config: StatisticsConfig) -> tuple[float, float]:
+    """Bias-corrected and accelerated; percentiles where a sample is too degenerate for that."""
+    from scipy.stats import bootstrap
+
+    for method in ("BCa", "percentile"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # degenerate samples give NaN, which is looked at
+            found = bootstrap(
+                (values,),
+                np.mean,
+                n_resamples=config.resamples,
+                confidence_level=config.confidence,
+                method=method,
+                vectorized=True,
+                rng=np.random.default_rng(0),
+            ).confidence_interval
+        if math.isfinite(found.low) and math.isfinite(found.high):
+            break
+    return float(found.low), float(found.high)
+
+
+def _summary(
+    group: tuple[str, str, str, float],
+    backend: str,
+    measure: tuple[str, str],
+    by_seed: Mapping[int | None, CellResult],
+    baseline: str,
+    against: Mapping[int | None, CellResult] | None,
+    config: StatisticsConfig,
+) -> Summary:
+    name, unit = measure
+    values = _figures(by_seed, name)
+    difference, better = None, math.nan
+    if against is not None:
+        other = _figures(against, name)
+        pairs = np.array([[values[seed], other[seed]] for seed in values if seed in other]).reshape(-1, 2)
+        difference = mean_of(pairs[:, 0] - pairs[:, 1], config)
+        better = float(np.mean(pairs[:, 0] < pairs[:, 1])) if len(pairs) else math.nan
+    every = np.array(list(values.values()))
+    median = float(np.median(every)) if len(every) else math.nan
+    counts = (len(by_seed), len(values), median, mean_of(every, config))
+    return Summary(*group, backend, name, unit, *counts, baseline, difference, better)
+
+
+def _figures(by_seed: Mapping[int | None, CellResult], measure: str) -> dict[int | None, float]:
+    found = {seed: result.figures.get(measure) for seed, result in by_seed.items()}
+    return {seed: value for seed, value in found.items() if value is not None}
+
+
+def of_measure(summaries: Sequence[Summary], measure: str) -> list[Summary]:
+    """Those of one measure."""
+    return [one for one in summaries if one.measure == measure]
+
+
+def in_group(cell: Cell, one: Summary) -> bool:
+    """Whether a cell is part of a summary."""
+    return (*cell.group, cell.backend) == (one.source, one.setting, one.kind, one.rate, one.backend)

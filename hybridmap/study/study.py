@@ -1,0 +1,106 @@
+"""A whole study in one call: lay out, compute what is missing, write tables and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hybridmap.errors import StudyError
+from hybridmap.metrics import Metric, to_json
+from hybridmap.study import provenance, tables
+from hybridmap.study.cell import CellResult
+from hybridmap.study.folder import CELLS_CSV, METRICS, STUDY, SUMMARY_CSV, TIMINGS_CSV, StudyFolder
+from hybridmap.study.grid import Cell, Grid, lay_out
+from hybridmap.study.model import StudyConfig
+from hybridmap.study.pools import Pool
+from hybridmap.study.runner import Progress, run
+from hybridmap.study.statistics import Summary, summarise
+from hybridmap.trajectory import write_text_atomic
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """A finished study.
+
+    Attributes:
+        folder: where it lies.
+        grid: its cells.
+        results: key -> result.
+        summaries: sums over the seeds, a group, back-end and measure each.
+        computed: cells that this run computed; the others were known.
+        head: the keys of `metrics.json` beside its list.
+        metrics: the figures.
+    """
+
+    folder: StudyFolder
+    grid: Grid
+    results: dict[str, CellResult]
+    summaries: list[Summary]
+    computed: int
+    head: dict[str, Any]
+    metrics: list[Metric]
+
+    @property
+    def rows(self) -> list[tuple[Cell, CellResult]]:
+        """Every cell with its result, in the order of the tables."""
+        return [(cell, self.results[cell.key]) for cell in self.grid.cells]
+
+
+def run_study(study: StudyConfig, out: Path, pool: Pool, progress: Progress | None = None) -> Study:
+    """Run or go on with a study; what an earlier run in the same folder knows is not computed again.
+
+    The folder gets `study.yaml`, `cells.csv`, `timings.csv`, `summary.csv` and `metrics.json`.
+
+    Raises:
+        StudyError: the folder cannot be used, or the workers cannot be.
+        GraphError, StoreError, StreamError, ConfigError: a source cannot be used; nothing has been written then.
+    """
+    folder = StudyFolder(out)
+    folder.check()
+    grid = lay_out(study)
+    with folder.in_use():
+        outcomes = run(grid, folder, pool, progress)
+        summaries = summarise(grid, outcomes.results)
+        head = _head(grid, outcomes.results)
+        metrics = _metrics(summaries)
+        texts = {
+            STUDY: study.to_yaml(),
+            CELLS_CSV: tables.cells_csv(grid.cells, outcomes.results),
+            TIMINGS_CSV: tables.timings_csv(grid.cells, outcomes.results),
+            SUMMARY_CSV: tables.summary_csv(summaries),
+            METRICS: to_json(head, metrics) + "\n",
+        }
+        try:
+            for name, text in texts.items():
+                write_text_atomic(out / name, text)
+        except OSError as error:
+            raise StudyError(f"{out}: cannot be written to: {error.strerror}") from None
+    return Study(folder, grid, outcomes.results, summaries, outcomes.computed, head, metrics)
+
+
+def _head(grid: Grid, results: dict[str, CellResult]) -> dict[str, Any]:
+    found = [results[cell.key].status for cell in grid.cells]
+    return {
+        "study": grid.study.name,
+        "study_hash": provenance.digest({"cells": [cell.key for cell in grid.cells]}),
+        "backends": [variant.title for variant in grid.study.backends],
+        "baseline": grid.study.backends[0].title,
+        "cells": len(grid.cells),
+        "status": {status: found.count(status) for status in sorted(set(found))},
+    }
+
+
+def _metrics(summaries: Sequence[Summary]) -> list[Metric]:
+    """Median and mean of each measure, and the mean difference to the baseline, `<figure>/<group>/<back-end>`."""
+    metrics = []
+    for one in summaries:
+        stage = f"{one.label}/{one.backend}"
+        stem = one.measure.removesuffix(f"_{one.unit}")
+        metrics.append(Metric(f"{stem}_median/{stage}", one.median, one.unit, f"median of {one.solved} of {one.cells} cells"))
+        metrics.append(Metric(f"{stem}_mean/{stage}", one.mean.value, one.unit, f"mean, {one.mean}"))
+        if one.difference is not None:
+            what = f"mean of the paired differences to {one.baseline}, {one.difference}"
+            metrics.append(Metric(f"{stem}_difference/{stage}", one.difference.value, one.unit, what))
+    return metrics

@@ -1,0 +1,80 @@
+"""The tables: every cell, what it cost, and the sums over the seeds. The same results give the same bytes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from hybridmap.study.cell import MEASURES, CellResult
+from hybridmap.study.grid import Cell
+from hybridmap.study.statistics import Summary
+
+_LABELS = ("source", "setting", "false_loop_kind", "false_loop_rate", "seed", "backend")
+_COUNTS = ("nodes", "edges", "own_loops", "false_loops")
+CELL_COLUMNS = (*_LABELS, "status", *MEASURES, *_COUNTS, "message", "key")
+"""Of `cells.csv`."""
+SUMMARY_COLUMNS = (
+    *(label for label in _LABELS if label != "seed"),
+    *("measure", "unit", "cells", "solved", "median", "mean", "mean_low", "mean_high"),
+    *("baseline", "pairs", "difference_mean", "difference_low", "difference_high", "share_lower"),
+)
+"""Of `summary.csv`."""
+TIMING_COLUMNS = (*_LABELS, "cpu_s", "key")
+"""Of `timings.csv`."""
+
+
+def cells_csv(cells: Sequence[Cell], results: Mapping[str, CellResult]) -> str:
+    """A line a cell in the order of the grid; numbers with all their digits, nothing where there is no figure."""
+    return _text(CELL_COLUMNS, (_cell_row(cell, results[cell.key]) for cell in cells))
+
+
+def timings_csv(cells: Sequence[Cell], results: Mapping[str, CellResult]) -> str:
+    """Process time of each cell, when it was computed; apart, since no two runs agree on it."""
+    return _text(TIMING_COLUMNS, ((*_labels(cell), shown(results[cell.key].cpu_s), cell.key) for cell in cells))
+
+
+def shown(value: float | None) -> str:
+    """A number with all its digits, whole ones without a point; nothing for None."""
+    if value is None:
+        return ""
+    return str(int(value)) if float(value).is_integer() and abs(value) < 2**53 else repr(float(value))
+
+
+def _labels(cell: Cell) -> tuple[str, ...]:
+    seed = "" if cell.seed is None else str(cell.seed)
+    return cell.source, cell.setting, cell.kind, shown(cell.rate), seed, cell.backend
+
+
+def _cell_row(cell: Cell, result: CellResult) -> tuple[str, ...]:
+    figures = tuple(shown(result.figures.get(name)) for name in (*MEASURES, *_COUNTS))
+    return (*_labels(cell), result.status, *figures, result.message, cell.key)
+
+
+def _text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return out.getvalue()
+
+
+def summary_csv(summaries: Sequence[Summary]) -> str:
+    """A line a group, back-end and measure."""
+    return _text(SUMMARY_COLUMNS, (_summary_row(one) for one in summaries))
+
+
+def _summary_row(one: Summary) -> tuple[str, ...]:
+    labels = (one.source, one.setting, one.kind, shown(one.rate), one.backend, one.measure, one.unit)
+    sums = (one.cells, one.solved, *(_known(value) for value in (one.median, one.mean.value, one.mean.low, one.mean.high)))
+    if one.difference is None:
+        return (*labels, *map(str, sums), one.baseline, *[""] * 5)
+    apart = one.difference
+    paired = tuple(_known(value) for value in (apart.value, apart.low, apart.high, one.better))
+    return (*labels, *map(str, sums), one.baseline, str(apart.count), *paired)
+
+
+def _known(value: float) -> str:
+    return shown(value if math.isfinite(value) else None)
