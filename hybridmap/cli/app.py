@@ -14,6 +14,7 @@ from hybridmap.cli.calibrate import calibrate
 from hybridmap.cli.compare import compare
 from hybridmap.cli.demo import demo
 from hybridmap.cli.evaluate import evaluate
+from hybridmap.cli.explain import explain
 from hybridmap.cli.export import export
 from hybridmap.cli.inspect import inspect
 from hybridmap.cli.map import map_source
@@ -55,6 +56,7 @@ def _options(
 app.command("demo")(demo)
 app.command("map")(map_source)
 app.command("evaluate")(evaluate)
+app.command("explain")(explain)
 app.command("export")(export)
 app.command("optimize")(optimize)
 app.command("compare")(compare)

@@ -120,7 +120,9 @@ class LoopCloser:
         self._note["gate"][GATE_FIELDS.index("whole_map")] = 1.0
         old = np.flatnonzero(belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s)
         found = self._relocaliser.search(node, np.setdiff1d(old, gated).astype(np.int64), belief)
-        if any(p.verdict is Verdict.ACCEPTED for p in found):
+        closures = {(p.source, p.target) for p in found if p.kind == "loop" and p.verdict is Verdict.ACCEPTED}
+        if closures:
+            self._filed |= closures
             self._travel_at_closure = float(belief.travel_m[node])
         return found
 

@@ -1,0 +1,145 @@
+"""`hybridmap explain`: why a loop was closed or not, why a node was made or not."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hybridmap.errors import ConfigError
+from hybridmap.trajectory import format_stamp
+
+if TYPE_CHECKING:
+    from hybridmap.evaluate.explain import Decision, FrameStory, NodeStory
+
+MOST_RANKED, MOST_LATER = 8, 12
+
+
+def explain(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Session folder, as `hybridmap map` writes it.")],
+    node: Annotated[
+        int | None, typer.Option(metavar="N", help="Explain what was decided at a node, 0 being the first.")
+    ] = None,
+    frame: Annotated[
+        float | None,
+        typer.Option(metavar="T", help="Explain an instant: seconds since the start of the recording, or a stamp."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+) -> None:
+    """Why: candidates, scores against their thresholds, verdicts (m, deg), and what would have had to be different."""
+    from hybridmap.evaluate.explain import Explainer
+    from hybridmap.metrics import to_json
+
+    if (node is None) == (frame is None):
+        raise ConfigError("explain: give either --node N or --frame T")
+    with Explainer(folder) as explainer:
+        instant = explainer.frame(frame) if frame is not None else None
+        number = node if instant is None else instant.at_node if instant.made else None
+        story = None if number is None else explainer.node(number)
+        primary = explainer.primary
+    if as_json:
+        head: dict[str, Any] = {"session": str(folder), "primary_backend": primary}
+        if instant is not None:
+            head["frame"] = instant.to_json()
+        if story is not None:
+            head["node"] = story.to_json()
+        sys.stdout.write(to_json(head, []) + "\n")
+        return
+    lines = [*(_frame_lines(instant) if instant else ()), *(_node_lines(story) if story else ())]
+    sys.stdout.write("\n".join(lines) + "\n")
+
+
+def _frame_lines(story: FrameStory) -> Iterator[str]:
+    yield f"frame at {story.time_s:.3f} s (stamp {format_stamp(story.stamp_ns)} s)"
+    yield f"  robot        {story.moved[0]:.3f} m and {story.moved[1]:.1f} deg from node {story.at_node}, the last one made"
+    if story.next_node is not None:
+        yield f"               node {story.next_node} came at {story.next_time_s:.3f} s"
+    yield from _pose_lines(story.poses, "believed")
+    yield f"  {'node made  ' if story.made else 'no node    '}  {story.reason}"
+    if story.made:
+        yield ""
+    else:
+        yield f"  more         --node {story.at_node} explains the node before" + (
+            f", --node {story.next_node} the one after" if story.next_node is not None else ""
+        )
+
+
+def _node_lines(story: NodeStory) -> Iterator[str]:
+    yield f"node {story.node} at {story.time_s:.3f} s (stamp {format_stamp(story.stamp_ns)} s)"
+    yield f"  travel       {story.travel_m:.2f} m so far"
+    if story.moved is not None:
+        yield f"  made         {story.moved[0]:.3f} m and {story.moved[1]:.1f} deg from node {story.node - 1}"
+    if story.template >= 0:
+        yield f"  view         template {story.template}" + (", which it founded" if story.founded else ", seen before")
+    yield from _pose_lines(story.poses, "pose")
+    yield from _gate_lines(story)
+    yield ""
+    yield "chain"
+    yield from _decisions(story.chain, story.node)
+    yield ""
+    yield f"loops to older nodes: {_counts(story.loops)}"
+    yield from _decisions(story.loops, story.node)
+    if story.later:
+        yield ""
+        yield f"loops from newer nodes: {_counts(story.later)}"
+        yield from _decisions(_accepted_first(story.later)[:MOST_LATER], story.node)
+        if len(story.later) > MOST_LATER:
+            yield f"  ... and {len(story.later) - MOST_LATER} more, see --json"
+
+
+def _pose_lines(poses: Any, title: str) -> Iterator[str]:
+    for name, (x, y, yaw) in poses.items():
+        yield f"  {title:12} x {x:.3f} m, y {y:.3f} m, heading {yaw * 57.29577951308232:.2f} deg by {name}"
+        title = ""
+
+
+def _gate_lines(story: NodeStory) -> Iterator[str]:
+    gate = story.gate
+    if gate:
+        inside = f"{gate['inside']:.0f} of {gate['older']:.0f} nodes that were old enough"
+        yield f"  gate         {gate['radius_m']:.2f} m and {gate['heading_deg']:.0f} deg: {inside}"
+        if gate["whole_map"]:
+            yield "               the robot was lost: the whole map was searched as well"
+    if story.nearest is not None:
+        node, metres, degrees = story.nearest
+        yield f"  nearest      of the older nodes on the final map: {node}, {metres:.2f} m and {degrees:.0f} deg away"
+    if len(story.ranked):
+        tried = {decision.edge.target for decision in story.loops}
+        best = [f"{row[0]:.0f} ({row[1]:.2f}{', tried' if int(row[0]) in tried else ''})" for row in story.ranked[:MOST_RANKED]]
+        yield f"  by its view  {', '.join(best)}: the best of the gate, with their G"
+
+
+def _counts(decisions: list[Decision]) -> str:
+    if not decisions:
+        return "none was considered"
+    statuses = [str(decision.edge.status) for decision in decisions]
+    return ", ".join(f"{statuses.count(status)} {status}" for status in dict.fromkeys(statuses))
+
+
+def _accepted_first(decisions: Iterable[Decision]) -> list[Decision]:
+    return sorted(decisions, key=lambda decision: str(decision.edge.status) != "accepted")
+
+
+def _decisions(decisions: Iterable[Decision], node: int) -> Iterator[str]:
+    for decision in decisions:
+        edge = decision.edge
+        other = edge.source if edge.target == node else edge.target
+        yield f"  {edge.kind.name.lower():12} {other:>5}  {str(edge.status).upper():9} {edge.reason}"
+        if decision.checks:
+            yield _indented("figures", "; ".join(f"{check} {'yes' if check.passed else 'NO'}" for check in decision.checks))
+        rest = {name: value for name, value in edge.scores.items() if name not in {c.rule.figure for c in decision.checks}}
+        if rest:
+            yield _indented("also", ", ".join(f"{name} {value:.4g}" for name, value in rest.items()))
+        if decision.otherwise:
+            yield _indented("otherwise", decision.otherwise)
+        if any(weight < 1.0 for weight in decision.weights.values()):
+            yield _indented("weight", ", ".join(f"{name} {weight:.2g}" for name, weight in decision.weights.items()))
+        if decision.error is not None:
+            yield _indented("off by", f"{decision.error[0]:.3f} m, {decision.error[1]:.2f} deg from the truth")
+
+
+def _indented(title: str, text: str) -> str:
+    return f"{'':22}{title:10} {text}"

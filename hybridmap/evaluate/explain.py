@@ -1,0 +1,362 @@
+"""Why the map is as it is at one node or at one instant, from the map file alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from hybridmap.errors import EvaluationError
+from hybridmap.evaluate.association import known_at
+from hybridmap.evaluate.checks import Check, checks_of, otherwise, setting
+from hybridmap.geometry import Array, between
+from hybridmap.graph.experience_map import Edge, ExperienceMap
+from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.store import MapStore, SessionFolder
+from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
+from hybridmap.vision.gating import GATE_FIELDS
+
+_AT_NODE_NS = 1_000
+_STAMPS_FROM_S = 1e6  # a time beyond it is a stamp, not seconds since the start
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """One edge that was considered, and what came of it.
+
+    Attributes:
+        number: of the edge in the map file.
+        edge: itself: ends, kind, status, reason, measurement, scores.
+        checks: its figures against the settings, in the order in which they were asked.
+        otherwise: what would have had to be different for the other decision.
+        weights: back-end -> weight of an accepted loop there (0: held for false).
+        error: (m, deg) of its measurement against the truth, where that is known.
+    """
+
+    number: int
+    edge: Edge
+    checks: list[Check]
+    otherwise: str
+    weights: Mapping[str, float] = field(default_factory=dict)
+    error: tuple[float, float] | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        e = self.edge
+        return {
+            "edge": self.number,
+            "source": e.source,
+            "target": e.target,
+            "kind": e.kind.name.lower(),
+            "status": str(e.status),
+            "reason": e.reason,
+            "since_node": e.since_node,
+            "relative": None if e.relative is None else e.relative.delta.tolist(),
+            "scores": dict(e.scores),
+            "checks": [
+                {
+                    "figure": c.rule.figure,
+                    "value": c.value,
+                    "needs": "at least" if c.rule.at_least else "at most",
+                    "limit": c.limit,
+                    "setting": c.rule.setting,
+                    "passed": c.passed,
+                }
+                for c in self.checks
+            ],
+            "otherwise": self.otherwise,
+            "weights": dict(self.weights),
+            "error_m": None if self.error is None else self.error[0],
+            "error_deg": None if self.error is None else self.error[1],
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class NodeStory:
+    """What happened at one node.
+
+    Attributes:
+        node: its number.
+        stamp_ns: of its frame.
+        time_s: since the first stamp of the recording, s.
+        travel_m: path length so far.
+        moved: (m, deg) since the node before, None for the first.
+        nearest: the older node that sees most nearly the same on the final map, and how far it is off: (node, m, deg).
+        template, founded: its view template, and whether no earlier node has it.
+        poses: name -> (3,) final pose by every back-end, `odometry` first.
+        gate: which older nodes were compared with it, by name (see `vision.gating.GATE_FIELDS`); empty where not stored.
+        ranked: (n, 3) the best of them by their views: node, G, shift in columns.
+        chain: odometry and registration edges that end here.
+        loops: closures that were considered when it was made, or proposed of it at the end.
+        later: closures that later nodes considered with it.
+    """
+
+    node: int
+    stamp_ns: int
+    time_s: float
+    travel_m: float
+    moved: tuple[float, float] | None
+    nearest: tuple[int, float, float] | None
+    template: int
+    founded: bool
+    poses: Mapping[str, Array]
+    gate: Mapping[str, float]
+    ranked: Array
+    chain: list[Decision]
+    loops: list[Decision]
+    later: list[Decision]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "node": self.node,
+            "stamp_ns": self.stamp_ns,
+            "time_s": self.time_s,
+            "travel_m": self.travel_m,
+            "moved_m": None if self.moved is None else self.moved[0],
+            "moved_deg": None if self.moved is None else self.moved[1],
+            "nearest_older": None if self.nearest is None else dict(zip(("node", "m", "deg"), self.nearest, strict=True)),
+            "template": self.template,
+            "founded_template": self.founded,
+            "poses": {name: pose.tolist() for name, pose in self.poses.items()},
+            "gate": dict(self.gate),
+            "ranked": [{"node": int(r[0]), "profile_G": float(r[1]), "shift": int(r[2])} for r in self.ranked],
+            "chain": [decision.to_json() for decision in self.chain],
+            "loops": [decision.to_json() for decision in self.loops],
+            "later": [decision.to_json() for decision in self.later],
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class FrameStory:
+    """What happened at one instant.
+
+    Attributes:
+        stamp_ns, time_s: of the instant that the map file has, nearest to what was asked for.
+        at_node: the node that the robot had made last.
+        moved: (m, deg) since it.
+        made: a node was made at this instant.
+        reason: why a node was made, or why not.
+        next_node, next_time_s: the node made next, None at the end.
+        poses: name -> (3,) where the robot believed to be at the time, `odometry` first.
+    """
+
+    stamp_ns: int
+    time_s: float
+    at_node: int
+    moved: tuple[float, float]
+    made: bool
+    reason: str
+    next_node: int | None
+    next_time_s: float | None
+    poses: Mapping[str, Array]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "stamp_ns": self.stamp_ns,
+            "time_s": self.time_s,
+            "at_node": self.at_node,
+            "moved_m": self.moved[0],
+            "moved_deg": self.moved[1],
+            "made_node": self.made,
+            "reason": self.reason,
+            "next_node": self.next_node,
+            "next_time_s": self.next_time_s,
+            "poses": {name: pose.tolist() for name, pose in self.poses.items()},
+        }
+
+
+class Explainer:
+    """Answers questions about one session; open it as a context manager.
+
+    Args:
+        folder: the session folder.
+
+    Raises:
+        StoreError: no session there.
+        EvaluationError: its map holds no node.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        SessionFolder(folder).require()
+        self._folder = SessionFolder(folder)
+        self._store = MapStore.open(folder)
+        self._map: ExperienceMap = self._store.map()
+        if len(self._map) == 0:
+            self._store.close()
+            raise EvaluationError(f"{folder}: its map holds no node: there is nothing to explain")
+        self._settings: dict[str, Any] = yaml.safe_load(self._store.config_yaml) or {}
+        self._held_at: dict[int, bool] = {}
+
+    def __enter__(self) -> Explainer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._store.close()
+
+    @property
+    def primary(self) -> str:
+        """The back-end that is judged."""
+        return self._store.primary
+
+    def node(self, number: int) -> NodeStory:
+        """What happened at a node.
+
+        Raises:
+            EvaluationError: it does not exist.
+        """
+        if not 0 <= number < len(self._map):
+            raise EvaluationError(f"{self._folder.path}: node {number} does not exist; expected one of 0..{len(self._map) - 1}")
+        node, kept = self._map.node(number), self._store.keyframe(number)
+        before = self._map.node(number - 1) if number else None
+        earlier = {n.template for n in self._map.nodes[:number]}
+        edges = [self._decision(n, e) for n, e in enumerate(self._map.edges) if number in (e.source, e.target)]
+        newest = [d for d in edges if max(d.edge.source, d.edge.target) == number]
+        gate = kept.get("gate")
+        return NodeStory(
+            node=number,
+            stamp_ns=node.stamp_ns,
+            time_s=self._since_start(node.stamp_ns),
+            travel_m=node.travel_m,
+            moved=None if before is None else _moved(between(before.pose_odom, node.pose_odom)),
+            nearest=self._nearest(number),
+            template=node.template,
+            founded=node.template >= 0 and node.template not in earlier,
+            poses=self._poses(number),
+            gate={} if gate is None else dict(zip(GATE_FIELDS, gate.tolist(), strict=False)),
+            ranked=np.asarray(kept.get("ranked", np.zeros((0, 3))), dtype=np.float64),
+            chain=[d for d in newest if d.edge.kind is not EdgeKind.LOOP],
+            loops=[d for d in newest if d.edge.kind is EdgeKind.LOOP],
+            later=[d for d in edges if d not in newest and d.edge.kind is EdgeKind.LOOP],
+        )
+
+    def frame(self, time_s: float) -> FrameStory:
+        """What happened at an instant: seconds since the start, or (beyond 1e6) a stamp.
+
+        Raises:
+            EvaluationError: the recording does not cover it.
+        """
+        track = self._store.track()
+        stamps = track.stamps_ns
+        if len(stamps) == 0:
+            raise EvaluationError(f"{self._folder.path}: its map holds no frame")
+        wanted = round(time_s * NS_PER_S) if time_s >= _STAMPS_FROM_S else int(stamps[0]) + round(time_s * NS_PER_S)
+        at = int(np.argmin(np.abs(stamps - wanted)))
+        spacing = int(np.max(np.diff(stamps), initial=NS_PER_S))
+        if abs(int(stamps[at]) - wanted) > spacing:
+            span = self._since_start(int(stamps[-1]))
+            raise EvaluationError(
+                f"{self._folder.path}: no frame at {time_s:g} s; expected 0..{span:.3f} s from the start, or a stamp in "
+                f"{stamps[0] / NS_PER_S:.3f}..{stamps[-1] / NS_PER_S:.3f} s"
+            )
+        stamp, node = int(stamps[at]), int(track.nodes[at])
+        made = abs(self._map.node(node).stamp_ns - stamp) <= _AT_NODE_NS
+        after = self._map.node(node + 1) if node + 1 < len(self._map) else None
+        moved = _moved(track.deltas[at])
+        believed = {"odometry": track.poses_odom[at]}
+        for name in self._store.online_backends():
+            believed[name] = self._store.online(name).at(np.array([stamp]))[0]
+        return FrameStory(
+            stamp_ns=stamp,
+            time_s=self._since_start(stamp),
+            at_node=node,
+            moved=moved,
+            made=made,
+            reason=self._why_a_node(node) if made else self._why_no_node(moved),
+            next_node=None if after is None else node + 1,
+            next_time_s=None if after is None else self._since_start(after.stamp_ns),
+            poses=believed,
+        )
+
+    def _why_a_node(self, number: int) -> str:
+        if number == 0:
+            return "first experience"
+        moved = _moved(between(self._map.node(number - 1).pose_odom, self._map.node(number).pose_odom))
+        if setting(self._settings, "nodes.rule") == "novelty":
+            return f"a new place or view, {moved[0]:.2f} m and {moved[1]:.0f} deg since node {number - 1}"
+        return f"{moved[0]:.2f} m and {moved[1]:.0f} deg since node {number - 1}; {self._node_rule()}"
+
+    def _why_no_node(self, moved: tuple[float, float]) -> str:
+        if setting(self._settings, "nodes.rule") == "novelty":
+            least = setting(self._settings, "nodes.place_threshold")
+            return f"neither a new view template nor a place code {least} from every node's (nodes.place_threshold)"
+        return (
+            f"only {moved[0]:.2f} m and {moved[1]:.0f} deg since the last node, or no view at this instant; {self._node_rule()}"
+        )
+
+    def _node_rule(self) -> str:
+        metres, degrees = (setting(self._settings, f"nodes.{name}") for name in ("distance_m", "angle_deg"))
+        return f"a node is made every {metres} m (nodes.distance_m) or {degrees} deg (nodes.angle_deg)"
+
+    def _since_start(self, stamp_ns: int) -> float:
+        return (stamp_ns - self._first_ns) / NS_PER_S
+
+    @cached_property
+    def _first_ns(self) -> int:
+        stamps = self._store.track().stamps_ns
+        return int(stamps[0]) if len(stamps) else self._map.node(0).stamp_ns
+
+    @cached_property
+    def _truth(self) -> Trajectory | None:
+        return read_tum(self._folder.groundtruth) if self._folder.groundtruth.is_file() else None
+
+    def _poses(self, number: int) -> dict[str, Array]:
+        out = {"odometry": self._map.node(number).pose_odom}
+        for name, solution in self._store.solutions().items():
+            if number < len(solution.poses):
+                out[name] = solution.poses[number]
+        return out
+
+    def _nearest(self, number: int) -> tuple[int, float, float] | None:
+        """By distance and turn together (1 rad counts as 1 m), of the nodes old enough to be loops."""
+        age = setting(self._settings, "vision.rgbd.closing.min_age_s")
+        young_ns = round((age if isinstance(age, int | float) else 10.0) * NS_PER_S)
+        stamps = np.array([node.stamp_ns for node in self._map.nodes[:number]], dtype=np.int64)
+        old = np.flatnonzero(stamps <= self._map.node(number).stamp_ns - young_ns)
+        solution = self._store.solutions().get(self.primary)
+        if len(old) == 0 or solution is None or number >= len(solution.poses):
+            return None
+        apart = between(solution.poses[number], solution.poses[old])
+        metres, turned = np.hypot(apart[:, 0], apart[:, 1]), np.abs(apart[:, 2])
+        best = int(np.argmin(metres + turned))
+        return int(old[best]), float(metres[best]), float(np.degrees(turned[best]))
+
+    def _decision(self, number: int, edge: Edge) -> Decision:
+        held = self._held(edge.source) or self._held(edge.target)
+        checks = [] if edge.kind is EdgeKind.ODOMETRY else checks_of(edge, self._settings, held)
+        weights = {}
+        if edge.kind is EdgeKind.LOOP and edge.status == "accepted":
+            for name, solution in self._store.solutions().items():
+                rejected = number in solution.report.rejected_edge_ids
+                weights[name] = 0.0 if rejected else solution.report.weights.get(number, 1.0)
+            weights.pop("odometry", None)
+        return Decision(number, edge, checks, otherwise(edge, checks, self._settings), weights, self._error(edge))
+
+    def _held(self, node: int) -> bool:
+        """The camera's tilt was measured at a node and not taken from the mounting."""
+        if node not in self._held_at:
+            camera, kept = self._store.rig.camera, self._store.keyframe(node).get("T_base_camera")
+            self._held_at[node] = (
+                camera is not None and kept is not None and not np.allclose(kept, camera.T_base_camera, atol=1e-6)
+            )
+        return self._held_at[node]
+
+    def _error(self, edge: Edge) -> tuple[float, float] | None:
+        if self._truth is None or edge.relative is None:
+            return None
+        stamps = np.array([self._map.node(end).stamp_ns for end in (edge.source, edge.target)], dtype=np.int64)
+        if not known_at(self._truth, stamps).all():
+            return None
+        poses = self._truth.at(stamps)
+        return _moved(between(between(poses[0], poses[1]), edge.relative.delta))
+
+
+def _moved(delta: Array) -> tuple[float, float]:
+    """Distance, m, and turn, degrees."""
+    return float(np.hypot(delta[0], delta[1])), float(np.degrees(abs(delta[2])))
