@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,15 +56,24 @@ def cloud_of_scan(ranges_m: NDArray[np.float32], laser: Laser, config: ScanConfi
         laser: bearings and mounting.
         config: range limit and cell size.
     """
-    ranges = ranges_m.astype(np.float64)
+    return clouds_of_scans([ranges_m], laser, config)[0]
+
+
+def clouds_of_scans(ranges_m: Sequence[NDArray[np.float32]], laser: Laser, config: ScanConfig) -> list[Cloud]:
+    """The same for many scans, worked out together: a scan is too small to keep an array operation busy."""
+    ranges = np.array(ranges_m, dtype=np.float64).reshape(len(ranges_m), -1)
     valid = (ranges >= laser.range_min_m) & (ranges <= min(laser.range_max_m, config.range_max_m))
-    ranges, bearings = ranges[valid], laser.bearings_rad[valid]
-    if len(ranges) < 2 * NEIGHBOURS + 1:
-        return EMPTY
-    points = np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1)
+    valid &= valid.sum(axis=1, keepdims=True) >= 2 * NEIGHBOURS + 1
+    scan, beam = np.nonzero(valid)
+    if len(scan) == 0:
+        return [EMPTY] * len(ranges_m)
+    distance, bearing = ranges[scan, beam], laser.bearings_rad[beam]
+    points = np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], axis=1)
     step = abs(float(laser.bearings_rad[-1] - laser.bearings_rad[0])) / max(len(laser.bearings_rad) - 1, 1)
-    normals = _normals(points, np.minimum(1.0, 0.1 + 8.0 * step * ranges))
-    return merged([Cloud(points, normals).moved(laser.pose_base_laser)], config.cell_m)
+    normals = _normals(points, np.minimum(1.0, 0.1 + 8.0 * step * distance), scan)
+    whole, group = _merged(Cloud(points, normals).moved(laser.pose_base_laser), scan, config.cell_m)
+    ends = np.searchsorted(group, np.arange(len(ranges_m) + 1))
+    return [Cloud(whole.points[a:b], whole.normals[a:b]) for a, b in pairwise(ends.tolist())]
 
 
 def merged(clouds: Iterable[Cloud], cell_m: float) -> Cloud:
@@ -71,33 +81,49 @@ def merged(clouds: Iterable[Cloud], cell_m: float) -> Cloud:
     parts = [c for c in clouds if len(c)]
     if not parts:
         return EMPTY
-    points = np.concatenate([c.points for c in parts])
-    normals = np.concatenate([c.normals for c in parts])
-    low = points.min(axis=0)
-    cells = ((points - low) / cell_m).astype(np.int64)
-    key = cells[:, 0] * (int(cells[:, 1].max()) + 1) + cells[:, 1]
-    _, group, count = np.unique(key, return_inverse=True, return_counts=True)
+    whole = Cloud(np.concatenate([c.points for c in parts]), np.concatenate([c.normals for c in parts]))
+    return _merged(whole, np.zeros(len(whole), dtype=np.int64), cell_m)[0]
+
+
+def _merged(cloud: Cloud, group: NDArray[np.int64], cell_m: float) -> tuple[Cloud, NDArray[np.int64]]:
+    """Merge points of one cell and one group; group numbers ascend along the points. Returns what is left, with its groups."""
+    first = np.flatnonzero(np.diff(group, prepend=-1))
+    low = np.zeros((int(group[-1]) + 1, 2))
+    low[group[first]] = np.minimum.reduceat(cloud.points, first, axis=0)
+    cells = ((cloud.points - low[group]) / cell_m).astype(np.int64)
+    rows, columns = (int(n) + 1 for n in cells.max(axis=0))
+    key = (group * rows + cells[:, 0]) * columns + cells[:, 1]
+    found, member, count = np.unique(key, return_inverse=True, return_counts=True)
     n = len(count)
-    mean: Array = np.stack([np.bincount(group, points[:, i], n) / count for i in (0, 1)], axis=1)
-    normal: Array = np.stack([np.bincount(group, normals[:, i], n) for i in (0, 1)], axis=1)
+    mean: Array = np.stack([np.bincount(member, cloud.points[:, i], n) / count for i in (0, 1)], axis=1)
+    normal: Array = np.stack([np.bincount(member, cloud.normals[:, i], n) for i in (0, 1)], axis=1)
     length = np.sqrt((normal**2).sum(axis=1))
     normal = np.where((length > 0.3)[:, None], normal / np.maximum(length, 1e-9)[:, None], 0.0)
-    return Cloud(mean, normal)
+    return Cloud(mean, normal), found // (rows * columns)
 
 
-def _normals(points: Array, reach_m: Array) -> Array:
-    """Normal of the line through each point's neighbours in beam order, towards the laser at the origin; (P, 2)."""
-    n = len(points)
-    window = np.arange(n)[:, None] + np.arange(-NEIGHBOURS, NEIGHBOURS + 1)[None]
-    inside = (window >= 0) & (window < n)
-    offset = points[np.clip(window, 0, n - 1)] - points[:, None]
-    dx, dy = offset[..., 0], offset[..., 1]
-    w = (inside & (dx * dx + dy * dy <= (reach_m**2)[:, None])).astype(np.float64)
-    total = w.sum(axis=1)
-    mx, my = (w * dx).sum(axis=1) / total, (w * dy).sum(axis=1) / total
-    xx = (w * dx * dx).sum(axis=1) / total - mx * mx
-    yy = (w * dy * dy).sum(axis=1) / total - my * my
-    xy = (w * dx * dy).sum(axis=1) / total - mx * my
+def _normals(points: Array, reach_m: Array, scan: NDArray[np.int64]) -> Array:
+    """Normal of the line through each point's neighbours in beam order, towards the laser at the origin; (P, 2).
+
+    Args:
+        points: (P, 2) of one scan after the other, in beam order.
+        reach_m: (P,) how far a neighbour may lie.
+        scan: (P,) number of the scan: neighbours are of the same.
+    """
+    n, reach = len(points), reach_m**2
+    total, sums = np.ones(n), np.zeros((5, n))
+    for k in range(1, min(NEIGHBOURS, n - 1) + 1):
+        dx, dy = (points[k:] - points[:-k]).T
+        terms = np.stack([dx, dy, dx * dx, dy * dy, dx * dy])
+        squared, same = terms[2] + terms[3], scan[k:] == scan[:-k]
+        ahead, behind = same & (squared <= reach[:-k]), same & (squared <= reach[k:])
+        total[:-k] += ahead
+        total[k:] += behind
+        sums[:, :-k] += terms * ahead
+        terms[:2] *= -1.0
+        sums[:, k:] += terms * behind
+    mx, my, xx, yy, xy = sums / total
+    xx, yy, xy = xx - mx * mx, yy - my * my, xy - mx * my
     along = 0.5 * np.arctan2(2.0 * xy, xx - yy)
     normal = np.stack([-np.sin(along), np.cos(along)], axis=1)
     spread = np.sqrt((xx - yy) ** 2 + 4.0 * xy * xy)

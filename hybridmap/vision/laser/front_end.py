@@ -42,7 +42,7 @@ class LaserFrontEnd:
         self._reviser = Reviser(self._config, self._atlas, laser)
         self._commitment = Commitment(self._config.commitment, self._atlas.travel_m.__getitem__, self._atlas.chain.__getitem__)
         self._profiles: list[NDArray[np.float32]] = []
-        self._retracer = Retracer(self._config, self._atlas, self._cloud)
+        self._retracer = Retracer(self._config, self._atlas, laser)
         self._scans: list[SeenScan] = []
         self._steps: list[Array] = []
         self._between: list[SeenScan] = []

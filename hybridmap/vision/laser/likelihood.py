@@ -22,7 +22,7 @@ class LikelihoodField:
         margin: empty cells at each border, so that a clipped look-up meets nothing.
         labels: (cells,) int32, 1 + index of the nearest point of the cloud within reach, 0 for none.
         likelihood: (cells,) uint8, 255 exp(-d^2 / 2 sigma^2) of the distance d to that point.
-        points, normals: (1 + P, 2) of the cloud, a dummy in row 0.
+        lines: (3, 1 + P) the line through each point: its normal, and its distance from the origin along that; 0 for none.
     """
 
     low: Array
@@ -31,15 +31,20 @@ class LikelihoodField:
     margin: int
     labels: NDArray[np.int32]
     likelihood: NDArray[np.uint8]
-    points: Array
-    normals: Array
+    lines: Array
 
     def cells(self, x: Array, y: Array) -> NDArray[np.int64]:
         """Flat cell numbers of coordinates of any shape; those outside fall on the empty border."""
         nx, ny = self.shape
-        column = ((x - self.low[0]) * (1.0 / self.cell_m)).clip(self.margin, nx - 1 - self.margin).astype(np.int64)
-        row = ((y - self.low[1]) * (1.0 / self.cell_m)).clip(self.margin, ny - 1 - self.margin).astype(np.int64)
+        column = _bounded((x - self.low[0]) * (1.0 / self.cell_m), self.margin, nx - 1 - self.margin)
+        row = _bounded((y - self.low[1]) * (1.0 / self.cell_m), self.margin, ny - 1 - self.margin)
         return np.asarray(column * ny + row)
+
+
+def _bounded(cells: Array, low: int, high: int) -> NDArray[np.int64]:
+    np.maximum(cells, low, out=cells)
+    np.minimum(cells, high, out=cells)
+    return cells.astype(np.int64)
 
 
 def build_field(cloud: Cloud, cell_m: float, reach_m: float, sigma_m: float, search_m: float = 0.0) -> LikelihoodField:
@@ -67,10 +72,9 @@ def build_field(cloud: Cloud, cell_m: float, reach_m: float, sigma_m: float, sea
     labels, likelihood = np.zeros(nx * ny, np.int32), np.zeros(nx * ny, np.uint8)
     labels[index] = np.tile(np.arange(1, len(points) + 1, dtype=np.int32), len(offsets))
     likelihood[index] = np.repeat(value, len(points))
-    dummy = np.zeros((1, 2))
-    return LikelihoodField(
-        low, cell_m, (nx, ny), margin, labels, likelihood, np.concatenate([dummy, points]), np.concatenate([dummy, normals])
-    )
+    lines = np.zeros((3, 1 + len(points)))
+    lines[:2, 1:], lines[2, 1:] = normals.T, (normals * points).sum(axis=1)
+    return LikelihoodField(low, cell_m, (nx, ny), margin, labels, likelihood, lines)
 
 
 def score_poses(field: LikelihoodField, points: Array, poses: Array) -> Array:

@@ -87,8 +87,18 @@ def second_mode(field: LikelihoodField, cloud: Cloud, alignment: Alignment, k: i
 
 
 @dataclass(frozen=True, slots=True)
+class _Moving:
+    """Points and normals of a cloud, a contiguous array (P,) or (K, P) each."""
+
+    x: Array
+    y: Array
+    normal_x: Array
+    normal_y: Array
+
+
+@dataclass(frozen=True, slots=True)
 class _Partners:
-    """Residuals (K, P) m, body-frame Jacobians (3, K, P) and whether each point has a partner (K, P)."""
+    """Residuals (K, P) m, body-frame Jacobians (K, 3, P) and whether each point has a partner (K, P)."""
 
     residual: Array
     jacobian: Array
@@ -108,9 +118,10 @@ def align(
         prior: holds the pose where the walls leave it free; it is no part of `hessian`.
     """
     poses = np.array(starts, dtype=np.float64)
+    moving = _Moving(*(np.ascontiguousarray(a[..., i]) for a in (cloud.points, cloud.normals) for i in (0, 1)))
     scale = 2.0 * config.cauchy_scale_m
     for iteration in range(config.iterations):
-        partners = _partners(field, cloud, poses)
+        partners = _partners(field, moving, poses)
         hessian, gradient = _normal_equations(partners, scale)
         if prior is not None:
             _add_prior(hessian, gradient, poses, prior)
@@ -121,30 +132,29 @@ def align(
             scale = config.cauchy_scale_m
             if np.abs(step).max() < CONVERGED:
                 break
-    return _judge(_partners(field, cloud, poses), poses, config)
+    return _judge(_partners(field, moving, poses), poses, config)
 
 
-def _partners(field: LikelihoodField, cloud: Cloud, poses: Array) -> _Partners:
-    px, py = cloud.points[..., 0], cloud.points[..., 1]
-    mx, my = cloud.normals[..., 0], cloud.normals[..., 1]
-    cos, sin = np.cos(poses[:, 2])[:, None], np.sin(poses[:, 2])[:, None]
-    x = poses[:, :1] + cos * px - sin * py
-    y = poses[:, 1:2] + sin * px + cos * py
+def _partners(field: LikelihoodField, moving: _Moving, poses: Array) -> _Partners:
+    cos, sin = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+    x = cos * moving.x - sin * moving.y + poses[:, :1]
+    y = sin * moving.x + cos * moving.y + poses[:, 1:2]
     label = field.labels.take(field.cells(x, y))
-    target, normal = field.points.take(label, axis=0), field.normals.take(label, axis=0)
-    nx, ny = normal[..., 0], normal[..., 1]
-    bx, by = cos * nx + sin * ny, cos * ny - sin * nx
-    facing = bx * mx + by * my
-    has = (label > 0) & (facing > -0.1)
-    residual = nx * (x - target[..., 0]) + ny * (y - target[..., 1])
-    return _Partners(residual, np.stack([bx, by, by * px - bx * py]), has)
+    nx, ny, offset = (column.take(label) for column in field.lines)
+    jacobian = np.empty((len(poses), 3, x.shape[1]))
+    bx, by = jacobian[:, 0], jacobian[:, 1]
+    np.add(cos * nx, sin * ny, out=bx)
+    np.subtract(cos * ny, sin * nx, out=by)
+    np.subtract(by * moving.x, bx * moving.y, out=jacobian[:, 2])
+    has = (label > 0) & (bx * moving.normal_x + by * moving.normal_y > -0.1)
+    return _Partners(nx * x + ny * y - offset, jacobian, has)
 
 
 def _normal_equations(partners: _Partners, scale: float) -> tuple[Array, Array]:
-    w = partners.has / (1.0 + (partners.residual / scale) ** 2)
-    weighted = partners.jacobian * w
-    hessian = np.einsum("akp,bkp->kab", weighted, partners.jacobian)
-    gradient = np.einsum("akp,kp->ka", weighted, partners.residual)
+    w = partners.has / (1.0 + (partners.residual * (1.0 / scale)) ** 2)
+    weighted = partners.jacobian * w[:, None]
+    hessian = weighted @ partners.jacobian.transpose(0, 2, 1)
+    gradient = (weighted @ partners.residual[..., None])[..., 0]
     return hessian / scale**2, gradient / scale**2
 
 
@@ -162,10 +172,10 @@ def _judge(partners: _Partners, poses: Array, config: RegistrationConfig) -> Ali
     inlier = partners.has & (np.abs(partners.residual) < config.inlier_m)
     count, near = inlier.sum(axis=1), partners.has.sum(axis=1)
     n = max(partners.has.shape[1], 1)
-    jacobian = partners.jacobian * inlier
+    jacobian = partners.jacobian * inlier[:, None]
     return Alignment(
         poses=poses,
-        hessian=np.einsum("akp,bkp->kab", jacobian, partners.jacobian),
+        hessian=jacobian @ jacobian.transpose(0, 2, 1),
         near=near / n,
         inliers=count / n,
         fit=count / np.maximum(near, 1),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from hybridmap.config.laser import LaserConfig
 from hybridmap.geometry import Array, between, compose, interpolate, wrap_angle
-from hybridmap.streams.base import LaserScan
+from hybridmap.streams.base import Laser, LaserScan
 from hybridmap.vision.base import Retraced
-from hybridmap.vision.laser.cloud import Cloud, merged
+from hybridmap.vision.laser.cloud import Cloud, clouds_of_scans, merged
 from hybridmap.vision.laser.likelihood import build_field
 from hybridmap.vision.laser.registration import Prior, align
 from hybridmap.vision.laser.submap import Atlas
@@ -33,10 +33,10 @@ class SeenScan:
 class Retracer:
     """Registers scans to the map, block of nodes by block."""
 
-    def __init__(self, config: LaserConfig, atlas: Atlas, cloud_of: Callable[[LaserScan], Cloud]) -> None:
+    def __init__(self, config: LaserConfig, atlas: Atlas, laser: Laser) -> None:
         self._config = config
         self._atlas = atlas
-        self._cloud_of = cloud_of
+        self._laser = laser
 
     def retrace(self, scans: Sequence[SeenScan], steps: Array, poses: Array) -> Retraced:
         """Pose of the robot at every scan that could be registered, seen from the node it had made last.
@@ -54,7 +54,7 @@ class Retracer:
         for first in range(0, len(poses), size):
             block = np.flatnonzero((nodes >= first) & (nodes < first + size))
             if len(block):
-                clouds = [self._cloud_of(scans[int(i)].scan) for i in block]
+                clouds = clouds_of_scans([scans[i].scan.ranges_m for i in block.tolist()], self._laser, self._config.scan)
                 found[block], good[block] = self._register(clouds, expected[block], poses[first : first + size], poses)
         stamps = np.array([s.scan.stamp_ns for s in scans], dtype=np.int64)
         return Retraced(stamps[good], nodes[good], between(poses[nodes[good]], found[good]))

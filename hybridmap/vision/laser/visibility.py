@@ -12,6 +12,8 @@ from hybridmap.streams.base import Laser
 from hybridmap.vision.laser.cloud import Cloud
 from hybridmap.vision.laser.submap import Submap
 
+Marks = NDArray[np.bool_]
+
 MARGIN_M = 0.25
 VIEWPOINTS = 6
 GRAZING = 0.3
@@ -31,32 +33,50 @@ def violation(
         laser: bearings and mounting.
     """
     cloud = walls.cloud.thinned(POINTS).moved(pose_seers_walls)
-    seen, through = np.zeros(len(cloud)), np.zeros(len(cloud))
-    for i in seers.viewpoints(VIEWPOINTS):
-        pose = compose(seers.poses[i], laser.pose_base_laser)
-        free, hit = _look(cloud.moved(inverse(pose)), ranges[int(seers.nodes[i])], laser)
-        seen, through = seen + (free | hit), through + free
+    chosen = seers.viewpoints(VIEWPOINTS)
+    poses = compose(seers.poses[chosen], laser.pose_base_laser)
+    free, hit = _look(cloud, inverse(poses), np.array([ranges[i] for i in seers.nodes[chosen].tolist()]), laser)
+    through, seen = free.sum(axis=0), (free | hit).sum(axis=0)
     judged = seen > 0
     return float((2.0 * through > seen)[judged].mean()) if judged.any() else 0.0
 
 
-def _look(cloud: Cloud, ranges_m: NDArray[np.float32], laser: Laser) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which points of a cloud in the laser's frame a scan looks through, and which it sees as walls.
+def _look(cloud: Cloud, poses_laser_cloud: Array, ranges_m: NDArray[np.float32], laser: Laser) -> tuple[Marks, Marks]:
+    """Which points of a cloud each of some scans looks through, and which it sees as walls; (V, P) each.
 
     Walls that the beams graze are left out: there a small error of the heading is a large one of the range.
+
+    Args:
+        cloud: P points.
+        poses_laser_cloud: (V, 3) the cloud's frame seen from the laser at each scan.
+        ranges_m: (V, B) of the scans.
+        laser: bearings.
     """
-    points = cloud.points
+    x, y = _turned(cloud.points, poses_laser_cloud)
+    x, y = x + poses_laser_cloud[:, :1], y + poses_laser_cloud[:, 1:2]
+    normal_x, normal_y = _turned(cloud.normals, poses_laser_cloud)
     bearings = laser.bearings_rad
     increment = float(bearings[-1] - bearings[0]) / max(len(bearings) - 1, 1)
-    distance = np.hypot(points[:, 0], points[:, 1])
-    turn = (np.arctan2(points[:, 1], points[:, 0]) - float(bearings[0])) * np.sign(increment) % (2.0 * np.pi)
+    distance = np.hypot(x, y)
+    turn = (np.arctan2(y, x) - float(bearings[0])) * np.sign(increment) % (2.0 * np.pi)
     beam = np.round(turn / abs(increment)).astype(np.int64)
     inside = (beam >= 1) & (beam < len(bearings) - 1)
-    beam = beam.clip(1, len(bearings) - 2)
-    three = np.stack([ranges_m[beam - 1], ranges_m[beam], ranges_m[beam + 1]])
-    steep = np.abs((cloud.normals * points).sum(axis=1)) > GRAZING * distance
-    usable = inside & steep & np.isfinite(three).all(axis=0)
+    nearest, farthest = _about(ranges_m)
+    beam = beam.clip(1, len(bearings) - 2) - 1
+    low, high = np.take_along_axis(nearest, beam, axis=1), np.take_along_axis(farthest, beam, axis=1)
+    usable = inside & (np.abs(normal_x * x + normal_y * y) > GRAZING * distance) & np.isfinite(low)
     margin = MARGIN_M + 0.03 * distance
-    free = usable & (distance < np.nan_to_num(three).min(axis=0) - margin)
-    hit = usable & ~free & (distance < np.nan_to_num(three).max(axis=0) + margin)
-    return free, hit
+    free = usable & (distance < low - margin)
+    return free, usable & ~free & (distance < high + margin)
+
+
+def _turned(vectors: Array, poses: Array) -> tuple[Array, Array]:
+    """Components (V, P) each of vectors (P, 2) turned by the headings of V poses."""
+    cos, sin = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+    return cos * vectors[:, 0] - sin * vectors[:, 1], sin * vectors[:, 0] + cos * vectors[:, 1]
+
+
+def _about(ranges_m: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Least and largest (V, B - 2) of each beam and its two neighbours; NaN where one of them has no return."""
+    before, at, after = ranges_m[:, :-2], ranges_m[:, 1:-1], ranges_m[:, 2:]
+    return np.minimum(np.minimum(before, at), after), np.maximum(np.maximum(before, at), after)

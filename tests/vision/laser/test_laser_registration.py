@@ -120,15 +120,16 @@ def test_field_knows_the_nearest_point_and_nothing_beyond_its_reach():
     rng = np.random.default_rng(9)
     cloud = cloud_of_scan(cast(room(), np.zeros(3), rng), LASER, ScanConfig())
     field = build_field(cloud, 0.05, 0.3, 0.1)
-    usable = field.points[1:]
+    usable = cloud.points[(cloud.normals**2).sum(axis=1) > 0.5]
     query = usable + rng.uniform(-0.1, 0.1, usable.shape)
     label = field.labels[field.cells(query[:, 0], query[:, 1])]
-    found = np.hypot(*(field.points[label] - query).T)
+    found = np.hypot(*(usable[label - 1] - query).T)
     nearest = np.hypot(*(usable[None] - query[:, None]).transpose(2, 0, 1)).min(axis=1)
     assert (label > 0).all()
     assert np.max(found - nearest) < 0.08
     far = field.cells(np.array([0.0, 1e6, -1e6]), np.array([0.0, 1e6, 3.0]))
     assert (field.labels[far] == 0).all()
+    np.testing.assert_allclose((field.lines[:2].T[1:] * usable).sum(axis=1), field.lines[2, 1:], atol=1e-12)
 
 
 def test_scores_of_a_grid_and_of_poses_agree():
