@@ -33,6 +33,10 @@ class SolveReport:
         cpu_s: process time spent.
         rejected_edge_ids: loop edges held for false: of weight zero (GNC), or with a residual beyond the gate (kernels).
         weights: loop edge id -> final weight in [0, 1]; empty for back-ends without a robust kernel.
+        chi2_odometry: share of `chi2` that is not of loops. Where loops were rejected and this is large, the map is wrong.
+        unit_variance: chi2 of the edges that were not rejected per degree of freedom; 1 where the stated noise is the true one.
+        rejected_clusters: groups of rejected loops that agree with each other, the largest first: true loops that were
+            dropped, or a place taken for another one. Only where a whole graph was solved.
     """
 
     backend: str
@@ -44,6 +48,9 @@ class SolveReport:
     cpu_s: float
     rejected_edge_ids: tuple[int, ...] = ()
     weights: dict[int, float] = field(default_factory=dict)
+    chi2_odometry: float | None = None
+    unit_variance: float | None = None
+    rejected_clusters: tuple[tuple[int, ...], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

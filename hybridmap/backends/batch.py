@@ -29,7 +29,16 @@ _ON_THE_WAY = 1e-3  # relative tolerance while the graph grows: the next closure
 _STUCK = 1e4  # Levenberg-Marquardt's lambda where it gave up rather than arrived
 
 
-def run(method: str, graph: Any, start: Array, max_iterations: int, *, initial: Any = None, tolerance: float = 1e-5) -> Outcome:
+def run(
+    method: str,
+    graph: Any,
+    start: Array,
+    max_iterations: int,
+    *,
+    initial: Any = None,
+    tolerance: float = 1e-5,
+    rescue: bool = True,
+) -> Outcome:
     """One optimiser run; exceptions become the status `failed`, standing still on a slope `stalled`.
 
     Levenberg-Marquardt that fails or stalls (the normal equations square the condition of the graph) is followed by
@@ -42,10 +51,11 @@ def run(method: str, graph: Any, start: Array, max_iterations: int, *, initial: 
         max_iterations: the limit.
         initial: the same poses as `gtsam.Values`, where they are there already.
         tolerance: relative decrease of the cost at which an optimiser is done.
+        rescue: whether Dogleg may follow.
     """
     initial = values(start) if initial is None else initial
     outcome = _attempt(method, graph, start, initial, max_iterations, tolerance)
-    if method != "lm" or outcome.status in (SolveStatus.CONVERGED, SolveStatus.MAX_ITERATIONS):
+    if not rescue or method != "lm" or outcome.status in (SolveStatus.CONVERGED, SolveStatus.MAX_ITERATIONS):
         return outcome
     onward = initial if outcome.values is None else outcome.values
     other = _attempt("dogleg-qr", graph, outcome.poses, onward, max_iterations, tolerance)

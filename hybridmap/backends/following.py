@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.base import Solution, SolveReport, SolveStatus, SupportsPoseGraph
-from hybridmap.backends.objective import chi2
+from hybridmap.backends.clusters import rejected_clusters
+from hybridmap.backends.objective import chi2, gate_of, squared_norms, total, unit_variance
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, between, compose
@@ -134,7 +135,7 @@ class GraphBackend(ABC):
             outcome = work()
         except RuntimeError as error:  # gtsam raises nothing more specific
             raise BackendError(f"{self._name}: the solver gave up: {_first_line(error)}") from error
-        return self._solution(graph, graph.initial, self._checked(graph, graph.initial, outcome), started)
+        return self._solution(graph, graph.initial, self._checked(graph, graph.initial, outcome), started, whole=True)
 
     @abstractmethod
     def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
@@ -186,18 +187,24 @@ class GraphBackend(ABC):
         poses[0] = graph.initial[0]
         return replace(outcome, poses=poses)
 
-    def _solution(self, graph: PoseGraph, start: Array, outcome: Outcome, started: float) -> Solution:
-        final = chi2(graph, outcome.poses)
+    def _solution(self, graph: PoseGraph, start: Array, outcome: Outcome, started: float, *, whole: bool = False) -> Solution:
+        squared = squared_norms(graph, outcome.poses)
+        clusters = whole and len(outcome.rejected) > 0
         report = SolveReport(
             backend=self._name,
             status=outcome.status,
             message=outcome.message,
             iterations=outcome.iterations,
-            chi2_initial=final if outcome.poses is start else chi2(graph, start),
-            chi2=final,
+            chi2_initial=total(squared) if outcome.poses is start else chi2(graph, start),
+            chi2=total(squared),
             cpu_s=time.process_time() - started,
             rejected_edge_ids=outcome.rejected,
             weights=outcome.weights,
+            chi2_odometry=total(squared[~graph.is_loop]),
+            unit_variance=unit_variance(graph, squared, outcome.rejected),
+            rejected_clusters=rejected_clusters(graph, outcome.poses, outcome.rejected, gate_of(self._config))
+            if clusters
+            else (),
         )
         return Solution(outcome.poses, report)
 

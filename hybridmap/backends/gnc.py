@@ -13,13 +13,16 @@ from typing import Any
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2 as chi2_law
 
 from hybridmap.backends.base import Solution, SolveStatus
 from hybridmap.backends.batch import run
+from hybridmap.backends.clusters import neighbouring_pairs, rejected_clusters
+from hybridmap.backends.covariance import Covariances
 from hybridmap.backends.factors import NoiseModels, anchor, factor_graph, factors, poses_of, values
 from hybridmap.backends.following import Change, GraphBackend, Outcome, prefix
 from hybridmap.backends.initial import best_start, trusted_start
-from hybridmap.backends.objective import gate_of, squared_norms, truncated_cost
+from hybridmap.backends.objective import gate_of, residuals, squared_norms, truncated_cost, unit_variance
 from hybridmap.backends.robust import WarmKernel, with_kernel
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
@@ -28,8 +31,10 @@ from hybridmap.graph.pose_graph import PoseGraph
 
 _STEP = 0.5  # of a quantised weight's logarithm to the base 2
 _PATIENT, _NEAR_FIRST = 1e-4, 3e-2  # least weight of a loop that takes part in a round
-_QUICK = 15  # iterations: least squares needs fewer where loops agree, and is of no use where they do not
-_MOSTLY = 0.9  # share of loops that least squares must agree with to be worth going on from
+_ROUGHLY = 10.0  # of the bound, before the first iteration
+_QUICK = (2, 12)  # iterations before each look: where loops agree few are needed, where they do not they are of no use
+_MOSTLY, _ALMOST_ALL = 0.9, 0.97  # share of loops that least squares must agree with, on the way and in the end
+_EXPECTED = 0.999  # quantile of the innovation up to which a lone loop is re-admitted
 _SLACK = 4.0  # of the bound over the unit variance, where files overstate their noise
 
 
@@ -106,40 +111,77 @@ def graduate(graph: PoseGraph, start: Array, config: BackendsConfig, negligible:
     squared = problem.squared(poses)
     largest = float(squared.max(initial=0.0))
     mu = bound / (2.0 * largest - bound) if largest > bound else np.inf
-    rounds = 0
+    rounds, current = 0, values(start)
     while np.isfinite(mu) and rounds < config.gnc.max_rounds:
         weights = truncated_weights(squared, mu, bound)
-        poses = _step(problem.weighted(weights, negligible), poses)
+        poses, current = _step(problem.weighted(weights, negligible), poses, current)
         squared = problem.squared(poses)
         rounds += 1
         if mu > 1.0 and np.all((weights < negligible) | (weights > 0.9)):
             break
         mu *= config.gnc.mu_factor
     settled = _settle(problem, poses, bound, config.max_iterations)
-    honest = min(1.0, _SLACK * unit_variance(graph, settled)) * bound
+    honest = min(1.0, _SLACK * _variance(graph, settled)) * bound
     if honest < bound:
         settled = _settle(problem, settled.poses, honest, config.max_iterations)
     return replace(settled, rounds=rounds + settled.rounds)
 
 
-def trusting(graph: PoseGraph, config: BackendsConfig) -> Truncated:
-    """Least squares with all loops, then the loops within the gate: right where there is hardly a false one."""
+def trusting(graph: PoseGraph, config: BackendsConfig) -> Truncated | None:
+    """Least squares with all loops, then the loops within the gate; None where too many are beyond it."""
     bound = gate_of(config)
-    limit = min(_QUICK, config.max_iterations)
-    outcome = run("lm", factor_graph(graph, NoiseModels()), best_start(graph), limit)
-    kept = squared_norms(graph, outcome.poses)[graph.is_loop] <= bound
-    found = Truncated(outcome.poses, kept, outcome.iterations, bound)
-    if kept.all() or kept.mean() < _MOSTLY:
-        return found
-    return _settle(_Problem(graph), outcome.poses, bound, config.max_iterations)
+    poses, rounds = best_start(graph), 0
+    if _share(squared_norms(graph, poses)[graph.is_loop] <= _ROUGHLY * bound) < _MOSTLY:
+        return None
+    whole = factor_graph(graph, NoiseModels())
+    for limit, least in zip(_QUICK, (_MOSTLY, _ALMOST_ALL), strict=True):
+        outcome = run("lm", whole, poses, min(limit, config.max_iterations), rescue=limit == _QUICK[-1])
+        poses, rounds = outcome.poses, rounds + outcome.iterations
+        kept = squared_norms(graph, poses)[graph.is_loop] <= bound
+        if _share(kept) < least:
+            return None
+    found = Truncated(poses, kept, rounds, bound)
+    return found if kept.all() else _settle(_Problem(graph), poses, bound, config.max_iterations)
 
 
-def unit_variance(graph: PoseGraph, result: Truncated) -> float:
-    """Chi2 of the inliers per degree of freedom: 1 where the stated noise is the true one; 1 where there is no redundancy."""
-    inlier = np.ones(graph.n_edges, dtype=bool)
-    inlier[np.flatnonzero(graph.is_loop)] = result.kept
-    freedom = 3 * (int(inlier.sum()) - graph.n_nodes + 1)
-    return float(squared_norms(graph, result.poses)[inlier].sum()) / freedom if freedom > 0 else 1.0
+def _share(true: NDArray[np.bool_]) -> float:
+    return float(true.mean()) if len(true) else 1.0
+
+
+def _variance(graph: PoseGraph, result: Truncated) -> float:
+    return unit_variance(graph, squared_norms(graph, result.poses), _rejected(graph, result))
+
+
+def _rejected(graph: PoseGraph, result: Truncated) -> tuple[int, ...]:
+    return tuple(graph.edge_ids[graph.is_loop][~result.kept].tolist())
+
+
+def on_probation(graph: PoseGraph, result: Truncated, config: BackendsConfig) -> Truncated:
+    """Take out the loops that no accepted neighbour backs, and re-admit those that the map without them expects.
+
+    A graph that overstates its noise leaves room for false loops which happen to be consistent. Each loop taken out is
+    judged by its innovation under the covariance of loop and map, scaled by the unit variance of the map without it.
+    """
+    loops = np.flatnonzero(graph.is_loop)
+    accepted = loops[result.kept]
+    backed = np.unique(neighbouring_pairs(graph, accepted))
+    lone = np.delete(accepted, backed)
+    if len(lone) == 0:
+        return result
+    without = result.kept & ~np.isin(loops, lone)
+    problem = _Problem(graph)
+    outcome = run("lm", problem.weighted(without.astype(np.float64)), result.poses, config.max_iterations)
+    bare = replace(result, poses=outcome.poses, kept=without, rounds=result.rounds + outcome.iterations)
+    backbone = graph.with_edges(np.setdiff1d(np.arange(graph.n_edges), loops[~without]))
+    covariance = Covariances(backbone, bare.poses).relative(graph.sources[lone], graph.targets[lone])
+    covariance = (covariance + np.linalg.inv(graph.information[lone])) * min(1.0, _variance(graph, bare))
+    r = residuals(graph.with_edges(lone), bare.poses)
+    innovation = np.einsum("ei,ei->e", r, np.linalg.solve(covariance, r[:, :, None])[:, :, 0])
+    kept = without | np.isin(loops, lone[innovation <= chi2_law.ppf(_EXPECTED, df=3)])
+    if not np.any(kept != without):
+        return bare
+    outcome = run("lm", problem.weighted(kept.astype(np.float64)), bare.poses, config.max_iterations)
+    return replace(bare, poses=outcome.poses, kept=kept, rounds=bare.rounds + outcome.iterations)
 
 
 def _settle(problem: _Problem, poses: Array, bound: float, max_iterations: int) -> Truncated:
@@ -156,13 +198,12 @@ def _settle(problem: _Problem, poses: Array, bound: float, max_iterations: int) 
     return Truncated(poses, keep, rounds, bound)
 
 
-def _step(factor_graph: Any, poses: Array) -> Array:
-    """One damped step from given poses."""
-    params = gtsam.LevenbergMarquardtParams()
-    optimizer = gtsam.LevenbergMarquardtOptimizer(factor_graph, values(poses), params)
+def _step(factor_graph: Any, poses: Array, current: Any) -> tuple[Array, Any]:
+    """One damped step from given poses, which are there as GTSAM's values too; both after it."""
+    optimizer = gtsam.LevenbergMarquardtOptimizer(factor_graph, current, gtsam.LevenbergMarquardtParams())
     optimizer.iterate()
     moved = poses_of(optimizer.values())
-    return moved if np.isfinite(moved).all() else poses
+    return (moved, optimizer.values()) if np.isfinite(moved).all() else (poses, current)
 
 
 def grow(graph: PoseGraph, config: BackendsConfig, negligible: float) -> Truncated:
@@ -199,30 +240,44 @@ class GncBackend(GraphBackend):
         return self._best(graph, None)
 
     def _best(self, graph: PoseGraph, driven: Array | None) -> Outcome:
-        """Run the configured starts; one that keeps every loop ends the search, else the lowest truncated cost wins.
+        """Run the configured starts until one convinces; if none does, the lowest truncated cost wins.
 
-        Costs are compared at the tightest bound that any start ended with: files that overstate their noise would
-        otherwise prefer a false loop that happens to be consistent.
+        A result convinces where no rejected loops agree with each other, or where two different ways came to the same. Costs
+        are compared at the
+        tightest bound that any start ended with: files that overstate their noise would otherwise prefer a false loop
+        that happens to be consistent.
         """
         results: dict[str, Truncated] = {}
         for name, attempt in self._attempts(graph, driven).items():
-            results[name] = attempt()
-            if results[name].kept.all():
-                return self._verdict(graph, results[name], name)
+            found = attempt()
+            if found is None:
+                continue
+            if not found.kept.all():
+                found = on_probation(graph, found, self._config)
+            agreed = name == "grown" and any(np.array_equal(found.kept, other.kept) for other in results.values())
+            if agreed or not rejected_clusters(graph, found.poses, _rejected(graph, found), found.bound):
+                return self._verdict(graph, found, name)
+            results[name] = found
         bound = min(result.bound for result in results.values())
         costs = {name: truncated_cost(graph, result.poses, bound) for name, result in results.items()}
         best = min(costs, key=costs.__getitem__)
         return self._verdict(graph, results[best], best)
 
-    def _attempts(self, graph: PoseGraph, driven: Array | None) -> dict[str, Callable[[], Truncated]]:
+    def _attempts(self, graph: PoseGraph, driven: Array | None) -> dict[str, Callable[[], Truncated | None]]:
         config = self._config
+
+        def whole(negligible: float) -> Truncated:
+            return graduate(graph, trusted_start(graph, gate_of(config)), config, negligible)
+
+        attempts: dict[str, Callable[[], Truncated | None]] = {}
         if config.gnc.start == "batch":
-            return {"batch": lambda: graduate(graph, trusted_start(graph, gate_of(config)), config, _PATIENT)}
-        attempts: dict[str, Callable[[], Truncated]] = {}
+            return {"batch": lambda: whole(_PATIENT)}
         if config.gnc.start == "auto":
             attempts["least squares"] = lambda: trusting(graph, config)
         if driven is not None:
             attempts["drive"] = lambda: graduate(graph, driven, config, _PATIENT)
+        if config.gnc.start == "auto":
+            attempts["batch, near loops first"] = lambda: whole(_NEAR_FIRST)
         attempts["grown"] = lambda: grow(graph, config, _PATIENT)
         if config.gnc.start == "auto":
             attempts["grown, near loops first"] = lambda: grow(graph, config, _NEAR_FIRST)
@@ -232,6 +287,6 @@ class GncBackend(GraphBackend):
         loops = graph.edge_ids[graph.is_loop].tolist()
         weights = dict(zip(loops, result.kept.astype(np.float64).tolist(), strict=True))
         rejected = tuple(edge for edge, weight in weights.items() if weight == 0.0)
-        variance = unit_variance(graph, result)
+        variance = _variance(graph, result)
         message = f"gnc: {len(rejected)} of {len(loops)} loops rejected (start: {start}; unit variance {variance:.3g})"
         return Outcome(result.poses, SolveStatus.CONVERGED, message, result.rounds, weights, rejected)

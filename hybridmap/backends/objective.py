@@ -30,8 +30,20 @@ def squared_norms(graph: PoseGraph, poses: Array) -> Array:
 def chi2(graph: PoseGraph, poses: Array) -> float:
     """Sum of the squared Mahalanobis residuals of all edges; infinite where a pose is not finite."""
     with np.errstate(invalid="ignore", over="ignore"):
-        total = float(squared_norms(graph, poses).sum())
-    return total if np.isfinite(total) else float("inf")
+        return total(squared_norms(graph, poses))
+
+
+def total(squared: Array) -> float:
+    """Sum of squared residuals (E,); infinite where one is not finite."""
+    summed = float(squared.sum())
+    return summed if np.isfinite(summed) else float("inf")
+
+
+def unit_variance(graph: PoseGraph, squared: Array, rejected: tuple[int, ...] = ()) -> float:
+    """Sum of squared residuals (E,) of the edges that were not rejected, per degree of freedom; 1 without redundancy."""
+    kept = ~np.isin(graph.edge_ids, rejected)
+    freedom = 3 * (int(kept.sum()) - graph.n_nodes + 1)
+    return float(squared[kept].sum()) / freedom if freedom > 0 else 1.0
 
 
 def truncated_cost(graph: PoseGraph, poses: Array, bound: float) -> float:

@@ -115,4 +115,5 @@ def report_from_json(text: str) -> SolveReport:
     fields["status"] = SolveStatus(fields["status"])
     fields["rejected_edge_ids"] = tuple(fields["rejected_edge_ids"])
     fields["weights"] = {int(number): weight for number, weight in fields["weights"].items()}
+    fields["rejected_clusters"] = tuple(tuple(cluster) for cluster in fields.get("rejected_clusters", ()))
     return SolveReport(**fields)

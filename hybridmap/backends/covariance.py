@@ -1,0 +1,77 @@
+"""How sure a solution is: covariances from the Gauss-Newton Hessian of the whole graph, node 0 fixed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csc_array
+from scipy.sparse.linalg import splu
+
+from hybridmap.errors import BackendError
+from hybridmap.geometry import Array, adjoint, between
+from hybridmap.graph.pose_graph import PoseGraph
+
+
+class Covariances:
+    """The inverse Hessian of a graph at a solution, factorised once.
+
+    Covariances are of right perturbations, m and rad, under the information that the edges state; multiply them by
+    `SolveReport.unit_variance` where that is far from 1.
+    """
+
+    def __init__(self, graph: PoseGraph, poses: Array) -> None:
+        """Factorise.
+
+        Raises:
+            BackendError: the Hessian is singular: a node hangs on nothing.
+        """
+        self._poses = poses
+        try:
+            self._factor: Any = splu(
+                _hessian(graph, poses), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            )
+        except RuntimeError as error:
+            raise BackendError(f"covariance: the graph is singular ({error})") from error
+
+    def marginal(self, node: int) -> Array:
+        """Covariance (3, 3) of a node relative to node 0, in its own frame; zero for node 0.
+
+        Raises:
+            BackendError: there is no such node.
+        """
+        if not 0 <= node < len(self._poses):
+            raise BackendError(f"covariance: there is no node {node}, expected one of 0..{len(self._poses) - 1}")
+        return np.asarray(self._projected(np.eye(3)[None], np.array([node]), np.zeros((1, 3, 3)), np.array([0]))[0])
+
+    def relative(self, sources: NDArray[np.int64], targets: NDArray[np.int64]) -> Array:
+        """Covariances (L, 3, 3) of targets seen from sources, in the targets' frames."""
+        carried = -adjoint(between(self._poses[targets], self._poses[sources]))
+        return self._projected(np.broadcast_to(np.eye(3), carried.shape), targets, carried, sources)
+
+    def _projected(self, at_first: Array, first: NDArray[np.int64], at_second: Array, second: NDArray[np.int64]) -> Array:
+        """J H^-1 J' (L, 3, 3) for Jacobians J with one block at each of two nodes."""
+        count, size = len(first), 3 * len(self._poses)
+        columns = np.zeros((size, 3 * count))
+        for block, node in ((at_first, first), (at_second, second)):
+            rows = 3 * node[:, None, None] + np.arange(3)[None, :, None]
+            column = 3 * np.arange(count)[:, None, None] + np.arange(3)[None, None, :]
+            columns[rows, column] += block.transpose(0, 2, 1)
+        solved = self._factor.solve(columns[3:]) if size > 3 else columns[3:]
+        wide, known = solved.reshape(-1, count, 3), columns[3:].reshape(-1, count, 3)
+        covariance = np.einsum("ski,skj->kij", known, wide, optimize=True)
+        return np.asarray(0.5 * (covariance + covariance.transpose(0, 2, 1)))
+
+
+def _hessian(graph: PoseGraph, poses: Array) -> csc_array:
+    """(3N - 3, 3N - 3), the residuals' own Jacobians taken for the identity: exact where residuals are small."""
+    at_source = -adjoint(between(poses[graph.targets], poses[graph.sources]))
+    across = at_source.transpose(0, 2, 1) @ graph.information
+    blocks = np.stack([across @ at_source, across, across.transpose(0, 2, 1), graph.information])
+    s, t, size = graph.sources, graph.targets, 3 * graph.n_nodes - 3
+    rows = np.stack([s, s, t, t])[:, :, None, None] * 3 + np.arange(3)[:, None] - 3
+    columns = np.stack([s, t, s, t])[:, :, None, None] * 3 + np.arange(3) - 3
+    rows, columns = np.broadcast_to(rows, blocks.shape).ravel(), np.broadcast_to(columns, blocks.shape).ravel()
+    free = (rows >= 0) & (columns >= 0)
+    return csc_array(coo_array((blocks.ravel()[free], (rows[free], columns[free])), shape=(size, size)))

@@ -1,0 +1,93 @@
+"""What a back-end makes of false loops in the standard graphs, over seeds: the table of the false-loop bars.
+
+    python tools/false_loop_study.py $HYBRIDMAP_DATA/posegraphs/intel.g2o --seeds 10 --shares 0.1 0.4 0.7
+    python tools/false_loop_study.py $HYBRIDMAP_DATA/posegraphs/manhattanOlson3500.g2o --seeds 3 --shares 0.1 0.2 0.4
+
+ATE is against the least-squares optimum of the clean graph. A share of 0.4 means that 40 % of all loops are false.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hybridmap import backends
+from hybridmap.backends.false_loops import inject
+from hybridmap.geometry import Array, align, transform_points
+from hybridmap.graph.io import read_graph
+from hybridmap.graph.pose_graph import PoseGraph
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One graph with false loops through one back-end.
+
+    Attributes:
+        ate_m: against the clean optimum.
+        lost: true loops rejected.
+        kept: false loops not rejected.
+        cpu_s: process time.
+    """
+
+    ate_m: float
+    lost: int
+    kept: int
+    cpu_s: float
+
+
+def main() -> None:
+    """Print one line a share, kind of false loops and back-end."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("graph", type=Path)
+    parser.add_argument("--backends", nargs="+", default=["gtsam-gnc"], metavar="NAME")
+    parser.add_argument("--shares", nargs="+", type=float, default=[0.1, 0.4])
+    parser.add_argument("--modes", nargs="+", choices=["random", "aliased"], default=["random", "aliased"])
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--first", type=int, default=0, metavar="SEED")
+    chosen = parser.parse_args()
+    graph = read_graph(chosen.graph)
+    clean = backends.create("gtsam-lm").solve(graph).poses
+    print(f"{chosen.graph.name}: {graph.n_nodes} nodes, {int(graph.is_loop.sum())} true loops; ATE in m, CPU in s")
+    print(
+        f"{'back-end':20}{'kind':9}{'share':>6}{'ATE median':>12}{'max':>9}{'<= 0.05':>9}"
+        f"{'lost max':>10}{'kept max':>10}{'CPU':>8}"
+    )
+    for name in chosen.backends:
+        for share in chosen.shares:
+            for mode in chosen.modes:
+                seeds = range(chosen.first, chosen.first + chosen.seeds)
+                cells = [cell(graph, clean, name, inject(graph, share, mode, np.random.default_rng(s))) for s in seeds]
+                print(line(name, mode, share, cells, int(graph.is_loop.sum())), flush=True)
+
+
+def cell(graph: PoseGraph, clean: Array, name: str, false: PoseGraph) -> Cell:
+    """Solve one disturbed graph in a fresh back-end."""
+    started = time.process_time()
+    solution = backends.create(name).solve(false)
+    cpu_s = time.process_time() - started
+    rejected = np.array(solution.report.rejected_edge_ids, dtype=np.int64)
+    lost = int(np.isin(rejected, graph.edge_ids).sum())
+    return Cell(ate(solution.poses, clean), lost, false.n_edges - graph.n_edges - (len(rejected) - lost), cpu_s)
+
+
+def ate(poses: Array, reference: Array) -> float:
+    """RMSE of position after alignment, m."""
+    moved = transform_points(align(reference, poses), poses[:, :2])
+    return float(np.sqrt(np.mean(np.sum((moved - reference[:, :2]) ** 2, axis=1))))
+
+
+def line(name: str, mode: str, share: float, cells: list[Cell], true_loops: int) -> str:
+    """One line of the table."""
+    errors = np.array([c.ate_m for c in cells])
+    lost = max(c.lost for c in cells)
+    figures = f"{np.median(errors):12.4f}{errors.max():9.4f}{f'{(errors <= 0.05).sum()}/{len(cells)}':>9}"
+    counts = f"{f'{lost} {lost / true_loops:.2%}':>10}{max(c.kept for c in cells):10d}"
+    return f"{name:20}{mode:9}{share:6.0%}{figures}{counts}{np.median([c.cpu_s for c in cells]):8.2f}"
+
+
+if __name__ == "__main__":
+    main()
