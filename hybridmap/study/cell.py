@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridmap.backends.base import Solution, SolveStatus
 from hybridmap.backends.initial import angular_start
@@ -38,7 +39,7 @@ MEASURES = {
     "chi2": ("1", "referee's chi2 at the end, false loops included"),
     "chi2_own": ("1", "referee's chi2 at the end over the graph's own edges, without the false loops put into it"),
     "false_kept": ("1", f"false loops of weight above {KEPT}"),
-    "own_lost": ("1", f"of the graph's own loops, those of weight {KEPT} or below"),
+    "own_lost": ("1", "of the graph's own loops, those that the back-end holds for false"),
     "iterations": ("1", "iterations, sweeps or updates"),
 }
 """Figure of merit -> unit and meaning, in the order of the tables."""
@@ -142,17 +143,16 @@ def run(task: CellTask) -> CellResult:
 
 def judge(own: PoseGraph, graph: PoseGraph, solution: Solution, reference: Array) -> dict[str, float | None]:
     """Figures of a solution of `graph`, which is `own` with false loops appended; `reference` (N, 3) may hold NaN."""
-    weights = _weights(graph, solution)
     false = np.arange(graph.n_edges) >= own.n_edges
-    loop = graph.is_loop
+    kept, rejected = _fates(graph, solution)
     ate_m, yaw_deg = errors(solution.poses, reference)
     return {
         "ate_m": _finite(ate_m),
         "yaw_deg": _finite(yaw_deg),
         "chi2": _finite(solution.report.chi2),
         "chi2_own": _finite(chi2(own, solution.poses)),
-        "false_kept": float(np.count_nonzero(false & (weights > KEPT))),
-        "own_lost": float(np.count_nonzero(loop & ~false & (weights <= KEPT))),
+        "false_kept": float(np.count_nonzero(false & kept)),
+        "own_lost": float(np.count_nonzero(~false & rejected)),
     }
 
 
@@ -203,18 +203,17 @@ def _begun(graph: PoseGraph, start: str, reference: Array) -> PoseGraph:
     return graph
 
 
-def _weights(graph: PoseGraph, solution: Solution) -> Array:
-    """(E,) final weight of each edge: as reported, else 0 for rejected ones; dead reckoning uses no loop at all."""
+def _fates(graph: PoseGraph, solution: Solution) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(E,) which edges were kept and (E,) which were held for false; dead reckoning uses no loop at all.
+
+    A kernel may do neither: it weighs an edge down by more than a half long before its residual is beyond the gate.
+    """
     report = solution.report
-    weights = np.ones(graph.n_edges)
-    ids = graph.edge_ids.tolist()
     if report.backend == "odometry":
-        weights[graph.is_loop] = 0.0
-    elif report.weights:
-        weights = np.array([report.weights.get(edge, 1.0) for edge in ids])
-    else:
-        weights[np.isin(graph.edge_ids, np.array(report.rejected_edge_ids, dtype=np.int64))] = 0.0
-    return weights
+        return ~graph.is_loop, graph.is_loop
+    rejected = np.isin(graph.edge_ids, np.array(report.rejected_edge_ids, dtype=np.int64))
+    weights = np.array([report.weights.get(edge, 1.0) for edge in graph.edge_ids.tolist()])
+    return (weights > KEPT) & ~rejected, rejected
 
 
 def _counts(own: PoseGraph, graph: PoseGraph) -> dict[str, float | None]:

@@ -50,7 +50,7 @@ class DaskCluster:
         """
         futures = {self._client.submit(work, task, pure=False, retries=ATTEMPTS): index for index, task in enumerate(tasks)}
         try:
-            for future in self._dask.as_completed(list(futures)):
+            for future in self._dask.as_completed(list(futures), loop=self._client.loop):
                 if future.status == "cancelled":
                     raise StudyError("the connection to the Dask scheduler is lost; run again to go on")
                 error = future.exception()

@@ -1,0 +1,207 @@
+"""The pictures of a study's page: each figure of merit over what was varied, and the paired differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hybridmap.report import style
+from hybridmap.study.cell import CellResult
+from hybridmap.study.grid import Cell
+from hybridmap.study.statistics import Summary
+from hybridmap.study.study import Study
+
+MOST_PANELS = 12
+"""More are not drawn; the tables have everything."""
+
+FLOOR_M = 1e-4
+"""Smaller errors are drawn here: a logarithm has no zero."""
+
+_MOST_LINES = 9  # with more back-ends each gets a row of its own instead of a line
+_COLUMNS = 2
+Figure = Callable[[CellResult], float | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """Cells that share a pair of axes.
+
+    Attributes:
+        title: what they have in common.
+        ticks: names of the positions along the axis of what is varied.
+        cells: (position, back-end, result).
+    """
+
+    title: str
+    ticks: tuple[str, ...]
+    cells: tuple[tuple[int, str, CellResult], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How a study is spread over panels.
+
+    Attributes:
+        panels: in the order of the grid.
+        along: what the positions are: `false loops`, `setting` or `back-end`; the last one has a row each, not a line.
+    """
+
+    panels: tuple[Panel, ...]
+    along: str
+
+
+def layout(study: Study) -> Layout:
+    """Over the rates if there are several, else over the settings, else over the back-ends alone."""
+    config = study.grid.study
+    rates = sorted(config.false_loops.rates)
+    titles = [variant.title for variant in config.backends]
+    if len(titles) > _MOST_LINES or (len(rates) == 1 and len(config.settings) == 1):
+        return Layout(
+            _gathered([(_group(cell), cell.backend, cell, result) for cell, result in study.rows], titles), "back-end"
+        )
+    if len(rates) > 1:
+        return Layout(_over_rates(study, rates), "false loops")
+    settings = [setting.name for setting in config.settings]
+    entries = [(_joined(cell.source, _false(cell)), cell.setting, cell, result) for cell, result in study.rows]
+    return Layout(_gathered(entries, settings), "setting")
+
+
+def _over_rates(study: Study, rates: Sequence[float]) -> tuple[Panel, ...]:
+    """A panel a source, setting and kind; the cells without false loops are of every kind."""
+    entries = [
+        (_joined(cell.source, _setting(study, cell), f"{kind} false loops"), _percent(cell.rate), cell, result)
+        for cell, result in study.rows
+        for kind in study.grid.study.false_loops.kinds
+        if cell.kind in ("", kind)
+    ]
+    return _gathered(entries, [_percent(rate) for rate in rates])
+
+
+def _gathered(entries: Sequence[tuple[str, str, Cell, CellResult]], ticks: Sequence[str]) -> tuple[Panel, ...]:
+    """Panels of (title, tick, cell, result)."""
+    by_title: dict[str, list[tuple[int, str, CellResult]]] = {}
+    for title, tick, cell, result in entries:
+        by_title.setdefault(title, []).append((ticks.index(tick), cell.backend, result))
+    return tuple(Panel(title, tuple(ticks), tuple(cells)) for title, cells in by_title.items())
+
+
+def merit_figure(study: Study, plan: Layout, label: str, figure: Figure, *, logarithmic: bool) -> str:
+    """One figure of merit: dots are cells, lines and bars go through their medians; a `data:` URI."""
+    shown = plan.panels[:MOST_PANELS]
+    titles = [variant.title for variant in study.grid.study.backends]
+    looks = style.line_styles(titles)
+    rows = plan.along == "back-end"
+    with _axes(len(shown), 0.24 * len(titles) + 1.0 if rows else 2.9) as (picture, panels):
+        for axes, panel in zip(panels, shown, strict=False):
+            (_draw_rows if rows else _draw_lines)(axes, panel, figure, looks)
+            axes.set_title(panel.title, fontsize=9.0)
+            value_axis = axes.xaxis if rows else axes.yaxis
+            value_axis.set_label_text(label)
+            (axes.set_xscale if rows else axes.set_yscale)("log" if logarithmic else "linear")
+            axes.grid(True, axis="x" if rows else "y", linewidth=0.5)
+            if not rows:
+                axes.set_xlabel(plan.along)
+        if not rows:
+            handles, names = panels[0].get_legend_handles_labels()
+            picture.legend(handles, names, loc="outside upper center", ncols=min(4, len(names)))
+        return style.svg_uri(picture)
+
+
+def difference_figure(summaries: Sequence[Summary]) -> str:
+    """Mean paired difference of ATE to the baseline with its interval, a panel a group; a `data:` URI, empty without any."""
+    groups: dict[str, list[Summary]] = {}
+    for one in summaries:
+        if one.measure == "ate_m" and one.difference is not None and one.difference.count > 1:
+            groups.setdefault(one.label, []).append(one)
+    if not groups:
+        return ""
+    shown = list(groups.items())[:MOST_PANELS]
+    deepest = max(len(ones) for _, ones in shown)
+    with _axes(len(shown), 0.24 * deepest + 1.0) as (picture, panels):
+        for axes, (label, ones) in zip(panels, shown, strict=False):
+            for row, one in enumerate(ones):
+                _draw_interval(axes, row, one)
+            axes.axvline(0.0, color="#444444", linewidth=0.8)
+            axes.set_xscale("symlog", linthresh=0.01)
+            axes.set_yticks(range(len(ones)), [one.backend for one in ones])
+            axes.set_ylim(len(ones) - 0.5, -0.5)
+            axes.set_title(label, fontsize=9.0)
+            axes.set_xlabel(f"ATE minus that of {ones[0].baseline} (m)")
+            axes.grid(True, axis="x", linewidth=0.5)
+            axes.tick_params(axis="x", labelsize=7.5)
+        return style.svg_uri(picture)
+
+
+def _draw_interval(axes: Any, row: int, one: Summary) -> None:
+    apart = one.difference
+    assert apart is not None
+    colour = "#666666" if not apart.excludes_zero else style.ACCEPTED if apart.high < 0.0 else style.REJECTED
+    axes.plot([apart.low, apart.high], [row, row], color=colour, linewidth=2.2, solid_capstyle="butt")
+    axes.plot([apart.value], [row], "o", color=colour, markersize=4.5)
+
+
+def _draw_lines(axes: Any, panel: Panel, figure: Figure, looks: dict[str, dict[str, Any]]) -> None:
+    """A line a back-end through its medians, each cell a dot."""
+    backends = list(dict.fromkeys(backend for _, backend, _ in panel.cells))
+    for rank, backend in enumerate(backends):
+        offset = 0.24 * ((rank + 0.5) / len(backends) - 0.5)
+        medians = []
+        for position in range(len(panel.ticks)):
+            values = _values(panel, position, backend, figure)
+            axes.plot([position + offset] * len(values), values, ".", color=looks[backend]["color"], markersize=3.5, alpha=0.55)
+            medians.append(float(np.median(values)) if len(values) else np.nan)
+        axes.plot(np.arange(len(medians)) + offset, medians, label=backend, **looks[backend])
+    axes.set_xticks(range(len(panel.ticks)), panel.ticks)
+    axes.set_xlim(-0.3, len(panel.ticks) - 0.7)
+
+
+def _draw_rows(axes: Any, panel: Panel, figure: Figure, looks: dict[str, dict[str, Any]]) -> None:
+    """A row a back-end, each cell a dot, the median a bar."""
+    for position, backend in enumerate(panel.ticks):
+        values = _values(panel, position, backend, figure)
+        axes.plot(values, [position] * len(values), ".", color=looks[backend]["color"], markersize=5.0, alpha=0.6)
+        if len(values):
+            axes.plot([np.median(values)], [position], "|", color=looks[backend]["color"], markersize=13, markeredgewidth=2)
+    axes.set_yticks(range(len(panel.ticks)), panel.ticks)
+    axes.set_ylim(len(panel.ticks) - 0.5, -0.5)
+
+
+def _values(panel: Panel, position: int, backend: str, figure: Figure) -> Any:
+    found = [figure(result) for at, name, result in panel.cells if (at, name) == (position, backend)]
+    return np.array([value for value in found if value is not None])
+
+
+@contextmanager
+def _axes(count: int, panel_height_in: float) -> Iterator[tuple[Any, list[Any]]]:
+    """A figure of panels in two columns; those left over are empty."""
+    columns = min(_COLUMNS, count)
+    lines = -(-count // columns)
+    with style.figure(style.PAGE_WIDTH_IN, panel_height_in * lines + 0.5) as picture:
+        panels = list(picture.subplots(lines, columns, squeeze=False).ravel())
+        for axes in panels[count:]:
+            axes.set_axis_off()
+        yield picture, panels
+
+
+def _group(cell: Cell) -> str:
+    return _joined(cell.source, cell.setting if cell.setting != "default" else "", _false(cell))
+
+
+def _setting(study: Study, cell: Cell) -> str:
+    return cell.setting if len(study.grid.study.settings) > 1 else ""
+
+
+def _false(cell: Cell) -> str:
+    return f"{_percent(cell.rate)} {cell.kind} false loops" if cell.kind else ""
+
+
+def _joined(*parts: str) -> str:
+    return ", ".join(part for part in parts if part)
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:g} %"
