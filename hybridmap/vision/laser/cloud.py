@@ -85,19 +85,34 @@ def merged(clouds: Iterable[Cloud], cell_m: float) -> Cloud:
     return _merged(whole, np.zeros(len(whole), dtype=np.int64), cell_m)[0]
 
 
+def merged_at(clouds: Sequence[Cloud], poses: Array, cell_m: float) -> Cloud:
+    """Merge clouds that were taken from poses (N, 3); the points come out in the frame of the poses."""
+    counts = [len(c) for c in clouds]
+    if sum(counts) == 0:
+        return EMPTY
+    x, y = poses[:, 0].repeat(counts), poses[:, 1].repeat(counts)
+    cos, sin = np.cos(poses[:, 2]).repeat(counts), np.sin(poses[:, 2]).repeat(counts)
+    px, py = np.concatenate([c.points for c in clouds]).T
+    nx, ny = np.concatenate([c.normals for c in clouds]).T
+    points = np.stack([x + cos * px - sin * py, y + sin * px + cos * py], axis=1)
+    normals = np.stack([cos * nx - sin * ny, sin * nx + cos * ny], axis=1)
+    return _merged(Cloud(points, normals), np.zeros(len(points), dtype=np.int64), cell_m)[0]
+
+
 def _merged(cloud: Cloud, group: NDArray[np.int64], cell_m: float) -> tuple[Cloud, NDArray[np.int64]]:
     """Merge points of one cell and one group; group numbers ascend along the points. Returns what is left, with its groups."""
     first = np.flatnonzero(np.diff(group, prepend=-1))
     low = np.zeros((int(group[-1]) + 1, 2))
-    low[group[first]] = np.minimum.reduceat(cloud.points, first, axis=0)
-    cells = ((cloud.points - low[group]) / cell_m).astype(np.int64)
-    rows, columns = (int(n) + 1 for n in cells.max(axis=0))
-    key = (group * rows + cells[:, 0]) * columns + cells[:, 1]
+    for i in (0, 1):
+        low[group[first], i] = np.minimum.reduceat(cloud.points[:, i], first)
+    cells = ((cloud.points - low[group]) / cell_m).astype(np.int64).T
+    rows, columns = int(cells[0].max()) + 1, int(cells[1].max()) + 1
+    key = (group * rows + cells[0]) * columns + cells[1]
     found, member, count = np.unique(key, return_inverse=True, return_counts=True)
     n = len(count)
     mean: Array = np.stack([np.bincount(member, cloud.points[:, i], n) / count for i in (0, 1)], axis=1)
     normal: Array = np.stack([np.bincount(member, cloud.normals[:, i], n) for i in (0, 1)], axis=1)
-    length = np.sqrt((normal**2).sum(axis=1))
+    length = np.sqrt(normal[:, 0] ** 2 + normal[:, 1] ** 2)
     normal = np.where((length > 0.3)[:, None], normal / np.maximum(length, 1e-9)[:, None], 0.0)
     return Cloud(mean, normal), found // (rows * columns)
 

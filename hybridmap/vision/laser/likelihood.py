@@ -57,23 +57,24 @@ def build_field(cloud: Cloud, cell_m: float, reach_m: float, sigma_m: float, sea
         sigma_m: width of the likelihood.
         search_m: largest translation of the starts that will be scored on this field.
     """
-    usable = np.flatnonzero((cloud.normals**2).sum(axis=1) > 0.5)
-    points, normals = cloud.points[usable], cloud.normals[usable]
+    usable = np.flatnonzero(cloud.normals[:, 0] ** 2 + cloud.normals[:, 1] ** 2 > 0.5)
+    points, normals = cloud.points[usable].T, cloud.normals[usable].T
     reach, margin = int(np.ceil(reach_m / cell_m)), int(np.ceil(search_m / cell_m)) + 1
     border = reach + 2 * margin + 1
-    if len(points) == 0:
-        points, normals = np.zeros((1, 2)), np.zeros((1, 2))
-    low = points.min(axis=0) - border * cell_m
-    cells = ((points - low) / cell_m).astype(np.int64)
-    nx, ny = (int(n) + border + 1 for n in cells.max(axis=0))
+    if len(usable) == 0:
+        points, normals = np.zeros((2, 1)), np.zeros((2, 1))
+    low = np.array([coordinate.min() for coordinate in points]) - border * cell_m
+    column, row = ((coordinate - least) / cell_m for coordinate, least in zip(points, low, strict=True))
+    column, row = column.astype(np.int64), row.astype(np.int64)
+    nx, ny = int(column.max()) + border + 1, int(row.max()) + border + 1
     offsets, distance_m = _disc(reach, cell_m)
-    index = ((cells[:, 0] * ny + cells[:, 1])[None] + (offsets[:, 0] * ny + offsets[:, 1])[:, None]).ravel()
+    index = (column * ny + row)[None] + (offsets[:, 0] * ny + offsets[:, 1])[:, None]
     value = np.maximum(1.0, 255.0 * np.exp(-0.5 * (distance_m / sigma_m) ** 2)).astype(np.uint8)
     labels, likelihood = np.zeros(nx * ny, np.int32), np.zeros(nx * ny, np.uint8)
-    labels[index] = np.tile(np.arange(1, len(points) + 1, dtype=np.int32), len(offsets))
-    likelihood[index] = np.repeat(value, len(points))
-    lines = np.zeros((3, 1 + len(points)))
-    lines[:2, 1:], lines[2, 1:] = normals.T, (normals * points).sum(axis=1)
+    labels[index] = np.arange(1, points.shape[1] + 1, dtype=np.int32)
+    likelihood[index] = value[:, None]
+    lines = np.zeros((3, 1 + points.shape[1]))
+    lines[:2, 1:], lines[2, 1:] = normals, normals[0] * points[0] + normals[1] * points[1]
     return LikelihoodField(low, cell_m, (nx, ny), margin, labels, likelihood, lines)
 
 

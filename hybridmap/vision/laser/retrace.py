@@ -12,7 +12,7 @@ from hybridmap.config.laser import LaserConfig
 from hybridmap.geometry import Array, between, compose, interpolate, wrap_angle
 from hybridmap.streams.base import Laser, LaserScan
 from hybridmap.vision.base import Retraced
-from hybridmap.vision.laser.cloud import Cloud, clouds_of_scans, merged
+from hybridmap.vision.laser.cloud import Cloud, clouds_of_scans, merged_at
 from hybridmap.vision.laser.likelihood import build_field
 from hybridmap.vision.laser.registration import Prior, align
 from hybridmap.vision.laser.submap import Atlas
@@ -66,7 +66,7 @@ class Retracer:
         near = np.argsort(distance, kind="stable")[: c.map_nodes]
         near = np.union1d(near[distance[near] < c.radius_m], np.argsort(distance, kind="stable")[:1])
         cell, settings = self._config.scan.cell_m, self._config.registration
-        local = merged([self._atlas.clouds[i].moved(poses[i]) for i in near], cell)
+        local = merged_at([self._atlas.clouds[i] for i in near.tolist()], poses[near], cell)
         field = build_field(local, cell, settings.reach_m, settings.field_sigma_m)
         stack, counts = _stacked(clouds)
         prior = Prior(expected, c.prior_m, float(np.deg2rad(c.prior_deg)))

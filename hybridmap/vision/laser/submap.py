@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.laser import LaserConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose_relative
-from hybridmap.vision.laser.cloud import Cloud, merged
+from hybridmap.vision.laser.cloud import Cloud, merged_at
 from hybridmap.vision.laser.likelihood import LikelihoodField, build_field
 
 SEARCH_M = 4.5
@@ -131,7 +131,7 @@ class Atlas:
         """Merge the clouds of some nodes in the frame of an anchor."""
         numbers = np.asarray(nodes, dtype=np.int64)
         poses = between(self.chain[anchor], np.array([self.chain[i] for i in numbers]).reshape(-1, 3))
-        cloud = merged([self.clouds[i].moved(p) for i, p in zip(numbers, poses, strict=True)], self._config.scan.cell_m)
+        cloud = merged_at([self.clouds[i] for i in numbers.tolist()], poses, self._config.scan.cell_m)
         return Submap(anchor, numbers, poses, cloud)
 
     def around(self, anchor: int, half_m: float) -> Submap:
