@@ -90,17 +90,16 @@ class LoopCloser:
         gated = self._gate(node, belief)
         changed = self._try_candidates(node, self._ranked(node, gated), belief) if len(gated) else []
         if self._config.verify != "none":
-            broken = self._relocaliser.whereabouts.broken_at is not None
+            broken = self._relocaliser.whereabouts.first_break is not None
             if not broken and not any(p.verdict is Verdict.ACCEPTED for p in changed):
                 near = self._nearest(node, 1, belief)
                 changed += self._try_again(node, near, belief, {j for j in near if self._is_sure(node, j, belief)})
             changed += self._relocalise(node, gated, changed, belief)
         return [*changed, *self._give_up(before=node - self._closing.pending_nodes)]
 
-    def tracked(self, node: int, steps: Sequence[Proposal]) -> None:
+    def tracked(self, node: int, steps: list[Proposal]) -> None:
         """Take notice of how a new node was registered to the ones before it."""
-        if steps:
-            self._relocaliser.whereabouts.tracked(node, any(step.verdict is Verdict.ACCEPTED for step in steps))
+        self._relocaliser.tracked(node, steps)
 
     def note(self, node: int) -> dict[str, Array]:
         """What the map file keeps of the newest node's search: `gate` (see `GATE_FIELDS`), `ranked` (n, 3): node, G, shift."""
@@ -131,11 +130,13 @@ class LoopCloser:
         out: list[Proposal] = []
         if self._rounds_left > 0 and self._closing.repropose_m > 0 and self._config.verify != "none":
             self._rounds_left -= 1
+            first_break = self._relocaliser.whereabouts.first_break
             for node in range(len(self._keyframes)):
                 accepted = sum(h.proposal.verdict is Verdict.ACCEPTED for h in self._hypotheses.get(node, ()))
                 if accepted < self._closing.accept:
                     near = self._nearest(node, self._closing.repropose_per_node, belief)
-                    out += self._try_again(node, near, belief, near)
+                    placed = first_break is None or node < first_break
+                    out += self._try_again(node, near, belief, near if placed else ())
         out += self._relocaliser.dismiss("too few others put the robot there")
         return [*out, *self._give_up(before=len(self._keyframes))]
 

@@ -9,16 +9,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridmap.config.rgbd import RegistrationConfig
 from hybridmap.geometry import Array, RelativePose
 from hybridmap.vision.rgbd.depth_grid import Surface
-from hybridmap.vision.rgbd.spatial import apply, cross, from_planar, rotation_of, to_floor
+from hybridmap.vision.rgbd.pairing import Pairing, associate
+from hybridmap.vision.rgbd.spatial import cross_into, from_planar, rotation_of, to_floor
 from hybridmap.vision.rgbd.stance import LevelPair, Stance, level_pair
 
 PLANAR = np.array([0, 1, 5])
 OUT_OF_PLANE = np.array([2, 3, 4])
+COARSE_POINTS = 400
+NEARLY_SETTLED, SETTLED = 2e-3, 1e-4
+"""While steps (m, rad) exceed the first, about so many points do; it ends with all of them and a step below the second."""
 LEAST_UNIT_VARIANCE = 0.1
 """Residuals are never held for better than this share of the variance that the sensor's model gives."""
 LOOSE = 1.0 / np.array([0.3, 0.3, np.deg2rad(10.0)]) ** 2
@@ -95,20 +98,6 @@ class Registration:
     tilt_rad: float
 
 
-@dataclass(frozen=True, slots=True)
-class _Pairing:
-    """Matched points at one iterate: indices, the moving ones' arms and normals along the fixed axes, residuals (m), and how
-    many were in view.
-    """
-
-    fixed: NDArray[np.int64]
-    moving: NDArray[np.int64]
-    arm: Array
-    turned: Array
-    residual: Array
-    in_view: int
-
-
 def register(
     fixed: Surface,
     moving: Surface,
@@ -132,27 +121,40 @@ def register(
     T = start.copy()
     floor = _FloorPrior.of(fixed.stance, moving.stance)
     wheels = None if prior is None else _PlanarPrior.of(prior)
+    stride = max(1, len(moving.points) // COARSE_POINTS)
+    settled: Pairing | None = None
     for _ in range(config.iterations):
-        pairing = _pair(fixed, moving, T, config)
-        if len(pairing.residual) < config.min_points:
+        pairing = associate(fixed, moving, T, config, stride)
+        if len(pairing) * stride < config.min_points:
             return None
-        H, b = _normal_equations(fixed, moving, pairing, T, pairs)
+        H, b = _normal_equations(pairing, T, pairs)
         H_prior, b_prior = _prior_terms(T, wheels, floor)
         step = np.asarray(np.linalg.solve(H + H_prior, b + b_prior), dtype=np.float64)
         T[:3, 3] += step[:3]
         T[:3, :3] = rotation_of(step[3:]) @ T[:3, :3]
-        if np.abs(step).max() < 1e-4:
+        largest = float(np.abs(step).max())
+        if stride == 1 and largest < SETTLED:
+            settled = pairing
             break
-    return _summarise(fixed, moving, T, floor, config, pairs)
+        if largest < NEARLY_SETTLED:
+            stride = 1
+    return _summarise(
+        fixed, moving, T, associate(fixed, moving, T, config) if settled is None else settled, floor, config, pairs
+    )
 
 
 def _summarise(
-    fixed: Surface, moving: Surface, T: Array, floor: _FloorPrior, config: RegistrationConfig, pairs: PointPairs | None
+    fixed: Surface,
+    moving: Surface,
+    T: Array,
+    pairing: Pairing,
+    floor: _FloorPrior,
+    config: RegistrationConfig,
+    pairs: PointPairs | None,
 ) -> Registration | None:
-    pairing = _pair(fixed, moving, T, config)
-    if len(pairing.residual) < config.min_points:
+    if len(pairing) < config.min_points:
         return None
-    H_depth = _information(fixed, moving, pairing)
+    H_depth = _information(pairing)
     H_pairs = np.zeros((6, 6)) if pairs is None else _pair_terms(pairs, T)[0]
     flat, level = to_floor(T), level_pair(T, fixed.stance, moving.stance)
     arm = moving.stance.T_base_camera[2, 3] * T[:3, 2]
@@ -163,51 +165,25 @@ def _summarise(
         level,
         RelativePose(level.delta, covariance),
         float(np.sqrt(np.linalg.eigvalsh(dulled[:2, :2])[-1])),
-        len(pairing.residual),
-        len(pairing.residual) / max(pairing.in_view, 1),
+        len(pairing),
+        len(pairing) / max(pairing.in_view, 1),
         float(np.sqrt(np.mean(pairing.residual**2))),
-        pairing.in_view / max(len(moving.points), 1),
+        pairing.in_view / max(pairing.looked_at, 1),
         flat.height_m,
         flat.tilt_rad,
     )
 
 
-def _pair(fixed: Surface, moving: Surface, T: Array, config: RegistrationConfig) -> _Pairing:
-    """Projective association: where a moving point falls into the fixed grid, the point there is its partner."""
-    arm = moving.points @ T[:3, :3].T
-    there = arm + T[:3, 3]
-    seen = apply(fixed.T_camera_base, there)
-    camera = fixed.grid.camera
-    z = np.maximum(seen[:, 2], 1e-6)
-    column = np.rint(camera.fx_px * seen[:, 0] / z + camera.cx_px).astype(np.int64)
-    row = np.rint(camera.fy_px * seen[:, 1] / z + camera.cy_px).astype(np.int64)
-    inside = (seen[:, 2] > 0.1) & (column >= 0) & (column < camera.width_px) & (row >= 0) & (row < camera.height_px)
-    number = np.full(len(there), -1, dtype=np.int64)
-    number[inside] = fixed.number[row[inside], column[inside]]
-    m = np.flatnonzero(number >= 0)
-    f = number[m]
-    offset = there[m] - fixed.points[f]
-    residual = np.einsum("ij,ij->i", fixed.normals[f], offset)
-    reach = config.max_distance_m + 3.0 * (fixed.sigma_m[f] + moving.sigma_m[m])
-    turned = moving.normals[m] @ T[:3, :3].T
-    alike = np.einsum("ij,ij->i", turned, fixed.normals[f]) > np.cos(np.deg2rad(config.max_normal_deg))
-    keep = (np.abs(residual) < reach) & alike & (np.einsum("ij,ij->i", offset, offset) < (2.0 * reach) ** 2)
-    return _Pairing(f[keep], m[keep], arm[m[keep]], turned[keep], residual[keep], len(m))
-
-
-def _information(fixed: Surface, moving: Surface, pairing: _Pairing) -> Array:
+def _information(pairing: Pairing) -> Array:
     """Information (6, 6) of the matched points, each with the variance that the residuals show.
 
     Normals are noisy, and squared noise passes for information: a bare wall would seem to hold the slide along itself. The
     product of either point's own normal has no such bias, since they err independently; what comes out below nothing is
     nothing.
     """
-    variance = fixed.sigma_m[pairing.fixed] ** 2 + moving.sigma_m[pairing.moving] ** 2
-    unit = max(float(np.mean(pairing.residual**2 / variance)), LEAST_UNIT_VARIANCE)
-    normal = fixed.normals[pairing.fixed]
-    J_fixed = np.concatenate([normal, cross(pairing.arm, normal)], axis=1)
-    J_moving = np.concatenate([pairing.turned, cross(pairing.arm, pairing.turned)], axis=1)
-    weighted = J_fixed / (unit * variance)[:, None]
+    unit = max(float(np.mean(pairing.residual**2 / pairing.variance)), LEAST_UNIT_VARIANCE)
+    J_fixed, J_moving = _jacobian(pairing.arm, pairing.normal), _jacobian(pairing.arm, pairing.turned)
+    weighted = J_fixed / (unit * pairing.variance)[:, None]
     both, biased = weighted.T @ J_moving, weighted.T @ J_fixed
     root = np.linalg.cholesky(biased + 1e-9 * np.trace(biased) * np.eye(6))
     share = np.linalg.solve(root, np.linalg.solve(root, 0.5 * (both + both.T)).T)
@@ -216,20 +192,23 @@ def _information(fixed: Surface, moving: Surface, pairing: _Pairing) -> Array:
     return np.asarray((base * np.maximum(values, 1e-4)) @ base.T)
 
 
-def _normal_equations(
-    fixed: Surface, moving: Surface, pairing: _Pairing, T: Array, pairs: PointPairs | None
-) -> tuple[Array, Array]:
+def _normal_equations(pairing: Pairing, T: Array, pairs: PointPairs | None) -> tuple[Array, Array]:
     """H (6, 6) and b (6,) of the data, with Cauchy weights."""
-    normal = fixed.normals[pairing.fixed]
-    J = np.concatenate([normal, cross(pairing.arm, normal)], axis=1)
-    variance = fixed.sigma_m[pairing.fixed] ** 2 + moving.sigma_m[pairing.moving] ** 2
-    weight = 1.0 / (variance + pairing.residual**2 / 4.0)
-    weighted = J * weight[:, None]
+    J = _jacobian(pairing.arm, pairing.normal)
+    weighted = J / (pairing.variance + pairing.residual**2 / 4.0)[:, None]
     H, b = weighted.T @ J, -weighted.T @ pairing.residual
     if pairs is not None:
         H_pairs, b_pairs = _pair_terms(pairs, T)
         H, b = H + H_pairs, b + b_pairs
     return H, b
+
+
+def _jacobian(arm: Array, normal: Array) -> Array:
+    """(n, 6) change of point-to-plane distances with a shift of the moving base and a turn about it."""
+    J = np.empty((len(normal), 6))
+    J[:, :3] = normal
+    cross_into(J[:, 3:], arm, normal)
+    return J
 
 
 def _pair_terms(pairs: PointPairs, T: Array) -> tuple[Array, Array]:

@@ -53,7 +53,7 @@ def detect(grey: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: Camera
     keypoints, descriptors = orb.detectAndCompute(grey, None)
     if descriptors is None or len(keypoints) == 0:
         return Features(np.zeros((0, 2)), np.zeros((0, 32), dtype=np.uint8), np.zeros((0, 3)))
-    pixels = np.array([k.pt for k in keypoints], dtype=np.float64)
+    pixels = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64)
     points, known = _points_at(pixels, depth_m, camera)
     return Features(pixels[known], descriptors[known], points[known])
 

@@ -55,7 +55,7 @@ def working_image(frame: RgbdFrame, factor: int) -> WorkingImage:
     import cv2
 
     grey = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
-    depth = np.nan_to_num(frame.depth_m, nan=0.0, posinf=0.0, neginf=0.0)
+    depth = np.where((frame.depth_m > 0) & (frame.depth_m < np.inf), frame.depth_m, np.float32(0))
     if factor > 1:
         height, width = grey.shape[0] // factor, grey.shape[1] // factor
         grey = cv2.resize(grey[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA)

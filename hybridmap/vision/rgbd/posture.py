@@ -24,6 +24,8 @@ LATER_TOLERANCE_M = 0.12
 """How far the height may be from the mounting's, and from that of the last floors once some have been seen."""
 REMEMBERED_FLOORS = 15
 MIN_FLOORS = 3
+TRUSTED_FLOORS, RELAXED_EVERY = 20, 5
+"""After so many floors that agree with the mounting, one keyframe in so many is looked at."""
 MIN_FLOOR_CELLS = 40
 MOUNTED = (float(np.deg2rad(0.2)), 0.004)
 ON_FLOOR = (float(np.deg2rad(0.5)), 0.02)
@@ -46,19 +48,31 @@ class Posture:
         self._solver = solver
         self._ratio = ratio
         self._heights: deque[float] = deque(maxlen=REMEMBERED_FLOORS)
+        self._agreed = 0
+        self._unwatched = 0
 
     def stance(self, grid: DepthGrid, features: Features, last: Keyframe | None) -> Stance:
         """How the camera is held at the keyframe after `last`."""
-        if not self._held and not self._watching:
+        if not self._held and not self._looks():
             return self._as_mounted
         found = self._on_floor(grid)
-        if self._watching and found is not None and self._contradicts(found):
-            self._held, self._watching = True, False
+        if self._watching and found is not None:
+            if self._contradicts(found):
+                self._held, self._watching = True, False
+            self._agreed += 1
         if not self._held:
             return self._as_mounted
         if found is None:
             return Stance(self._carried(grid, features, last), *CARRIED, True)
         return Stance(found, *ON_FLOOR, True)
+
+    def _looks(self) -> bool:
+        """Whether this keyframe's floor is looked for: once many have agreed with the mounting, only now and then."""
+        self._unwatched += 1
+        if not self._watching or (self._agreed >= TRUSTED_FLOORS and self._unwatched < RELAXED_EVERY):
+            return False
+        self._unwatched = 0
+        return True
 
     def _on_floor(self, grid: DepthGrid) -> Array | None:
         up, mounted_m = self._mounting[2, :3], float(self._mounting[2, 3])

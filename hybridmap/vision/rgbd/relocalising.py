@@ -37,7 +37,7 @@ class Relocaliser:
 
     Sightings wait until `support` of them, of distinct nodes over `span_m` of travel, put the robot at one and the same pose,
     and those that contradict them are fewer than half as many. Then all of them enter the map together, and the odometry edge
-    at which the chain broke gives way to one that leads to where they have it.
+    at which the chain broke gives way to one that leads to where they have it; registrations across the break are taken back.
     """
 
     def __init__(
@@ -55,6 +55,18 @@ class Relocaliser:
         self._config = config
         self._new_key = new_key
         self._waiting: list[_Sighting] = []
+        self._steps: list[Proposal] = []
+
+    def tracked(self, node: int, steps: list[Proposal]) -> None:
+        """Take notice of how a new node was registered to the ones before it; nothing was tried where there are no steps."""
+        accepted = [step for step in steps if step.verdict is Verdict.ACCEPTED]
+        if steps:
+            sigma_m = min((step.scores.get("sigma_m", 0.0) for step in accepted), default=None)
+            self.whereabouts.tracked(node, sigma_m)
+        if self.whereabouts.lost:
+            self._steps += accepted
+        else:
+            self._steps = accepted
 
     def search(self, node: int, elsewhere: Indices, belief: Belief) -> list[Proposal]:
         """Compare a node with the nodes outside the gate; what changed, the new ones first.
@@ -64,9 +76,7 @@ class Relocaliser:
             elsewhere: (n,) older nodes outside the gate, ascending.
             belief: the map's; poses on either side of the break are right among themselves.
         """
-        broken_at = self.whereabouts.broken_at
-        targets = elsewhere if broken_at is None else elsewhere[elsewhere < broken_at]
-        out = [self._measured(node, target, scores) for target, scores in self._candidates(node, targets).items()]
+        out = [self._measured(node, target, scores) for target, scores in self._candidates(node, elsewhere).items()]
         return out + self._settle(belief)
 
     def dismiss(self, reason: str) -> list[Proposal]:
@@ -109,11 +119,17 @@ class Relocaliser:
         out = [replace(s.proposal, verdict=Verdict.ACCEPTED, reason=reason) for s in friends]
         self._waiting = [s for i, s in enumerate(self._waiting) if i not in set(chosen.tolist())]
         out += self.dismiss("contradicts the closures that put the robot elsewhere")
-        broken_at = self.whereabouts.broken_at
+        broken_at = self.whereabouts.break_before(min(s.proposal.source for s in friends))
         if broken_at is not None:
-            out.append(self._rehung(broken_at, friends, belief))
+            out += [*self._crossing(broken_at), self._rehung(broken_at, friends, belief)]
         self.whereabouts.recognised()
         return out
+
+    def _crossing(self, broken_at: int) -> list[Proposal]:
+        """Registrations across the break that had been believed."""
+        crossing = [step for step in self._steps if step.source < broken_at <= step.target]
+        reason = f"the robot was carried between nodes {broken_at - 1} and {broken_at}"
+        return [replace(step, verdict=Verdict.REJECTED, reason=reason) for step in crossing]
 
     def _agreement(self, belief: Belief) -> NDArray[np.bool_]:
         """(n, n) which sightings put the robot at the same pose, each carried along the chain to the newest node."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,18 +44,19 @@ def from_planar(pose: Array) -> Array:
 
 def to_floor(T_a_b: Array) -> FloorPose:
     """Split a transform (4, 4) between two bases into planar pose, height and tilt."""
-    yaw = np.arctan2(T_a_b[1, 0] - T_a_b[0, 1], T_a_b[0, 0] + T_a_b[1, 1])
-    tilt = np.arccos(np.clip(T_a_b[2, 2], -1.0, 1.0))
-    return FloorPose(np.array([T_a_b[0, 3], T_a_b[1, 3], yaw]), float(T_a_b[2, 3]), float(tilt))
+    yaw = math.atan2(T_a_b[1, 0] - T_a_b[0, 1], T_a_b[0, 0] + T_a_b[1, 1])
+    tilt = math.acos(min(max(float(T_a_b[2, 2]), -1.0), 1.0))
+    return FloorPose(np.array([T_a_b[0, 3], T_a_b[1, 3], yaw]), float(T_a_b[2, 3]), tilt)
 
 
 def rotation_of(rotvec: Array) -> Array:
     """Rotation matrix (3, 3) of a rotation vector (3,), rad (Rodrigues)."""
-    angle = float(np.linalg.norm(rotvec))
-    K = np.array([[0.0, -rotvec[2], rotvec[1]], [rotvec[2], 0.0, -rotvec[0]], [-rotvec[1], rotvec[0], 0.0]])
+    x, y, z = rotvec.tolist()
+    angle = math.hypot(x, y, z)
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     if angle < 1e-9:
         return np.asarray(np.eye(3) + K)
-    return np.asarray(np.eye(3) + np.sin(angle) / angle * K + (1.0 - np.cos(angle)) / angle**2 * K @ K)
+    return np.asarray(np.eye(3) + math.sin(angle) / angle * K + (1.0 - math.cos(angle)) / angle**2 * K @ K)
 
 
 def small_rotvec(R: Array) -> Array:
@@ -67,11 +69,13 @@ def small_rotvec(R: Array) -> Array:
     return np.asarray(0.5 * twice_sin * angle / sin)
 
 
-def cross(a: Array, b: Array) -> Array:
-    """Row-wise cross product of (N, 3) arrays (numpy's own is several times slower on small ones)."""
+def cross_into(out: Array, a: Array, b: Array) -> None:
+    """Row-wise cross product of (N, 3) arrays, into `out` (numpy's own is several times slower)."""
     ax, ay, az = a[:, 0], a[:, 1], a[:, 2]
     bx, by, bz = b[:, 0], b[:, 1], b[:, 2]
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+    out[:, 0] = ay * bz - az * by
+    out[:, 1] = az * bx - ax * bz
+    out[:, 2] = ax * by - ay * bx
 
 
 def apply(T_a_b: Array, points_b: Array) -> Array:

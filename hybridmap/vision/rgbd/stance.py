@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,13 +55,15 @@ def camera_on(up: Array, height_m: float, T_base_camera_nominal: Array) -> Array
     axis = 2 if abs(nominal[2, 2]) < 0.9 else 0
     forward = -up[axis] * up
     forward[axis] += 1.0
-    forward /= np.linalg.norm(forward)
-    heading = np.arctan2(nominal[1, axis], nominal[0, axis])
-    cos, sin = np.cos(heading), np.sin(heading)
+    x, y, z = (forward / math.sqrt(forward @ forward)).tolist()
+    ux, uy, uz = up.tolist()
+    heading = math.atan2(nominal[1, axis], nominal[0, axis])
+    cos, sin = math.cos(heading), math.sin(heading)
+    left = (uy * z - uz * y, uz * x - ux * z, ux * y - uy * x)
     out = np.eye(4)
-    out[:3, :3] = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ np.stack(
-        [forward, np.cross(up, forward), up]
-    )
+    out[0, :3] = cos * x - sin * left[0], cos * y - sin * left[1], cos * z - sin * left[2]
+    out[1, :3] = sin * x + cos * left[0], sin * y + cos * left[1], sin * z + cos * left[2]
+    out[2, :3] = up
     out[:2, 3] = T_base_camera_nominal[:2, 3]
     out[2, 3] = height_m
     return out
