@@ -49,3 +49,21 @@ def test_figures_of_a_drive_are_held_against_their_bars(short_drive):
     assert "7 | <= 8" in by_name["edge_p95_cm"]
     assert "0.4 ✗" in by_name["chi2_loop"]
     assert "0.9 | >= 0.85" in by_name["recall"]
+
+
+def test_a_sweep_says_where_the_map_is_worse_than_odometry():
+    sweep = importlib.import_module("threshold_sweep")
+    good = sweep.Outcome("12", 30, 2, 1, 0, 0.5, 0.1)
+    assert good.harmless
+    assert sweep.line(good) == "| 12 | 30 | 2 | 1 | 0 | 0.5000 | 0.1000 |  |"
+    worse = sweep.Outcome("4", 30, 2, -1, -1, 0.5, 0.6)
+    assert not worse.harmless
+    assert sweep.line(worse) == "| 4 | 30 | 2 | ? | ? | 0.5000 | 0.6000 | ✗ worse |"
+
+
+def test_a_sweep_judges_one_value():
+    sweep = importlib.import_module("threshold_sweep")
+    config = Config.load("lab", {"simulation.duration_s": 3.0, "backends.names": ["gtsam-gnc"]})
+    one = sweep.outcome("lab", config, "12")
+    assert (one.loops, one.rejected, one.wrong, one.wrong_kept) == (0, 0, 0, 0)
+    assert 0 < one.map_m <= one.odometry_m
