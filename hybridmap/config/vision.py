@@ -65,6 +65,8 @@ class RelocalisingConfig(Section):
     """They agree if they put the robot within this of each other, m (plus 5 % of the travel between them)."""
     agree_deg: float = Field(default=5.0, gt=0)
     """The same for its heading, degrees (plus 1 per metre)."""
+    doubtful_m: float = Field(default=0.1, gt=0)
+    """A node whose view fits those before it but may slide by more than this (one standard deviation) may be elsewhere, m."""
     unrecognised_nodes: int = Field(default=16, ge=0)
     """Nodes in a row at places that the map knows, none of them recognised, after which the robot is lost too; 0: never."""
     known_m: float = Field(default=0.7, gt=0)

@@ -16,7 +16,7 @@ from hybridmap.graph.experience_map import Status
 from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import Rig
-from hybridmap.vision.base import Belief, Verdict
+from hybridmap.vision.base import Belief, Proposal, Verdict
 from hybridmap.vision.rgbd.pnp import Verification
 from hybridmap.vision.rgbd.relocalising import Relocaliser
 from hybridmap.vision.templates import Matcher
@@ -123,7 +123,11 @@ class FakeVerifier:
         return Verification(relative, "" if delta is None else "agrees", {"inliers": 20.0})
 
 
-def sought(sightings, nodes=(40, 41, 42, 43, 44), config=None):
+def step(source, target, verdict, sigma_m=0.01):
+    return Proposal(10**6 + 100 * target + source, "registration", source, target, verdict, "", None, {"sigma_m": sigma_m})
+
+
+def sought(sightings, nodes=(40, 41, 42, 43, 44), config=None, steps=None):
     """Proposals by key and Relocaliser after some nodes of a straight drive of 0.3 m a node whose chain broke at 40."""
     rng = np.random.default_rng(0)
     profiles = rng.normal(size=(50, 2, 16)).astype(np.float32)
@@ -137,7 +141,7 @@ def sought(sightings, nodes=(40, 41, 42, 43, 44), config=None):
     belief = Belief(np.column_stack([x, 0 * x, 0 * x]), np.arange(50.0), x, lambda _: np.zeros((50, 3, 3)))
     for profile in profiles[:40]:
         matcher.add(profile)
-    relocaliser.whereabouts.tracked(40, registered=False)
+    relocaliser.tracked(40, steps if steps is not None else [step(38, 40, Verdict.REJECTED), step(39, 40, Verdict.REJECTED)])
     proposals = {}
     for node in nodes:
         matcher.add(profiles[node])
@@ -188,9 +192,31 @@ def test_places_that_are_known_and_not_recognised_make_it_lost():
     for _ in range(3):
         whereabouts.unrecognised()
     assert whereabouts.lost
-    assert whereabouts.broken_at is None
+    assert whereabouts.first_break is None
     whereabouts.recognised()
-    whereabouts.tracked(7, registered=True)
+    whereabouts.tracked(7, 0.05)
     assert not whereabouts.lost
-    whereabouts.tracked(8, registered=False)
-    assert (whereabouts.lost, whereabouts.broken_at) == (True, 8)
+
+
+def test_a_break_counts_for_more_than_a_doubt():
+    whereabouts = Whereabouts(RelocalisingConfig(doubtful_m=0.1))
+    for node, sigma_m in ((8, 0.3), (9, None), (10, 0.02), (12, 0.2)):
+        whereabouts.tracked(node, sigma_m)
+    assert whereabouts.lost
+    assert whereabouts.first_break == 8
+    assert [whereabouts.break_before(node) for node in (7, 8, 9, 11, 20)] == [None, 8, 9, 9, 9]
+    whereabouts.recognised()
+    assert whereabouts.break_before(20) is None
+
+
+def test_registrations_across_the_break_are_taken_back():
+    """One wall fits any other: the view at 40 fits, but slides, and 41 fits 39 as well."""
+    true = {(40 + i, 10 + i): (0.0, 0.0, 0.0) for i in range(5)}
+    believed = [step(39, 40, Verdict.ACCEPTED, 0.3), step(38, 40, Verdict.ACCEPTED, 0.4)]
+    proposals, relocaliser = sought(true, steps=believed)
+    taken_back = [p for p in proposals.values() if p.kind == "registration" and p.verdict is Verdict.REJECTED]
+    assert [(p.key, p.source, p.target) for p in taken_back] == [(p.key, p.source, 40) for p in believed]
+    assert all("carried between nodes 39 and 40" in p.reason for p in taken_back)
+    assert not relocaliser.whereabouts.lost
+    held = [step(39, 40, Verdict.ACCEPTED, 0.3), step(38, 40, Verdict.ACCEPTED, 0.01)]
+    assert not [p for p in sought(true, steps=held)[0].values() if p.kind == "registration"]

@@ -1,0 +1,44 @@
+"""A robot that is carried away unseen finds itself again, in whole drives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hybridmap.config import Config
+from hybridmap.geometry import align, compose
+from hybridmap.graph.experience_map import Status
+from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.session import run
+from hybridmap.store import MapStore
+from hybridmap.streams.simulated import SimulatedStream
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("world", "carried_m"), [("lab", 5.0), ("office", 19.5)])
+def test_it_is_relocalised_within_five_metres(world, carried_m, tmp_path):
+    config = Config.load(world, {"simulation.carried_m": 20.0, "backends.names": ["gtsam-gnc"]})
+    stream = SimulatedStream(config.simulation, 0)
+    assert stream.carry.distance_m > carried_m
+    done = run(stream, config, tmp_path / "s")
+    with MapStore.open(done.folder.path) as store:
+        experiences, online, final = store.map(), store.online("gtsam-gnc"), store.solutions()["gtsam-gnc"]
+    stamps = np.array([node.stamp_ns for node in experiences.nodes])
+    truth = stream.groundtruth.at(stamps)
+    down = int(np.searchsorted(stamps, stream.groundtruth.stamps_ns[stream.carry.last]))
+    travel_m = np.concatenate([[0.0], np.hypot(*np.diff(truth[down:, :2], axis=0).T).cumsum()])
+    believed = online.at(stamps)
+    on_map = compose(align(truth[:down], believed[:down]), believed)
+    off_m = np.hypot(*(on_map - truth)[down:, :2].T)
+    found = int(np.argmax(off_m < 0.5))
+    assert off_m[0] > 0.5
+    assert travel_m[found] < 5.0
+    assert off_m[found:].max() < 0.5
+    loops = [edge for edge in experiences.edges if edge.kind is EdgeKind.LOOP and edge.status is Status.ACCEPTED]
+    back = [edge for edge in loops if edge.source >= down > edge.target]
+    assert travel_m[min(edge.since_node for edge in back) - down] < 5.0
+    first = min(back, key=lambda edge: edge.since_node)
+    apart = truth[first.source, :2] - truth[first.target, :2]
+    assert np.hypot(*apart) < 1.0
+    ends = compose(align(truth, final.poses), final.poses)
+    assert np.hypot(*(ends - truth)[:, :2].T).max() < 0.2
