@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.laser import RegistrationConfig
-from hybridmap.geometry import Array, compose, wrap_angle
+from hybridmap.geometry import Array, compose
 from hybridmap.vision.laser.cloud import Cloud
 from hybridmap.vision.laser.likelihood import LikelihoodField, ambiguity
 
 CONVERGED = 5e-4
+LEAST = 1e-6
 WEAKEST_INFORMATION = (1.0, 1.0, 4.0)
 
 
@@ -121,16 +123,12 @@ def align(
     moving = _Moving(*(np.ascontiguousarray(a[..., i]) for a in (cloud.points, cloud.normals) for i in (0, 1)))
     scale = 2.0 * config.cauchy_scale_m
     for iteration in range(config.iterations):
-        partners = _partners(field, moving, poses)
-        hessian, gradient = _normal_equations(partners, scale)
-        if prior is not None:
-            _add_prior(hessian, gradient, poses, prior)
-        hessian[:, [0, 1, 2], [0, 1, 2]] += 1e-6
-        step = -np.linalg.solve(hessian, gradient[..., None])[..., 0]
-        poses = compose(poses, step.clip(-0.3, 0.3))
+        hessian, gradient = _normal_equations(_partners(field, moving, poses), scale)
+        steps = _newton_steps(hessian, gradient, poses, prior)
+        poses = compose(poses, steps.clip(-0.3, 0.3))
         if iteration >= 2:
             scale = config.cauchy_scale_m
-            if np.abs(step).max() < CONVERGED:
+            if np.abs(steps).max() < CONVERGED:
                 break
     return _judge(_partners(field, moving, poses), poses, config)
 
@@ -158,14 +156,32 @@ def _normal_equations(partners: _Partners, scale: float) -> tuple[Array, Array]:
     return hessian / scale**2, gradient / scale**2
 
 
-def _add_prior(hessian: Array, gradient: Array, poses: Array, prior: Prior) -> None:
-    off = poses - prior.pose
-    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    weight_m, weight_rad = prior.sigma_m**-2, prior.sigma_rad**-2
-    hessian[:, [0, 1, 2], [0, 1, 2]] += [weight_m, weight_m, weight_rad]
-    gradient[:, 0] += weight_m * (cos * off[:, 0] + sin * off[:, 1])
-    gradient[:, 1] += weight_m * (cos * off[:, 1] - sin * off[:, 0])
-    gradient[:, 2] += weight_rad * wrap_angle(off[:, 2])
+def _newton_steps(hessian: Array, gradient: Array, poses: Array, prior: Prior | None) -> Array:
+    """Steps (K, 3) in the body frame, the prior taken in; a system of three unknowns is soonest solved without arrays."""
+    expected = poses.tolist() if prior is None else np.broadcast_to(prior.pose, poses.shape).tolist()
+    weight_m, weight_rad = (0.0, 0.0) if prior is None else (prior.sigma_m**-2, prior.sigma_rad**-2)
+    steps = []
+    for pose, middle, h, g in zip(poses.tolist(), expected, hessian.tolist(), gradient.tolist(), strict=True):
+        cos, sin = math.cos(pose[2]), math.sin(pose[2])
+        x, y = pose[0] - middle[0], pose[1] - middle[1]
+        turn = math.remainder(pose[2] - middle[2], 2.0 * math.pi)
+        g = [g[0] + weight_m * (cos * x + sin * y), g[1] + weight_m * (cos * y - sin * x), g[2] + weight_rad * turn]
+        for i, weight in enumerate((weight_m, weight_m, weight_rad)):
+            h[i][i] += weight + LEAST
+        steps.append(_solved(h, g))
+    return np.array(steps)
+
+
+def _solved(h: list[list[float]], g: list[float]) -> list[float]:
+    """Solution of h step = -g for a symmetric positive definite h, by its LDL decomposition."""
+    l1, l2 = h[0][1] / h[0][0], h[0][2] / h[0][0]
+    d1, middle = h[1][1] - l1 * h[0][1], h[1][2] - l1 * h[0][2]
+    l3 = middle / d1
+    d2 = h[2][2] - l2 * h[0][2] - l3 * middle
+    y1 = -g[1] + l1 * g[0]
+    z2 = (-g[2] + l2 * g[0] - l3 * y1) / d2
+    z1 = y1 / d1 - l3 * z2
+    return [-g[0] / h[0][0] - l1 * z1 - l2 * z2, z1, z2]
 
 
 def _judge(partners: _Partners, poses: Array, config: RegistrationConfig) -> Alignment:
