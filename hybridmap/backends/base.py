@@ -37,6 +37,8 @@ class SolveReport:
         unit_variance: chi2 of the edges that were not rejected per degree of freedom; 1 where the stated noise is the true one.
         rejected_clusters: groups of rejected loops that agree with each other, the largest first: true loops that were
             dropped, or a place taken for another one. Only where a whole graph was solved.
+
+    These last three are under the calibration of odometry that the back-end found, if it looks for one.
     """
 
     backend: str

@@ -50,6 +50,10 @@ class Covariances:
         carried = -adjoint(between(self._poses[targets], self._poses[sources]))
         return self._projected(np.broadcast_to(np.eye(3), carried.shape), targets, carried, sources)
 
+    def solve(self, columns: Array) -> Array:
+        """H^-1 times columns (3N - 3, K), in the order of the nodes from node 1 on."""
+        return np.asarray(self._factor.solve(columns))
+
     def _projected(self, at_first: Array, first: NDArray[np.int64], at_second: Array, second: NDArray[np.int64]) -> Array:
         """J H^-1 J' (L, 3, 3) for Jacobians J with one block at each of two nodes."""
         count, size = len(first), 3 * len(self._poses)

@@ -1,4 +1,4 @@
-"""False loop closures put into a graph on purpose, to see what a back-end survives."""
+"""False loop closures and bent odometry put into a graph on purpose, to see what a back-end survives."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.errors import GraphError
+from hybridmap.graph.connectivity import chain
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 
 _RUN = 5  # aliased loops that come one after the other and agree with each other
@@ -44,6 +45,14 @@ def inject(graph: PoseGraph, share: float, mode: Literal["random", "aliased"], r
         edge_ids=np.concatenate([graph.edge_ids, last + 1 + np.arange(count)]),
         entered=entered,
     )
+
+
+def bend(graph: PoseGraph, bias_rad_m: float) -> PoseGraph:
+    """Add a heading bias to every odometry edge, in rad a metre of its length; `initial` becomes the bent chain."""
+    deltas = graph.deltas.copy()
+    odometry = graph.kinds == EdgeKind.ODOMETRY
+    deltas[odometry, 2] += bias_rad_m * np.hypot(deltas[odometry, 0], deltas[odometry, 1])
+    return chain(replace(graph, deltas=deltas))
 
 
 def _random_pairs(

@@ -31,6 +31,7 @@ class Outcome:
         weights: loop edge id -> final weight.
         rejected: loops held for false.
         values: the poses in the solver's own form, to start from again.
+        calibrated: the graph under the odometry calibration that the solver found.
     """
 
     poses: Array
@@ -40,6 +41,7 @@ class Outcome:
     weights: dict[int, float] = field(default_factory=dict)
     rejected: tuple[int, ...] = ()
     values: Any = None
+    calibrated: PoseGraph | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,6 +191,8 @@ class GraphBackend(ABC):
 
     def _solution(self, graph: PoseGraph, start: Array, outcome: Outcome, started: float, *, whole: bool = False) -> Solution:
         squared = squared_norms(graph, outcome.poses)
+        meant = graph if outcome.calibrated is None else outcome.calibrated
+        strain = squared if outcome.calibrated is None else squared_norms(meant, outcome.poses)
         clusters = whole and len(outcome.rejected) > 0
         report = SolveReport(
             backend=self._name,
@@ -200,9 +204,9 @@ class GraphBackend(ABC):
             cpu_s=time.process_time() - started,
             rejected_edge_ids=outcome.rejected,
             weights=outcome.weights,
-            chi2_odometry=total(squared[~graph.is_loop]),
-            unit_variance=unit_variance(graph, squared, outcome.rejected),
-            rejected_clusters=rejected_clusters(graph, outcome.poses, outcome.rejected, gate_of(self._config))
+            chi2_odometry=total(strain[~graph.is_loop]),
+            unit_variance=unit_variance(meant, strain, outcome.rejected),
+            rejected_clusters=rejected_clusters(meant, outcome.poses, outcome.rejected, gate_of(self._config))
             if clusters
             else (),
         )

@@ -24,6 +24,7 @@ _TABLE = {
     "gtsam-cauchy": ("robust", "KernelBackend"),
     "gtsam-dcs": ("robust", "KernelBackend"),
     "gtsam-gnc": ("gnc", "GncBackend"),
+    "gtsam-calibrated": ("calibrated", "CalibratedBackend"),
 }
 
 

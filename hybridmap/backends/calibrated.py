@@ -1,0 +1,145 @@
+"""`gtsam-calibrated`: gain, turn gain and heading bias of the odometry are variables of the graph.
+
+Wheels that bend every metre by the same amount are no outlier: no kernel takes that out, and true loops that contradict
+the bent chain are thrown out instead. As a variable of the graph the bias straightens the whole chain. A wrong winding of the
+chain is a local minimum, so the solution is sought from several biases; the lowest truncated cost wins, in which
+odometry counts in full and a rejected loop as much as the gate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.backends.batch import run
+from hybridmap.backends.covariance import Covariances
+from hybridmap.backends.factors import NoiseModels, factor_graph
+from hybridmap.backends.following import Outcome
+from hybridmap.backends.gnc import GncBackend
+from hybridmap.backends.objective import gate_of, residuals, squared_norms, truncated_cost, unit_variance
+from hybridmap.geometry import Array, adjoint, between, exp, log
+from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+
+BIAS_STARTS_RAD_M = (0.0, -0.02, 0.02, -0.06, 0.06)
+"""Starts of the heading bias, rad/m; the drift of wheels seldom exceeds 3 deg/m."""
+
+_NEUTRAL = np.array([1.0, 1.0, 0.0])
+_PRIOR_SIGMA = np.array([0.02, 0.1, 0.2])  # so wide that it only holds what the drive leaves open, such as its scale
+_ROUNDS = 12
+_SETTLED = 1e-6
+_SAME = 2e-4  # by how much the calibrations of two starts may differ to be one
+_STEP = 1e-6  # of the difference that takes a derivative by the calibration
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """A start's result: `graph` is the one with calibrated odometry, `gains` (3,) gain, turn gain, heading bias."""
+
+    graph: PoseGraph
+    outcome: Outcome
+    gains: Array
+    cost: float
+
+
+def with_gains(deltas: Array, gains: Array) -> Array:
+    """Odometry edges (E, 3) as calibrated wheels would have measured them.
+
+    The robot is taken to have driven an arc: with the twist log(delta) = (x, y, w) the calibrated one is
+    (gain x, gain y, turn_gain w + bias x).
+    """
+    twist = log(deltas)
+    turn = gains[1] * twist[:, 2] + gains[2] * twist[:, 0]
+    return exp(np.column_stack([gains[0] * twist[:, :2], turn]))
+
+
+class CalibratedBackend(GncBackend):
+    """While driving as `gtsam-gnc`; on a whole graph with the calibration as one more variable."""
+
+    def _best(self, graph: PoseGraph, driven: Array | None) -> Outcome:
+        found: list[_Found] = []
+        for bias in BIAS_STARTS_RAD_M:
+            one = self._from(graph, np.array([1.0, 1.0, bias]), driven if bias == 0.0 else None)
+            agrees = any(np.abs(one.gains - other.gains).max() < _SAME for other in found)
+            found.append(one)
+            if agrees and min(found, key=lambda each: each.cost).outcome.rejected == one.outcome.rejected:
+                break
+        best = min(found, key=lambda each: each.cost)
+        gain, turn_gain, bias = best.gains
+        message = f"gain {gain:.4f}, turn gain {turn_gain:.4f}, heading bias {bias:.5f} rad/m from {len(found)} starts"
+        return replace(best.outcome, message=f"{message}; {best.outcome.message}", calibrated=best.graph)
+
+    def _from(self, graph: PoseGraph, gains: Array, driven: Array | None) -> _Found:
+        """Choose loops and calibrate in turn until neither changes."""
+        own = _own_edges(graph)
+        straight = _calibrated(graph, own, gains)
+        outcome = super()._best(straight, driven)
+        for _ in range(3):
+            before = outcome.rejected
+            gains, poses = self._calibrate(graph, own, gains, outcome)
+            straight = _calibrated(graph, own, gains)
+            outcome = super()._best(straight, poses)
+            if outcome.rejected == before:
+                break
+        squared = squared_norms(straight, outcome.poses)
+        bound = min(1.0, 4.0 * unit_variance(straight, squared, outcome.rejected)) * gate_of(self._config)
+        return _Found(straight, outcome, gains, truncated_cost(straight, outcome.poses, bound))
+
+    def _calibrate(self, graph: PoseGraph, own: NDArray[np.int64], gains: Array, outcome: Outcome) -> tuple[Array, Array]:
+        """Gauss-Newton on the three numbers, each time with the poses that are best for them; both."""
+        kept = ~np.isin(graph.edge_ids, outcome.rejected)
+        poses = outcome.poses
+        for _ in range(_ROUNDS):
+            straight = _calibrated(graph, own, gains).with_edges(kept)
+            poses = run("lm", factor_graph(straight, NoiseModels()), poses, self._config.max_iterations).poses
+            step = _gain_step(graph.with_edges(kept), straight, poses, gains)
+            if not np.isfinite(step).all():
+                break
+            gains = gains + step
+            if np.abs(step).max() < _SETTLED:
+                break
+        return gains, poses
+
+
+def _own_edges(graph: PoseGraph) -> NDArray[np.int64]:
+    return np.flatnonzero((graph.kinds == EdgeKind.ODOMETRY) & (graph.targets == graph.sources + 1))
+
+
+def _calibrated(graph: PoseGraph, own: NDArray[np.int64], gains: Array) -> PoseGraph:
+    """The graph with calibrated odometry; its noise grows with the gains, or a smaller map would always fit better."""
+    deltas, information = graph.deltas.copy(), graph.information.copy()
+    deltas[own] = with_gains(deltas[own], gains)
+    shrink = 1.0 / np.array([gains[0], gains[0], gains[1]])
+    information[own] *= shrink[:, None] * shrink
+    return replace(graph, deltas=deltas, information=information)
+
+
+def _gain_step(raw: PoseGraph, straight: PoseGraph, poses: Array, gains: Array) -> Array:
+    """Step (3,) of the calibration with the poses eliminated (a Schur complement)."""
+    own = _own_edges(raw)
+    slope = np.stack([_slope(raw.deltas[own], straight.deltas[own], gains, k) for k in range(3)], axis=2)  # (O, 3, 3)
+    r, information = residuals(straight, poses), straight.information
+    slope[:, :2, 0] -= r[own, :2] / gains[0]
+    slope[:, 2, 1] -= r[own, 2] / gains[1]
+    s, t = straight.sources, straight.targets
+    carried = -adjoint(between(poses[t], poses[s])).transpose(0, 2, 1)
+    wide = np.zeros((straight.n_nodes, 3, 4))  # columns: by each of the three numbers, and the gradient
+    np.add.at(wide, s[own], np.concatenate([carried[own] @ information[own] @ slope, np.zeros((len(own), 3, 1))], axis=2))
+    np.add.at(wide, t[own], np.concatenate([information[own] @ slope, np.zeros((len(own), 3, 1))], axis=2))
+    pull = (information @ r[:, :, None])[:, :, 0]
+    np.add.at(wide[:, :, 3], s, (carried @ pull[:, :, None])[:, :, 0])
+    np.add.at(wide[:, :, 3], t, pull)
+    columns = wide.reshape(-1, 4)[3:]
+    solved = Covariances(straight, poses).solve(columns)
+    own_part = np.einsum("eik,eij,ejl->kl", slope, information[own], slope) + np.diag(_PRIOR_SIGMA**-2.0)
+    reduced = own_part - columns[:, :3].T @ solved[:, :3]
+    gradient = np.einsum("eik,ei->k", slope, pull[own]) + (gains - _NEUTRAL) / _PRIOR_SIGMA**2
+    return np.asarray(-np.linalg.solve(reduced, gradient - columns[:, :3].T @ solved[:, 3]))
+
+
+def _slope(raw: Array, straight: Array, gains: Array, number: int) -> Array:
+    """Derivative (O, 3) of the residuals of odometry edges by one of the three numbers."""
+    moved = gains.copy()
+    moved[number] += _STEP
+    return np.asarray(-log(between(straight, with_gains(raw, moved))) / _STEP)
