@@ -69,6 +69,7 @@ app.command("verify")(verify)
 
 def main() -> None:
     """Run the command line: every error is one line on standard error and exit code 2."""
+    os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")  # pictures are small: a second thread costs more than it gives
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # a damaged picture is reported by our own line
     try:
         code = app(prog_name="hybridmap", standalone_mode=False)
