@@ -97,6 +97,11 @@ def merit_figure(study: Study, plan: Layout, label: str, figure: Figure, *, loga
     rows = plan.along == "back-end"
     with _axes(len(shown), 0.24 * len(titles) + 1.0 if rows else 2.9) as (picture, panels):
         for axes, panel in zip(panels, shown, strict=False):
+            if all(figure(result) is None for _, _, result in panel.cells):
+                axes.text(0.5, 0.5, "no cell has this figure", ha="center", transform=axes.transAxes, color="#666666")
+                axes.set_axis_off()
+                axes.set_title(panel.title, fontsize=9.0)
+                continue
             (_draw_rows if rows else _draw_lines)(axes, panel, figure, looks)
             axes.set_title(panel.title, fontsize=9.0)
             value_axis = axes.xaxis if rows else axes.yaxis
@@ -106,8 +111,11 @@ def merit_figure(study: Study, plan: Layout, label: str, figure: Figure, *, loga
             if not rows:
                 axes.set_xlabel(plan.along)
         if not rows:
-            handles, names = panels[0].get_legend_handles_labels()
-            picture.legend(handles, names, loc="outside upper center", ncols=min(4, len(names)))
+            known: dict[str, Any] = {}
+            for axes in panels:
+                known |= {name: handle for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
+            if known:
+                picture.legend(known.values(), known, loc="outside upper center", ncols=min(4, len(known)))
         return style.svg_uri(picture)
 
 

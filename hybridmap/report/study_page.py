@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -102,17 +103,17 @@ def _shares(study: Study, plan: study_figures.Layout, label: str, figure: study_
 
 def _tiles(study: Study) -> list[tuple[str, str]]:
     config = study.grid.study
-    solved = sum(result.status in _SOLVED for _, result in study.rows)
+    solved = sum("chi2" in result.figures for _, result in study.rows)
     counts = [
         (len(study.grid.cells), "cells"),
-        (solved, "of them solved"),
-        (len(config.sources), "sources"),
-        (len(config.settings), "settings"),
-        (len(config.backends), "back-ends"),
-        (len({(cell.kind, cell.rate) for cell in study.grid.cells}), "kinds and rates of false loops"),
-        (len(config.seeds), "seeds"),
+        (solved, "cells with a map"),
+        (len(config.sources), "source(s)"),
+        (len(config.settings), "setting(s)"),
+        (len(config.backends), "back-end(s)"),
+        (len({(cell.kind, cell.rate) for cell in study.grid.cells}), "mix(es) of false loops"),
+        (len(config.seeds), "seed(s)"),
     ]
-    return [(str(count), label) for count, label in counts]
+    return [(str(count), re.sub(r"\((\w+)\)", "" if count == 1 else r"\1", label)) for count, label in counts]
 
 
 def _reference(study: Study) -> bool:

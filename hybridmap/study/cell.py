@@ -40,6 +40,8 @@ MEASURES = {
     "chi2_own": ("1", "referee's chi2 at the end over the graph's own edges, without the false loops put into it"),
     "false_kept": ("1", f"false loops of weight above {KEPT}"),
     "own_lost": ("1", "of the graph's own loops, those that the back-end holds for false"),
+    "chi2_odometry": ("1", "share of chi2 that is not of loops; large where true loops were dropped"),
+    "unit_variance": ("1", "chi2 of the edges kept per degree of freedom; 1 where the stated noise is the true one"),
     "iterations": ("1", "iterations, sweeps or updates"),
 }
 """Figure of merit -> unit and meaning, in the order of the tables."""
@@ -151,6 +153,8 @@ def judge(own: PoseGraph, graph: PoseGraph, solution: Solution, reference: Array
         "yaw_deg": _finite(yaw_deg),
         "chi2": _finite(solution.report.chi2),
         "chi2_own": _finite(chi2(own, solution.poses)),
+        "chi2_odometry": _finite(solution.report.chi2_odometry),
+        "unit_variance": _finite(solution.report.unit_variance),
         "false_kept": float(np.count_nonzero(false & kept)),
         "own_lost": float(np.count_nonzero(~false & rejected)),
     }
@@ -226,5 +230,5 @@ def _counts(own: PoseGraph, graph: PoseGraph) -> dict[str, float | None]:
     }
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None

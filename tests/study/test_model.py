@@ -1,0 +1,91 @@
+"""A study's configuration: short forms, variants, paths, and refusals that name the key."""
+
+import pytest
+
+from hybridmap.errors import ConfigError
+from hybridmap.study import StudyConfig, named_studies
+from hybridmap.study.grid import lay_out
+from hybridmap.study.model import backend_settings
+from tests.study.studies import TREE, small
+
+
+def test_short_forms_are_spelt_out():
+    study = small(seeds=3, sources=["lab"], backends=["gtsam-lm", {"backend": "odometry", "name": "none"}])
+    assert study.seeds == (0, 1, 2)
+    assert (study.sources[0].world, study.sources[0].title) == ("lab", "lab")
+    assert [(variant.backend, variant.title) for variant in study.backends] == [("gtsam-lm", "gtsam-lm"), ("odometry", "none")]
+
+
+def test_varied_settings_become_variants_of_their_own():
+    entry = {"backend": "relaxation-ratslam", "vary": {"relaxation.theta": [0.2, 0.5], "relaxation.solve_sweeps": [10, 20]}}
+    variants = small(backends=[entry]).backends
+    assert [variant.title for variant in variants] == [
+        "relaxation-ratslam theta=0.2 solve_sweeps=10",
+        "relaxation-ratslam theta=0.2 solve_sweeps=20",
+        "relaxation-ratslam theta=0.5 solve_sweeps=10",
+        "relaxation-ratslam theta=0.5 solve_sweeps=20",
+    ]
+    settings = backend_settings(variants[1]).relaxation
+    assert (settings.theta, settings.solve_sweeps) == (0.2, 20)
+
+
+def test_the_resolved_study_reads_back_to_an_equal_one(tmp_path, monkeypatch):
+    monkeypatch.setenv("GRAPHS", str(tmp_path))
+    (tmp_path / "a.yaml").write_text("sources: [{graph: $GRAPHS/a.g2o}]\nbackends: [gtsam-lm]\nseeds: 2\n")
+    study = StudyConfig.load(tmp_path / "a.yaml", {"false_loops.rates": [0.1]})
+    assert study.sources[0].graph == tmp_path / "a.g2o"
+    assert (study.name, study.sources[0].title, study.false_loops.rates) == ("a", "a.g2o", (0.1,))
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "b.yaml").write_text(study.to_yaml())
+    assert StudyConfig.load(tmp_path / "elsewhere" / "b.yaml") == study
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"seads": 3}, "unknown key 'seads'"),
+        ({"backends": [{"backend": "gtsam-lm", "thata": 1}]}, "unknown key 'backends.0.thata'"),
+        ({"backends": [{"backend": "gtsam-lm", "settings": {"relaxation": {"thata": 1}}}]}, "unknown key 'relaxation.thata'"),
+        ({"backends": [{"backend": "gtsam-lm", "settings": {"relaxation.theta": 7}}]}, "relaxation.theta: .*found 7"),
+        ({"backends": [{"backend": "gtsam-lm", "settings": {"names": ["odometry"]}}]}, "say `backend: NAME`"),
+        ({"backends": ["gtsam-ml"]}, "unknown back-end 'gtsam-ml'; there are odometry"),
+        ({"backends": ["gtsam-lm", "gtsam-lm"]}, "backends: 'gtsam-lm' is there twice"),
+        ({"backends": []}, "backends: "),
+        ({"sources": [{"name": "x"}]}, "x: found none, expected one of world, session, graph, synthetic"),
+        ({"sources": [{"world": "lab", "graph": "a.g2o"}]}, "found world and graph"),
+        ({"sources": ["labb"]}, "no world called 'labb'; there are lab"),
+        ({"sources": [{"graph": "$NO_SUCH_PLACE/a.g2o"}]}, "NO_SUCH_PLACE is not set"),
+        ({"sources": [{"synthetic": {}, "config": "laser"}]}, "for worlds only"),
+        ({"settings": [{"name": "a", "overrides": {"seed": 1}}]}, "overrides need a world to map"),
+        ({"false_loops": {"rates": [1.0]}}, "false_loops.rates.0: .*less than 1"),
+        ({"seeds": [1, 1]}, "seeds: '1' is there twice"),
+        ({"seeds": 0}, "seeds: "),
+    ],
+)
+def test_refusals_name_the_key(changes, expected):
+    with pytest.raises(ConfigError, match=rf"small.yaml: .*{expected}|{expected}"):
+        small(**changes)
+
+
+def test_a_missing_or_damaged_file_is_refused(tmp_path):
+    (tmp_path / "list.yaml").write_text("- 1\n")
+    (tmp_path / "torn.yaml").write_text("a: [\n")
+    for name, expected in (("none.yaml", "studies that come with"), ("list.yaml", "a mapping"), ("torn.yaml", "not a YAML")):
+        with pytest.raises(ConfigError, match=expected):
+            StudyConfig.load(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", sorted(named_studies()))
+def test_every_study_that_comes_along_is_whole(name, monkeypatch, tmp_path):
+    monkeypatch.setenv("HYBRIDMAP_DATA", str(tmp_path))
+    study = StudyConfig.load(name)
+    assert study.description
+    assert len(study.backends) > 1
+    if not any(source.graph or source.session for source in study.sources):
+        assert len({cell.key for cell in lay_out(study).cells}) > 1
+
+
+def test_the_tree_of_these_tests_is_not_changed_by_reading_it():
+    before = repr(TREE)
+    small(seeds=2)
+    assert repr(TREE) == before
