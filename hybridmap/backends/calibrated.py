@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.batch import run
+from hybridmap.backends.clusters import rejected_clusters
 from hybridmap.backends.covariance import Covariances
 from hybridmap.backends.factors import NoiseModels, factor_graph
 from hybridmap.backends.following import Outcome
 from hybridmap.backends.gnc import GncBackend
-from hybridmap.backends.objective import gate_of, residuals, squared_norms, truncated_cost, unit_variance
+from hybridmap.backends.objective import gate_of, residuals, truncated_cost
 from hybridmap.geometry import Array, adjoint, between, exp, log
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 
@@ -63,7 +64,7 @@ class CalibratedBackend(GncBackend):
             one = self._from(graph, np.array([1.0, 1.0, bias]), driven if bias == 0.0 else None)
             agrees = any(np.abs(one.gains - other.gains).max() < _SAME for other in found)
             found.append(one)
-            if agrees and min(found, key=lambda each: each.cost).outcome.rejected == one.outcome.rejected:
+            if agrees and not rejected_clusters(one.graph, one.outcome.poses, one.outcome.rejected, gate_of(self._config)):
                 break
         best = min(found, key=lambda each: each.cost)
         gain, turn_gain, bias = best.gains
@@ -82,9 +83,7 @@ class CalibratedBackend(GncBackend):
             outcome = super()._best(straight, poses)
             if outcome.rejected == before:
                 break
-        squared = squared_norms(straight, outcome.poses)
-        bound = min(1.0, 4.0 * unit_variance(straight, squared, outcome.rejected)) * gate_of(self._config)
-        return _Found(straight, outcome, gains, truncated_cost(straight, outcome.poses, bound))
+        return _Found(straight, outcome, gains, truncated_cost(straight, outcome.poses, gate_of(self._config)))
 
     def _calibrate(self, graph: PoseGraph, own: NDArray[np.int64], gains: Array, outcome: Outcome) -> tuple[Array, Array]:
         """Gauss-Newton on the three numbers, each time with the poses that are best for them; both."""
