@@ -94,8 +94,8 @@ def _lines(done: Study) -> list[list[str]]:
     for (label, backend), found in by_row.items():
         ate, kept, lost = (found[name] for name in _HEADLINES)
         apart = ate.difference
-        paired = "" if apart is None else f"{apart.value:.3g}"
-        paired += "" if apart is None or apart.low != apart.low else f" [{apart.low:.3g}, {apart.high:.3g}]"
+        paired = "" if apart is None or not apart.count else f"{apart.value:.3g}"
+        paired += "" if apart is None or apart.count < 2 else f" [{apart.low:.3g}, {apart.high:.3g}]"
         figures = [f"{one.median:.4g}" if one.solved else "" for one in (ate, kept, lost)]
         lines.append([label, backend, f"{ate.solved}/{ate.cells}", figures[0], paired, figures[1], figures[2]])
     return lines

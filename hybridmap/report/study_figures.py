@@ -90,7 +90,7 @@ def _gathered(entries: Sequence[tuple[str, str, Cell, CellResult]], ticks: Seque
 
 
 def merit_figure(study: Study, plan: Layout, label: str, figure: Figure, *, logarithmic: bool) -> str:
-    """One figure of merit: dots are cells, lines and bars go through their medians; a `data:` URI."""
+    """One figure of merit, an error or a share in percent: dots are cells, lines and bars their medians; a `data:` URI."""
     shown = plan.panels[:MOST_PANELS]
     titles = [variant.title for variant in study.grid.study.backends]
     looks = style.line_styles(titles)
@@ -107,6 +107,8 @@ def merit_figure(study: Study, plan: Layout, label: str, figure: Figure, *, loga
             value_axis = axes.xaxis if rows else axes.yaxis
             value_axis.set_label_text(label)
             (axes.set_xscale if rows else axes.set_yscale)("log" if logarithmic else "linear")
+            if not logarithmic:
+                (axes.set_xlim if rows else axes.set_ylim)(-4.0, 104.0)  # shares, in percent
             axes.grid(True, axis="x" if rows else "y", linewidth=0.5)
             if not rows:
                 axes.set_xlabel(plan.along)
@@ -174,6 +176,9 @@ def _draw_rows(axes: Any, panel: Panel, figure: Figure, looks: dict[str, dict[st
         axes.plot(values, [position] * len(values), ".", color=looks[backend]["color"], markersize=5.0, alpha=0.6)
         if len(values):
             axes.plot([np.median(values)], [position], "|", color=looks[backend]["color"], markersize=13, markeredgewidth=2)
+        if without := _without(panel, position, backend, figure):
+            looks_of_text = {"fontsize": 7.5, "color": style.REJECTED, "va": "center"}
+            axes.text(0.01, position, without, transform=axes.get_yaxis_transform(), **looks_of_text)
     axes.set_yticks(range(len(panel.ticks)), panel.ticks)
     axes.set_ylim(len(panel.ticks) - 0.5, -0.5)
 
@@ -193,6 +198,13 @@ def _axes(count: int, panel_height_in: float) -> Iterator[tuple[Any, list[Any]]]
         for axes in panels[count:]:
             axes.set_axis_off()
         yield picture, panels
+
+
+def _without(panel: Panel, position: int, backend: str, figure: Figure) -> str:
+    """How many cells have no such figure, and their statuses."""
+    cells = [result for at, name, result in panel.cells if (at, name) == (position, backend)]
+    statuses = [result.status for result in cells if figure(result) is None]
+    return ", ".join(f"{statuses.count(status)} of {len(cells)} {status}" for status in sorted(set(statuses)))
 
 
 def _group(cell: Cell) -> str:

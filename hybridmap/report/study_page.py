@@ -85,7 +85,7 @@ def _render(study: Study) -> str:
         of_truth=_reference(study),
         ate=study_figures.merit_figure(study, plan, "ATE (m)", _error, logarithmic=True),
         kept=_shares(study, plan, "false loops kept (%)", _kept) if by_false_loops else "",
-        lost=_shares(study, plan, "own loops lost (%)", _lost),
+        lost=_shares(study, plan, "own loops lost (%)", _lost) if any(_lost(result) for _, result in study.rows) else "",
         differences=study_figures.difference_figure(study.summaries),
         confidence=f"{100.0 * config.statistics.confidence:g}",
         method={"t": "Student's t", "bootstrap": "BCa bootstrap"}[config.statistics.method],
