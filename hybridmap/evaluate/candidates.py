@@ -45,6 +45,7 @@ class Reading:
         max_shift: largest shift tried, columns.
         g_bar: see `vision.templates.combine`.
         sequence: views in a row that must match.
+        circular: the profiles go full circle.
     """
 
     mode: Mode
@@ -53,6 +54,7 @@ class Reading:
     max_shift: int = 16
     g_bar: GBar = "templates"
     sequence: int = 1
+    circular: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +93,8 @@ class Truth:
 
 
 DEFAULT_LIMITS = CandidateLimits()
+FROM_ANY_SIDE = CandidateLimits(same_deg=180.0, other_deg=180.0)
+"""For views that go full circle: a place is the same from whichever side it is entered."""
 
 
 def judge_pairs(
@@ -120,12 +124,12 @@ def score_matrix(profiles: Sequence[Profile], queries: Indices, readings: Sequen
     Args:
         profiles: of all nodes, (bands, width) each.
         queries: (Q,) the views, ascending.
-        readings: how to score; their largest shifts must be one and the same.
+        readings: how to score; their largest shifts, and whether they are circular, must be one and the same.
 
     Returns:
         For each reading (Q, N), smaller for a better match; infinite where a node is not older than the view.
     """
-    store = ProfileStore(readings[0].max_shift)
+    store = ProfileStore(readings[0].max_shift, readings[0].circular)
     for profile in profiles:
         store.add(profile)
     wanted = _with_predecessors(queries, max(reading.sequence for reading in readings))
@@ -140,7 +144,7 @@ def score_matrix(profiles: Sequence[Profile], queries: Indices, readings: Sequen
     row_of = {int(number): at for at, number in enumerate(wanted)}
     out = []
     for row, r in zip(rows, readings, strict=True):
-        ordered = [_sequence(row, row_of, int(number), r.sequence) for number in queries]
+        ordered = [_sequence(row, row_of, int(number), r) for number in queries]
         out.append(np.stack(ordered) if ordered else np.zeros((0, len(profiles))))
     return out
 
@@ -170,17 +174,17 @@ def _with_predecessors(queries: Indices, sequence: int) -> Indices:
     return np.unique(before[before >= 0])
 
 
-def _sequence(rows: Array, row_of: dict[int, int], number: int, sequence: int) -> Array:
+def _sequence(rows: Array, row_of: dict[int, int], number: int, reading: Reading) -> Array:
     """Scores (N,) of one view with those before it."""
     scores: Array = rows[row_of[number]]
-    if sequence == 1:
+    if reading.sequence == 1:
         return scores
 
     def earlier(back: int, partners: Indices) -> Array:
         return np.asarray(rows[row_of[number - back], partners])
 
     out: Array = scores.copy()
-    out[:number] = in_sequence(scores[:number], np.arange(number), number, sequence, earlier)
+    out[:number] = in_sequence(scores[:number], np.arange(number), number, reading.sequence, earlier, reading.circular)
     return out
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ import yaml
 from hybridmap.config.vision import MatchingConfig, ProfileConfig
 from hybridmap.errors import EvaluationError
 from hybridmap.evaluate.candidates import (
+    DEFAULT_LIMITS,
+    FROM_ANY_SIDE,
     CandidateErrors,
     Reading,
     all_readings,
@@ -22,21 +24,24 @@ from hybridmap.evaluate.candidates import (
 )
 from hybridmap.metrics import Metric
 from hybridmap.store import MapStore, SessionFolder
-from hybridmap.streams.base import RgbdFrame
+from hybridmap.streams.base import Laser, RgbdFrame
 from hybridmap.trajectory import Trajectory, read_tum
 from hybridmap.vision.profile import Profile, image_profile
+from hybridmap.vision.templates import Mode
 
+FULL_CIRCLE_RAD = float(np.deg2rad(355.0))
 Progress = Callable[[int, int | None], None]
 
 
 @dataclass(frozen=True, slots=True)
 class ViewSettings:
-    """What of a session's configuration its profiles depend on."""
+    """What of a session its profiles and their comparison depend on; `circular`: its laser sees all around."""
 
     profile: ProfileConfig
     matching: MatchingConfig
-    mode: str
+    mode: Mode
     max_width_px: int
+    circular: bool
 
 
 def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
@@ -60,17 +65,19 @@ def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
         profiles, stamps = stored_profiles(store), node_stamps(store)
     if not profiles:
         raise EvaluationError(f"{folder}: its nodes hold no views: there are no candidates to judge")
-    mode = settings.mode if len(profiles[0]) > 1 else "plain"
-    matching = settings.matching
+    if len(profiles[0]) == 1:
+        settings = replace(settings, mode="plain")
+    mode, matching, circular = settings.mode, settings.matching, settings.circular and len(profiles[0]) == 1
     reading = Reading(
-        mode,  # type: ignore[arg-type]
+        mode,
         matching.mu_r,
         matching.mu_d,
         min(matching.max_shift, profiles[0].shape[1] - 1),
         matching.g_bar,
         matching.sequence,
+        circular,
     )
-    pairs = judge_pairs(stamps, truth)
+    pairs = judge_pairs(stamps, truth, FROM_ANY_SIDE if circular else DEFAULT_LIMITS)
     errors = candidate_errors(score_matrix(profiles, pairs.queries, [reading])[0], pairs)
     metrics = candidate_metrics(mode, errors)
     SessionFolder(folder).merge_metrics(metrics)
@@ -80,19 +87,22 @@ def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
 def every_mode(
     folder: Path, reference: Path | None = None, progress: Progress | None = None
 ) -> Iterator[tuple[str, CandidateErrors]]:
-    """Judge every mode on the frames of an RGB-D session, with its own sizes of profiles and shifts.
+    """Judge every mode on the frames of a session, with its own sizes of profiles and shifts; of a laser: as fan and circle.
 
     Yields:
         Name of the mode, and its figures.
 
     Raises:
         StoreError: no session there.
-        EvaluationError: no truth, or no frames.
+        EvaluationError: no truth, or neither frames nor scans.
     """
     truth = truth_of(folder, reference)
     named = list(all_readings())
     with MapStore.open(folder) as store:
         settings, stamps = view_settings(store), node_stamps(store)
+        if store.rig.camera is None:
+            yield from _modes_of_laser(store, settings, stamps, truth)
+            return
         pairs = judge_pairs(stamps, truth)
         for bands in (1, 4):
             profiles = profiles_again(store, settings, bands, len(stamps), progress)
@@ -100,6 +110,20 @@ def every_mode(
             rows = score_matrix(profiles, pairs.queries, [reading for _, reading in readings])
             for (name, _), row in zip(readings, rows, strict=True):
                 yield name, candidate_errors(row, pairs)
+
+
+def _modes_of_laser(
+    store: MapStore, settings: ViewSettings, stamps: np.ndarray[Any, np.dtype[np.int64]], truth: Trajectory
+) -> Iterator[tuple[str, CandidateErrors]]:
+    profiles = stored_profiles(store)
+    if not profiles:
+        raise EvaluationError(f"{store.path}: its nodes hold no views: there are no candidates to judge")
+    for circular in (False, True) if settings.circular else (False,):
+        pairs = judge_pairs(stamps, truth, FROM_ANY_SIDE if circular else DEFAULT_LIMITS)
+        readings = [Reading("plain", max_shift=settings.matching.max_shift, sequence=n, circular=circular) for n in (1, 5)]
+        for reading, row in zip(readings, score_matrix(profiles, pairs.queries, readings), strict=True):
+            name = "full circle, from any side" if circular else "fan, from the same side"
+            yield name + (f", {reading.sequence} in a row" if reading.sequence > 1 else ""), candidate_errors(row, pairs)
 
 
 def candidate_metrics(mode: str, errors: CandidateErrors) -> list[Metric]:
@@ -134,9 +158,17 @@ def view_settings(store: MapStore) -> ViewSettings:
     return ViewSettings(
         ProfileConfig.model_validate(tree.get("profile") or {}),
         MatchingConfig.model_validate(tree.get("matching") or {}),
-        str(rgbd.get("matching", "four-band")),
+        rgbd.get("matching", "four-band"),
         int(rgbd.get("max_width_px", 320)),
+        _sees_all_around(store.rig.laser),
     )
+
+
+def _sees_all_around(laser: Laser | None) -> bool:
+    if laser is None:
+        return False
+    span = float(np.ptp(laser.bearings_rad))
+    return span + span / max(len(laser.bearings_rad) - 1, 1) >= FULL_CIRCLE_RAD
 
 
 def node_stamps(store: MapStore) -> np.ndarray[Any, np.dtype[np.int64]]:

@@ -37,6 +37,11 @@ class Nearest:
     shift: Indices
 
 
+def full_circle(width: int) -> Indices:
+    """(width,) every shift of a profile that goes full circle, ascending, from half a turn back."""
+    return np.arange(width) - width // 2
+
+
 class Blocks:
     """Rows of one length, appended one by one; memory is taken a block at a time and never moved.
 
@@ -89,15 +94,17 @@ class ProfileIndex:
         weights: (bands,) of the bands, summing to 1.
         width: columns of a profile.
         max_shift: largest shift tried, columns.
+        circular: the profiles go full circle: every shift is tried, and columns that leave on one side come in on the other.
     """
 
-    def __init__(self, weights: NDArray[np.float64], width: int, max_shift: int) -> None:
+    def __init__(self, weights: NDArray[np.float64], width: int, max_shift: int, circular: bool = False) -> None:
         self._bands = np.flatnonzero(weights > 0)
         self._width = width
         self._steps = 127.0 / HALF_RANGE * (weights[self._bands] / weights.max())
         self._unit = float(weights.max()) * HALF_RANGE / 127.0
         self._rows = Blocks(width * len(self._bands), np.uint8)
-        self._shifts = np.arange(-max_shift, max_shift + 1)
+        self._circular = circular
+        self._shifts = full_circle(width) if circular else np.arange(-max_shift, max_shift + 1)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -146,6 +153,10 @@ class ProfileIndex:
         import cv2
 
         most, bands, length = min(count, len(block)), len(self._bands), sought.shape[1]
+        if self._circular:
+            turned = np.stack([np.roll(sought[0], -bands * c) for c in self._shifts.tolist()])
+            sums, rows = cv2.batchDistance(turned, block, cv2.CV_32S, None, None, cv2.NORM_L1, most)
+            return rows.ravel().astype(np.int64) + first, sums.ravel() / self._width, np.repeat(self._shifts, most)
         sums, rows = np.empty((2, len(self._shifts), 1, most), dtype=np.int32)
         for at, c in enumerate(self._shifts.tolist()):
             skip, overlap = bands * abs(c), length - bands * abs(c)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.vision.profile import Profile
-from hybridmap.vision.search import Blocks, ProfileIndex
+from hybridmap.vision.search import Blocks, ProfileIndex, full_circle
 
 Mode = Literal["literal", "ratio", "signed", "plain", "four-band"]
 GBar = Literal["templates", "shifts"]
@@ -45,10 +45,17 @@ _NOTHING = Match(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.
 
 
 class ProfileStore:
-    """Profiles by number, with their differences to a query over all shifts. Grows by blocks: nothing is ever copied."""
+    """Profiles by number, with their differences to a query over all shifts. Grows by blocks: nothing is ever copied.
 
-    def __init__(self, max_shift: int) -> None:
+    Args:
+        max_shift: largest shift tried, columns.
+        circular: the profiles go full circle, as those of a laser that sees all around: every shift is tried, none loses
+            columns, and a place is known again from whichever side it is entered.
+    """
+
+    def __init__(self, max_shift: int, circular: bool = False) -> None:
         self._shifts = np.arange(-max_shift, max_shift + 1)
+        self._circular = circular
         self._shape = (0, 0)
         self._rows = Blocks(0, np.float32)
 
@@ -65,6 +72,8 @@ class ProfileStore:
         if not len(self):
             self._shape = (profile.shape[0], profile.shape[1])
             self._rows = Blocks(profile.size, np.float32)
+            if self._circular:
+                self._shifts = full_circle(profile.shape[1])
         self._rows.append(profile.ravel())
         return len(self) - 1
 
@@ -84,10 +93,10 @@ class ProfileStore:
         """
         numbers = np.arange(len(self)) if indices is None else indices
         stored = self._rows.take(numbers).reshape(len(numbers), *self._shape).transpose(1, 0, 2)
-        return shifted_differences(np.asarray(query, dtype=np.float64), stored.astype(np.float64), self._shifts)
+        return shifted_differences(np.asarray(query, dtype=np.float64), stored.astype(np.float64), self._shifts, self._circular)
 
 
-def shifted_differences(query: Floats, stored: Floats, shifts: Indices) -> Floats:
+def shifted_differences(query: Floats, stored: Floats, shifts: Indices, circular: bool = False) -> Floats:
     """g(c, Ij, Ik) = 1/(b - |c|) sum_{i=1..b-|c|} | Ij[i + max(c,0)] - Ik[i - min(c,0)] |  (eq. 12).
 
     All shifts go through one L1 distance: the shifted query is padded with zeros, and what the padding adds (the sum of
@@ -97,6 +106,7 @@ def shifted_differences(query: Floats, stored: Floats, shifts: Indices) -> Float
         query: (bands, width), Ij.
         stored: (bands, n, width), Ik.
         shifts: (S,) columns, |c| < width.
+        circular: columns that leave on one side come in on the other; the overlap is always whole.
 
     Returns:
         (n, bands, S).
@@ -104,8 +114,8 @@ def shifted_differences(query: Floats, stored: Floats, shifts: Indices) -> Float
     from scipy.spatial.distance import cdist
 
     bands, width = query.shape
-    table = _overlaps(width, tuple(shifts.tolist()))
-    margin = np.zeros((bands, width))
+    table = _overlaps(width, tuple(shifts.tolist()), circular)
+    margin = query if circular else np.zeros((bands, width))
     padded = np.concatenate([margin, query, margin], axis=1)[:, table.source]
     out = np.abs(stored) @ table.outside
     for band in range(bands):
@@ -124,10 +134,10 @@ class _Overlaps:
 
 
 @lru_cache(maxsize=16)
-def _overlaps(width: int, shifts: tuple[int, ...]) -> _Overlaps:
+def _overlaps(width: int, shifts: tuple[int, ...], circular: bool) -> _Overlaps:
     source = np.arange(width)[None, :] + np.array(shifts)[:, None]
-    outside = (source < 0) | (source >= width)
-    return _Overlaps(source + width, outside.T.astype(np.float64), width - np.abs(np.array(shifts, dtype=np.float64)))
+    outside = ((source < 0) | (source >= width)) & (not circular)
+    return _Overlaps(source + width, outside.T.astype(np.float64), width - outside.sum(axis=1).astype(np.float64))
 
 
 def band_weights(bands: int, mu_r: float, mu_d: float) -> Floats:
@@ -183,13 +193,22 @@ class Matcher:
         max_shift: largest shift tried, columns.
         g_bar: see `combine`.
         sequence: views in a row that must match (SeqSLAM's idea: neighbours of a true match match too); 1: each by itself.
+        circular: the profiles go full circle, see `ProfileStore`.
     """
 
     def __init__(
-        self, mode: Mode, mu_r: float, mu_d: float, max_shift: int, g_bar: GBar = "templates", sequence: int = 1
+        self,
+        mode: Mode,
+        mu_r: float,
+        mu_d: float,
+        max_shift: int,
+        g_bar: GBar = "templates",
+        sequence: int = 1,
+        circular: bool = False,
     ) -> None:
-        self.store = ProfileStore(max_shift)
+        self.store = ProfileStore(max_shift, circular)
         self._max_shift = max_shift
+        self._circular = circular
         self._index: ProfileIndex | None = None
         self._mode: Mode = mode
         self._mu = (mu_r, mu_d)
@@ -200,7 +219,7 @@ class Matcher:
         """Store a profile and return its number."""
         if self._index is None:
             weights = band_weights(len(profile), *self._mu)
-            self._index = ProfileIndex(weights, profile.shape[1], self._max_shift)
+            self._index = ProfileIndex(weights, profile.shape[1], self._max_shift, self._circular)
         self._index.add(profile)
         return self.store.add(profile)
 
@@ -232,7 +251,8 @@ class Matcher:
             numbers = np.sort(self._index.nearest(query, searched, among).numbers)
         match = self.score(query, numbers)
         if self._sequence > 1 and ending_at is not None:
-            score = in_sequence(match.score, match.indices, ending_at, self._sequence, self._of_earlier(ending_at))
+            earlier = self._of_earlier(ending_at)
+            score = in_sequence(match.score, match.indices, ending_at, self._sequence, earlier, self._circular)
             match = Match(match.indices, score, match.shift)
         order = np.argsort(match.score, kind="stable")[:count]
         return Match(match.indices[order], match.score[order], match.shift[order])
@@ -242,7 +262,12 @@ class Matcher:
 
 
 def in_sequence(
-    scores: Floats, indices: Indices, ending_at: int, sequence: int, earlier: Callable[[int, Indices], Floats]
+    scores: Floats,
+    indices: Indices,
+    ending_at: int,
+    sequence: int,
+    earlier: Callable[[int, Indices], Floats],
+    both_ways: bool = False,
 ) -> Floats:
     """Mean score over the views that end at one, each with the best of three stored ones where its partner should be.
 
@@ -252,13 +277,22 @@ def in_sequence(
         ending_at: number of the last view itself.
         sequence: views in a row.
         earlier: (how many views back, (m,) numbers, ascending) -> (m,) scores of that view against those.
+        both_ways: the stored views may also have been seen in the opposite order; the better of the two counts.
 
     Returns:
         (n,); a view without a partner, at the beginning of the drive, does not count.
     """
+    directions = (-1, 1) if both_ways else (-1,)
+    means = [_mean_along(scores, indices, ending_at, sequence, earlier, step) for step in directions]
+    return np.asarray(np.min(means, axis=0))
+
+
+def _mean_along(
+    scores: Floats, indices: Indices, ending_at: int, sequence: int, earlier: Callable[[int, Indices], Floats], step: int
+) -> Floats:
     total, views = scores.copy(), np.ones(len(scores))
     for back in range(1, min(sequence, ending_at + 1)):
-        partners = indices[:, None] - back + np.arange(-1, 2)
+        partners = indices[:, None] + step * back + np.arange(-1, 2)
         known = (partners >= 0) & (partners < ending_at - back)
         numbers = np.unique(partners[known])
         if len(numbers) == 0:

@@ -50,6 +50,26 @@ def test_the_search_finds_what_brute_force_finds(seed, n, count, bands):
     assert index.nearest(query, count, among).numbers.tolist() == expected.tolist()
 
 
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), turn=st.integers(0, WIDTH - 1))
+def test_a_full_circle_is_known_again_from_any_side(seed, turn):
+    rng = np.random.default_rng(seed)
+    stored = profiles(rng, 40, 1)
+    matcher = Matcher("plain", 0.5, 0.5, max_shift=2, circular=True)
+    for profile in stored:
+        matcher.add(profile)
+    query = np.roll(stored[17], turn, axis=1)
+    best = matcher.best(query, 1)
+    assert best.indices.tolist() == [17]
+    assert best.score[0] == pytest.approx(0.0, abs=1e-6)
+    assert (best.shift[0] - turn) % WIDTH == 0
+    noisy = (query + rng.normal(scale=0.2, size=query.shape)).astype(np.float32)
+    every = matcher.score(noisy, np.arange(40))
+    by_hand = min(np.abs(np.roll(noisy, -c, axis=1) - stored[30]).mean() for c in range(WIDTH))
+    assert every.score[30] == pytest.approx(by_hand, abs=1e-6)
+    assert matcher.best(noisy, 1).score[0] == every.score.min()
+
+
 def test_the_distance_is_the_weighted_mean_difference_of_the_profiles():
     rng = np.random.default_rng(1)
     stored, query = profiles(rng, 50, 8), profiles(rng, 1, 8)[0]
