@@ -67,6 +67,8 @@ class RelocalisingConfig(Section):
     """The same for its heading, degrees (plus 1 per metre)."""
     doubtful_m: float = Field(default=0.1, gt=0)
     """A node whose view fits those before it but may slide by more than this (one standard deviation) may be elsewhere, m."""
+    doubt_nodes: int = Field(default=40, ge=1)
+    """Such a doubt is forgotten after so many nodes."""
     unrecognised_nodes: int = Field(default=16, ge=0)
     """Nodes in a row at places that the map knows, none of them recognised, after which the robot is lost too; 0: never."""
     known_m: float = Field(default=0.7, gt=0)

@@ -10,7 +10,8 @@ class Whereabouts:
 
     The chain is broken at a node whose view fits none of the nodes before it: the robot may have been carried there, or have
     looked at a bare wall. It is doubtful at a node whose view fits, but slides: one wall fits any other. And a robot that is
-    where its map has it recognises what it drives past. In all three cases it is lost until a closure tells where it is.
+    where its map has it recognises what it drives past. In all three cases it is lost until a closure tells where it is;
+    only a doubt is forgotten in the end, as most bare walls are just that.
     """
 
     def __init__(self, config: RelocalisingConfig) -> None:
@@ -42,6 +43,9 @@ class Whereabouts:
             node: the new node.
             sigma_m: standard deviation of the best registration in its loosest direction, m; None where nothing fitted.
         """
+        forgotten = [at for at, certain in self._breaks.items() if not certain and node - at > self._config.doubt_nodes]
+        for at in forgotten:
+            del self._breaks[at]
         if self._config.candidates > 0 and (sigma_m is None or sigma_m > self._config.doubtful_m):
             self._breaks[node] = sigma_m is None
 

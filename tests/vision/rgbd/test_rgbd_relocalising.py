@@ -209,6 +209,19 @@ def test_a_break_counts_for_more_than_a_doubt():
     assert whereabouts.break_before(20) is None
 
 
+def test_a_doubt_is_forgotten_and_a_break_is_not():
+    whereabouts = Whereabouts(RelocalisingConfig(doubtful_m=0.1, doubt_nodes=5))
+    whereabouts.tracked(3, 0.3)
+    for node in range(4, 9):
+        whereabouts.tracked(node, 0.01)
+        assert whereabouts.lost
+    whereabouts.tracked(9, 0.01)
+    assert not whereabouts.lost
+    whereabouts.tracked(10, None)
+    whereabouts.tracked(100, 0.01)
+    assert whereabouts.break_before(100) == 10
+
+
 def test_registrations_across_the_break_are_taken_back():
     """One wall fits any other: the view at 40 fits, but slides, and 41 fits 39 as well."""
     true = {(40 + i, 10 + i): (0.0, 0.0, 0.0) for i in range(5)}

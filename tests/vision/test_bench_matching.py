@@ -1,0 +1,46 @@
+"""The benchmark of matching: what it compares gives the same answers, and its table is whole."""
+
+from __future__ import annotations
+
+import importlib
+import json
+
+import numpy as np
+import pytest
+
+from hybridmap.vision.search import ProfileIndex
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    monkeypatch.syspath_prepend("tools")
+    module = importlib.import_module("bench_matching")
+    monkeypatch.setattr(module, "best_of", lambda work, seconds=0.0: (work(), 1.0)[1])
+    return module
+
+
+def test_the_baseline_finds_the_same_views(bench):
+    rng = np.random.default_rng(0)
+    stored = bench.views(300, 4, rng)
+    index = ProfileIndex(np.full(4, 0.25), bench.WIDTH, bench.MATCHING.max_shift)
+    for profile in stored:
+        index.add(profile)
+    for near in range(0, 300, 60):
+        query = stored[near] + rng.normal(scale=0.2, size=stored[near].shape).astype(np.float32)
+        assert bench.plain(query, stored)[0] == index.nearest(query, 1).numbers[0] == near
+
+
+def test_the_gate_holds_as_many_nodes_in_a_large_map(bench):
+    near = [bench.measure(size, 1, 0)["in the gate"] for size in (2000, 4000)]
+    assert near[0] == near[1] > 20
+
+
+def test_the_table_is_whole(bench, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["bench_matching.py", "--sizes", "200", "400", "--numpy-up-to", "200", "--json"])
+    bench.main()
+    shown = json.loads(capsys.readouterr().out)
+    assert set(shown["bars"]) <= set(shown["ms"]["200"])
+    assert "numpy" not in shown["ms"]["400"]
+    monkeypatch.setattr("sys.argv", ["bench_matching.py", "--sizes", "200"])
+    bench.main()
+    assert "search / bare" in capsys.readouterr().out
