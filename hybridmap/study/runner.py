@@ -112,6 +112,5 @@ def _crashed(key: str, loss: Lost) -> CellResult:
 
 def _require_same_code(code: str) -> None:
     if code != provenance.solving():
-        raise StudyError(
-            "a worker has another version of hybridmap or its libraries than this machine; install the same on all"
-        )
+        what = "a worker has another version of hybridmap or its libraries than this process"
+        raise StudyError(f"{what}: install the same on all machines, and do not edit it meanwhile")
