@@ -80,7 +80,7 @@ def _node_lines(story: NodeStory) -> Iterator[str]:
     yield "chain"
     yield from _decisions(story.chain, story.node)
     yield ""
-    yield f"loops to older nodes: {_counts(story.loops)}"
+    yield f"loops to older nodes: {_counts(story.loops)}" + (f": {story.no_loops}" if story.no_loops else "")
     yield from _decisions(story.loops, story.node)
     if story.later:
         yield ""

@@ -106,7 +106,11 @@ _OTHERWISE = (
         "too few others",
         "closures of {vision.relocalising.support} nodes over {vision.relocalising.span_m} m of travel that agree",
     ),
-    ("outside the gate", f"a less certain map, or {{{_LASER}.gate_m}} m of vision.laser.probes.gate_m larger"),
+    (
+        "outside the gate",
+        f"a less certain map, or a wider gate: {{{_LASER}.gate_sigmas}} sigma + {{{_LASER}.gate_m}} m and "
+        f"{{{_LASER}.gate_deg}} deg",
+    ),
     ("contradicted by registration", "a registration that agrees with the odometry, or edges.drop_contradicted: false"),
     ("from odometry without being sure", "odometry nearer to the registration, or a registration as sure as it is good"),
     ("too little depth", "more surfaces in common view"),
@@ -138,6 +142,9 @@ def otherwise(edge: Edge, checks: list[Check], settings: Mapping[str, Any]) -> s
             return ""
         change = "above" if tightest.rule.at_least else "below"
         return f"refused with {tightest.rule.setting} {change} {abs(tightest.value):.4g} (now {tightest.limit:.4g})"
+    for words, needed in _OTHERWISE:
+        if words in edge.reason:
+            return _filled(needed, settings)
     for check in checks:
         if not check.passed:
             sign, change = (">=", "at most") if check.rule.at_least else ("<=", "at least")
@@ -145,9 +152,6 @@ def otherwise(edge: Edge, checks: list[Check], settings: Mapping[str, Any]) -> s
                 f"{check.rule.figure} {sign} {check.limit:.4g} instead of {check.value:.4g}, "
                 f"or {check.rule.setting} {change} {abs(check.value):.4g}"
             )
-    for words, needed in _OTHERWISE:
-        if words in edge.reason:
-            return _filled(needed, settings)
     return ""
 
 

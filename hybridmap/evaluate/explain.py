@@ -93,6 +93,7 @@ class NodeStory:
         ranked: (n, 3) the best of them by their views: node, G, shift in columns.
         chain: odometry and registration edges that end here.
         loops: closures that were considered when it was made, or proposed of it at the end.
+        no_loops: where there are none, why; empty where that is not known.
         later: closures that later nodes considered with it.
     """
 
@@ -109,6 +110,7 @@ class NodeStory:
     ranked: Array
     chain: list[Decision]
     loops: list[Decision]
+    no_loops: str
     later: list[Decision]
 
     def to_json(self) -> dict[str, Any]:
@@ -128,6 +130,7 @@ class NodeStory:
             "ranked": [{"node": int(r[0]), "profile_G": float(r[1]), "shift": int(r[2])} for r in self.ranked],
             "chain": [decision.to_json() for decision in self.chain],
             "loops": [decision.to_json() for decision in self.loops],
+            "no_loops": self.no_loops,
             "later": [decision.to_json() for decision in self.later],
         }
 
@@ -218,7 +221,8 @@ class Explainer:
         earlier = {n.template for n in self._map.nodes[:number]}
         edges = [self._decision(n, e) for n, e in enumerate(self._map.edges) if number in (e.source, e.target)]
         newest = [d for d in edges if max(d.edge.source, d.edge.target) == number]
-        gate = kept.get("gate")
+        gate = dict(zip(GATE_FIELDS, kept["gate"].tolist(), strict=False)) if "gate" in kept else {}
+        loops = [d for d in newest if d.edge.kind is EdgeKind.LOOP]
         return NodeStory(
             node=number,
             stamp_ns=node.stamp_ns,
@@ -229,10 +233,11 @@ class Explainer:
             template=node.template,
             founded=node.template >= 0 and node.template not in earlier,
             poses=self._poses(number),
-            gate={} if gate is None else dict(zip(GATE_FIELDS, gate.tolist(), strict=False)),
+            gate=gate,
             ranked=np.asarray(kept.get("ranked", np.zeros((0, 3))), dtype=np.float64),
             chain=[d for d in newest if d.edge.kind is not EdgeKind.LOOP],
-            loops=[d for d in newest if d.edge.kind is EdgeKind.LOOP],
+            loops=loops,
+            no_loops="" if loops else self._why_no_loops(gate),
             later=[d for d in edges if d not in newest and d.edge.kind is EdgeKind.LOOP],
         )
 
@@ -312,6 +317,17 @@ class Explainer:
             if number < len(solution.poses):
                 out[name] = solution.poses[number]
         return out
+
+    def _why_no_loops(self, gate: Mapping[str, float]) -> str:
+        if gate:
+            if gate["older"] == 0:
+                least = setting(self._settings, "vision.rgbd.closing.min_age_s")
+                return f"no node was old enough: {least} s (vision.rgbd.closing.min_age_s)"
+            return "no older node lay inside the gate" if gate["inside"] == 0 else ""
+        every = setting(self._settings, "vision.laser.probes.every_m")
+        if self._store.rig.laser is not None and isinstance(every, int | float):
+            return f"the laser looks for them every {every:g} m of travel (vision.laser.probes.every_m), inside its gate"
+        return ""
 
     def _nearest(self, number: int) -> tuple[int, float, float] | None:
         """By distance and turn together (1 rad counts as 1 m), of the nodes old enough to be loops."""

@@ -77,6 +77,11 @@ def test_reasons_without_a_figure_say_what_was_missing(reason, said):
     assert said in explained(edge(Status.REJECTED, reason))[1]
 
 
+def test_a_reason_that_is_no_figure_goes_before_figures_that_were_not_asked_for():
+    far = edge(Status.REJECTED, "3.1 m, 2.0 deg from the expected pose: outside the gate", near=0.9, fit=0.9, loosest_m=9.0)
+    assert "a wider gate: 2.5 sigma + 2.5 m" in explained(far)[1]
+
+
 def test_settings_that_an_older_session_has_not_are_left_out():
     assert explained(edge(Status.REJECTED, "x", matches=2.0), settings={}) == ({}, "")
 
@@ -96,6 +101,7 @@ def test_the_story_of_a_node(tmp_path):
     assert story.nearest[0] == 19
     assert story.nearest[1] == pytest.approx(0.0, abs=1e-9)
     assert [decision.edge.kind for decision in story.chain] == [EdgeKind.ODOMETRY]
+    assert story.no_loops == ""
     assert json.loads(json.dumps(story.to_json()))["loops"][1]["reason"] == "too few inliers"
 
 
@@ -138,3 +144,4 @@ def test_a_mapped_session_has_its_gates(tmp_path):
     assert last.gate["inside"] >= len(last.ranked)
     assert (np.diff(last.ranked[:, 1]) >= 0).all()
     assert first.gate["older"] == 0
+    assert "vision.rgbd.closing.min_age_s" in first.no_loops
