@@ -16,6 +16,8 @@ class ScanConfig(Section):
     """Points of one cell are merged into one, m."""
     profile_width: int = Field(default=64, ge=8)
     """Bearing columns of the scanline profile."""
+    templates: bool = True
+    """Whether every scan is compared with the view templates (`vision.templates`), as the `novelty` rule of nodes needs it."""
 
 
 class RegistrationConfig(Section):
@@ -53,6 +55,8 @@ class SearchConfig(Section):
 class TrackingConfig(Section):
     """Refined self-motion: each new node is registered to the submap of the last ones."""
 
+    enabled: bool = True
+    """Whether it is done; if not, submaps hang on the path integrator's motion alone."""
     submap_nodes: int = Field(default=25, ge=1)
     """Nodes in the submap."""
     narrow: SearchConfig = SearchConfig(half_m=0.2, half_deg=8.0, prior_m=0.1, prior_deg=5.0)

@@ -20,6 +20,7 @@ from hybridmap.vision.laser.revisits import Reviser
 from hybridmap.vision.laser.submap import Atlas
 from hybridmap.vision.laser.tracking import Step, Tracker
 from hybridmap.vision.profile import laser_profile
+from hybridmap.vision.templates import ViewTemplates
 
 LAST_PROBE_M = 0.5
 """Travel since the last probe after which the end of the drive is worth one of its own."""
@@ -41,6 +42,8 @@ class LaserFrontEnd:
         self._prober = Prober(self._config, self._atlas, laser)
         self._reviser = Reviser(self._config, self._atlas, laser)
         self._commitment = Commitment(self._config.commitment, self._atlas.travel_m.__getitem__, self._atlas.chain.__getitem__)
+        t, m = config.templates, config.matching
+        self._templates = ViewTemplates(t.threshold, t.stable_frames, t.max_shift, m.mu_r, m.mu_d)
         self._profiles: list[NDArray[np.float32]] = []
         self._retracer = Retracer(self._config, self._atlas, laser)
         self._scans: list[SeenScan] = []
@@ -62,7 +65,10 @@ class LaserFrontEnd:
             raise StreamError(f"laser: expected {len(self._laser.bearings_rad)} ranges, found {frame.ranges_m.shape}")
         self._scans.append(SeenScan(frame, len(self._profiles) - 1, np.array(delta_node_robot, dtype=np.float64)))
         profile = laser_profile(frame.ranges_m, self._laser.bearings_rad, self._config.scan.profile_width)
-        return View(frame.stamp_ns, profile, -1, False)
+        if not self._config.scan.templates:
+            return View(frame.stamp_ns, profile, -1, False)
+        seen = self._templates.recognise(profile)
+        return View(frame.stamp_ns, profile, seen.template, seen.founded)
 
     def add_node(self, node: int, view: View) -> None:
         """Make a node of the scan observed last."""
@@ -81,6 +87,9 @@ class LaserFrontEnd:
         assert number == node
         if odometry is None:
             self._atlas.add(cloud, scan.ranges_m, IDENTITY.copy(), np.zeros((3, 3)))
+            return []
+        if not self._config.tracking.enabled:
+            self._atlas.add(cloud, scan.ranges_m, compose(self._atlas.chain[-1], odometry.delta), odometry.covariance)
             return []
         step = self._tracker.step(cloud, odometry, self._clouds_between)
         self._atlas.add(cloud, scan.ranges_m, compose(self._atlas.chain[-1], step.relative.delta), step.scatter)

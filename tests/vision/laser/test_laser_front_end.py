@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from laser_worlds import LASER, cast, corridor, drifting, ring, ring_drive, room
 
-from hybridmap.config.laser import LaserConfig
+from hybridmap.config.laser import LaserConfig, ScanConfig
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, RelativePose, between, compose, log
@@ -37,7 +37,7 @@ class Run:
             relative = RelativePose(motion, np.diag(SIGMAS**2)) if node else None
             tracked = self.front_end.track(node, relative)
             if node:
-                step = tracked[0].relative or relative
+                step = tracked[0].relative if tracked and tracked[0].relative else relative
                 self.poses.append(compose(self.poses[-1], step.delta))
                 self.travel.append(self.travel[-1] + np.hypot(*step.delta[:2]))
             self.proposals += tracked + self.front_end.close(node, self.belief())
@@ -183,6 +183,34 @@ def test_two_runs_give_the_same_bytes():
     a, b = Run(ring(), truth, odometry), Run(ring(), truth, odometry)
     assert flat(a) == flat(b)
     assert [dataclasses.astuple(p)[:6] for p in a.proposals] == [dataclasses.astuple(p)[:6] for p in b.proposals]
+
+
+def test_without_refined_self_motion_the_chain_is_the_odometry():
+    tracking = VisionConfig().laser.tracking.model_copy(update={"enabled": False})
+    truth = ring_drive(0.4)
+    odometry = drifting(truth, np.random.default_rng(2))
+    run = Run(ring(), truth, odometry, config=VisionConfig(laser=LaserConfig(tracking=tracking)))
+    assert [p for p in run.proposals if p.kind == "registration"] == []
+    last = run.node_at[-1]
+    np.testing.assert_allclose(log(between(run.poses[-1], between(odometry[0], odometry[last]))), 0.0, atol=1e-9)
+
+
+def test_scans_found_view_templates_and_are_recognised():
+    truth = ring_drive(2.0)[::5]
+    rng = np.random.default_rng(1)
+    scans = [LaserScan(i, cast(ring(), pose, rng)) for i, pose in enumerate(truth)]
+    views = {}
+    for on in (True, False):
+        config = VisionConfig(laser=LaserConfig(scan=ScanConfig(templates=on)))
+        front_end = LaserFrontEnd(config, LASER, 0)
+        views[on] = [front_end.observe(scan, IDENTITY) for scan in scans]
+    numbers, lap = np.array([view.template for view in views[True]]), len(truth) // 2
+    founded = [i for i, view in enumerate(views[True]) if view.new_template]
+    assert founded[0] == 0
+    assert 2 <= len(founded) == numbers.max() + 1
+    assert founded[-1] < lap
+    assert np.mean(numbers[lap : 2 * lap] == numbers[:lap]) > 0.8
+    assert {view.template for view in views[False]} == {-1}
 
 
 def test_frames_of_another_kind_are_refused():
