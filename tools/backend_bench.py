@@ -4,6 +4,9 @@
     python tools/backend_bench.py overhead gnc isam2 --data $HYBRIDMAP_DATA
 
 `sweep`     relaxation-ratslam against loops in plain Python over the same links in the same order: 1,000 nodes, 1,500 edges
+`overhead`  gtsam-lm against tools/bare_gtsam.py on the same file, from the parsed file in memory to the optimised poses
+`gnc`       gtsam-gnc against gtsam.GncLMOptimizer with odometry as known inliers: intel, random false loops
+`isam2`     one update of a replay against one batch optimisation from the odometry chain: Manhattan
 """
 
 from __future__ import annotations
@@ -14,12 +17,21 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import bare_gtsam
+import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
+from hybridmap import backends
+from hybridmap.backends.batch import run
+from hybridmap.backends.factors import NoiseModels, factor_graph, values
+from hybridmap.backends.false_loops import inject
+from hybridmap.backends.following import prefix
 from hybridmap.backends.link_blocks import BlockSweeps
 from hybridmap.backends.links import Links, Planar
 from hybridmap.geometry import Array, between, compose, exp, wrap_angle
 from hybridmap.graph.connectivity import chain
+from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 
 _SWEEPS = 400
@@ -138,7 +150,84 @@ def sweep_study(data: Path | None) -> list[str]:
     ]
 
 
-STUDIES: dict[str, Callable[[Path | None], list[str]]] = {"sweep": sweep_study}
+def overhead_study(data: Path | None) -> list[str]:
+    """`gtsam-lm` against GTSAM alone."""
+    lines = []
+    for name in ("intel.g2o", "manhattanOlson3500.g2o"):
+        path = posegraph(data, name)
+        graph, parsed = read_graph(path), bare_gtsam.parse(path)
+        chi2, bare, ours = bare_gtsam.optimise(*parsed)[1], math.inf, math.inf
+        for _ in range(7):  # in turn, so that both see the same machine
+            bare = min(bare, cpu_s(lambda parsed=parsed: bare_gtsam.optimise(*parsed), 1))
+            ours = min(ours, cpu_s(lambda graph=graph: backends.create("gtsam-lm").solve(graph), 1))
+        mine = backends.create("gtsam-lm").solve(graph).report.chi2
+        lines.append(
+            f"{name}: bare gtsam {bare:.3f} s, chi2 {chi2:.6g}; gtsam-lm {ours:.3f} s, {mine:.6g}: {ours / bare:.2f} x"
+        )
+    return lines
+
+
+def gnc_study(data: Path | None) -> list[str]:
+    """Our GNC against GTSAM's."""
+    lines = []
+    graph = read_graph(posegraph(data, "intel.g2o"))
+    for share in (0.1, 0.4):
+        false = inject(graph, share, "random", np.random.default_rng(0))
+        started = time.process_time()
+        theirs = gtsams_gnc(false)
+        plain = time.process_time() - started
+        ours = cpu_s(lambda false=false: backends.create("gtsam-gnc").solve(false))
+        rejected = np.array(backends.create("gtsam-gnc").solve(false).report.rejected_edge_ids)
+        verdicts = " and ".join(
+            f"{int(np.isin(out, graph.edge_ids).sum())} true loops lost, "
+            f"{false.n_edges - graph.n_edges - int((~np.isin(out, graph.edge_ids)).sum())} false kept"
+            for out in (theirs, rejected)
+        )
+        cost = f"GncLMOptimizer {plain:.2f} s, gtsam-gnc {ours:.2f} s: 1/{plain / ours:.1f}"
+        lines.append(f"intel, {share:.0%} false: {cost}; {verdicts}")
+    return lines
+
+
+def gtsams_gnc(graph: PoseGraph) -> NDArray[np.int64]:
+    """Edge ids that GTSAM's own GNC rejects, odometry being known inliers."""
+    params = gtsam.GncLMParams()
+    params.setLossType(gtsam.GncLossType.TLS)
+    params.setKnownInliers([*np.flatnonzero(~graph.is_loop).tolist(), graph.n_edges])
+    optimizer = gtsam.GncLMOptimizer(factor_graph(graph, NoiseModels()), values(graph.initial), params)
+    optimizer.optimize()
+    weights = np.asarray(optimizer.getWeights())[: graph.n_edges]
+    return graph.edge_ids[graph.is_loop & (weights < 0.5)]
+
+
+def isam2_study(data: Path | None) -> list[str]:
+    """A replay's updates against one batch optimisation."""
+    graph = chain(read_graph(posegraph(data, "manhattanOlson3500.g2o")))
+    batch = cpu_s(lambda: run("lm", factor_graph(graph, NoiseModels()), graph.initial, 100))
+    best = backends.create("gtsam-lm").solve(graph).report.chi2
+    backend, spent, updates = backends.create("gtsam-isam2"), [], [prefix(graph, n + 1) for n in range(graph.n_nodes)]
+    for part in updates:
+        started = time.process_time()
+        solution = backend.update(part)
+        spent.append(time.process_time() - started)
+    median, p99 = np.quantile(spent, [0.5, 0.99])
+    figures = f"median {median * 1e3:.2f} ms, 99 % {p99 * 1e3:.0f} ms, {sum(spent):.1f} s in all"
+    cost = f"chi2 {solution.report.chi2:.6g} = {solution.report.chi2 / best:.5f} x batch"
+    return [f"isam2 on Manhattan: batch from the chain {batch:.3f} s; updates {figures}: 1/{batch / median:.0f}; {cost}"]
+
+
+def posegraph(data: Path | None, name: str) -> Path:
+    """A standard graph in the folder of recordings."""
+    if data is None:
+        raise SystemExit("backend_bench: this study needs --data, the folder of recordings")
+    return data / "posegraphs" / name
+
+
+STUDIES: dict[str, Callable[[Path | None], list[str]]] = {
+    "sweep": sweep_study,
+    "overhead": overhead_study,
+    "gnc": gnc_study,
+    "isam2": isam2_study,
+}
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ from hybridmap.backends.base import SolveStatus
 from hybridmap.backends.factors import NoiseModels, anchor, factor_graph, factors, poses_of, values
 from hybridmap.backends.following import Change, GraphBackend, Outcome, difference
 from hybridmap.backends.initial import best_start
-from hybridmap.backends.objective import chi2
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
@@ -117,6 +116,8 @@ class WarmStart:
 class BatchBackend(GraphBackend):
     """`gtsam-lm` (with a start of its own and Dogleg to fall back on), `gtsam-gn`, `gtsam-dogleg`."""
 
+    _descends = True
+
     def __init__(self, name: str, config: BackendsConfig) -> None:
         super().__init__(name, config)
         self._warm = WarmStart(NoiseModels())
@@ -130,7 +131,4 @@ class BatchBackend(GraphBackend):
         return run(method, factor_graph(graph, NoiseModels()), start, self._config.max_iterations)
 
     def _solve_whole(self, graph: PoseGraph) -> Outcome:
-        outcome = self._optimise(graph, best_start(graph))
-        if chi2(graph, outcome.poses) > chi2(graph, graph.initial):
-            return Outcome(graph.initial, SolveStatus.DIVERGED, "ended worse than it began; kept the start", outcome.iterations)
-        return outcome
+        return self._optimise(graph, best_start(graph))

@@ -74,10 +74,12 @@ def difference(old: PoseGraph | None, new: PoseGraph) -> Change:
     """What happened between two states of one graph."""
     if old is None:
         return Change(np.arange(new.n_edges), np.arange(0), closes=True)
-    _, i_old, i_new = np.intersect1d(old.edge_ids, new.edge_ids, assume_unique=True, return_indices=True)
+    place = np.searchsorted(new.edge_ids, old.edge_ids)  # both strictly increase
+    found = new.edge_ids[np.minimum(place, max(new.n_edges - 1, 0))] == old.edge_ids if new.n_edges else place < 0
+    i_old, i_new = np.flatnonzero(found), place[found]
     same = (
         (old.deltas[i_old] == new.deltas[i_new]).all(axis=1)
-        & (old.information[i_old] == new.information[i_new]).all(axis=(1, 2))
+        & (old.information[i_old].reshape(-1, 9) == new.information[i_new].reshape(-1, 9)).all(axis=1)
         & (old.kinds[i_old] == new.kinds[i_new])
     )
     kept_old, kept_new = np.zeros(old.n_edges, dtype=bool), np.zeros(new.n_edges, dtype=bool)
@@ -91,11 +93,14 @@ def difference(old: PoseGraph | None, new: PoseGraph) -> Change:
 class GraphBackend(ABC):
     """What all back-ends share; a solver supplies `_optimise` and may refine `_solve_whole`."""
 
+    _descends = False  # whether a solution of higher chi2 than its start is a failure
+
     def __init__(self, name: str, config: BackendsConfig) -> None:
         self._name = name
         self._config = config
         self._graph: PoseGraph | None = None
         self._poses: Array = np.zeros((0, 3))
+        self._squared: Array = np.zeros(0)
         self._weights: dict[int, float] = {}
         self._rejected: tuple[int, ...] = ()
 
@@ -110,14 +115,16 @@ class GraphBackend(ABC):
         change = difference(self._graph, graph)
         placed = self._admit(graph, change)
         start = self._extend(graph, placed)
+        at_start = self._carried(graph, change, start)
         if self._must_work(change):
             outcome = self._guarded(graph, start, change)
         else:
             message = "extended by odometry"
             outcome = Outcome(start, SolveStatus.CONVERGED, message, 0, self._weights, self._rejected)
-        self._graph, self._poses = graph, outcome.poses
+        squared = at_start if outcome.poses is start else squared_norms(graph, outcome.poses)
+        self._graph, self._poses, self._squared = graph, outcome.poses, squared
         self._weights, self._rejected = outcome.weights, outcome.rejected
-        return self._solution(graph, start, outcome, started)
+        return self._solution(graph, outcome, squared, total(at_start), started)
 
     def finish(self, graph: PoseGraph) -> Solution:
         """See `Backend.finish`: a fresh solve; back-ends whose state is their merit go on from it instead."""
@@ -137,7 +144,19 @@ class GraphBackend(ABC):
             outcome = work()
         except RuntimeError as error:  # gtsam raises nothing more specific
             raise BackendError(f"{self._name}: the solver gave up: {_first_line(error)}") from error
-        return self._solution(graph, graph.initial, self._checked(graph, graph.initial, outcome), started, whole=True)
+        outcome = self._checked(graph, graph.initial, outcome)
+        squared = squared_norms(graph, outcome.poses)
+        before = total(squared) if outcome.poses is graph.initial else chi2(graph, graph.initial)
+        if self._descends and total(squared) > before:
+            message = f"{outcome.message}; ended worse than it began, kept the start"
+            outcome = Outcome(graph.initial, SolveStatus.DIVERGED, message, outcome.iterations)
+            squared = squared_norms(graph, graph.initial)
+        solution = self._solution(graph, outcome, squared, before, started)
+        if not outcome.rejected:
+            return solution
+        meant = graph if outcome.calibrated is None else outcome.calibrated
+        clusters = rejected_clusters(meant, outcome.poses, outcome.rejected, gate_of(self._config))
+        return replace(solution, report=replace(solution.report, rejected_clusters=clusters))
 
     @abstractmethod
     def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
@@ -189,26 +208,34 @@ class GraphBackend(ABC):
         poses[0] = graph.initial[0]
         return replace(outcome, poses=poses)
 
-    def _solution(self, graph: PoseGraph, start: Array, outcome: Outcome, started: float, *, whole: bool = False) -> Solution:
-        squared = squared_norms(graph, outcome.poses)
+    def _carried(self, graph: PoseGraph, change: Change, start: Array) -> Array:
+        """Squared residuals (E,) at the start of an update; those of edges that were there before are known."""
+        old = self._graph
+        if old is None or len(change.removed):
+            return squared_norms(graph, start)
+        squared = np.empty(graph.n_edges)
+        known = np.ones(graph.n_edges, dtype=bool)
+        known[change.added] = False
+        squared[known] = self._squared
+        squared[change.added] = squared_norms(graph.with_edges(change.added), start)
+        return squared
+
+    def _solution(self, graph: PoseGraph, outcome: Outcome, squared: Array, before: float, started: float) -> Solution:
+        """The outcome with the referee's figures: squared residuals (E,) at its poses, chi2 before."""
         meant = graph if outcome.calibrated is None else outcome.calibrated
         strain = squared if outcome.calibrated is None else squared_norms(meant, outcome.poses)
-        clusters = whole and len(outcome.rejected) > 0
         report = SolveReport(
             backend=self._name,
             status=outcome.status,
             message=outcome.message,
             iterations=outcome.iterations,
-            chi2_initial=total(squared) if outcome.poses is start else chi2(graph, start),
+            chi2_initial=before,
             chi2=total(squared),
             cpu_s=time.process_time() - started,
             rejected_edge_ids=outcome.rejected,
             weights=outcome.weights,
             chi2_odometry=total(strain[~graph.is_loop]),
             unit_variance=unit_variance(meant, strain, outcome.rejected),
-            rejected_clusters=rejected_clusters(meant, outcome.poses, outcome.rejected, gate_of(self._config))
-            if clusters
-            else (),
         )
         return Solution(outcome.poses, report)
 

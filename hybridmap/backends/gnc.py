@@ -177,7 +177,7 @@ def on_probation(graph: PoseGraph, result: Truncated, config: BackendsConfig) ->
     covariance = (covariance + np.linalg.inv(graph.information[lone])) * min(1.0, _variance(graph, bare))
     r = residuals(graph.with_edges(lone), bare.poses)
     innovation = np.einsum("ei,ei->e", r, np.linalg.solve(covariance, r[:, :, None])[:, :, 0])
-    kept = without | np.isin(loops, lone[innovation <= chi2_law.ppf(_EXPECTED, df=3)])
+    kept = without | np.isin(loops, lone[innovation <= _SLACK * chi2_law.ppf(_EXPECTED, df=3)])
     if not np.any(kept != without):
         return bare
     outcome = run("lm", problem.weighted(kept.astype(np.float64)), bare.poses, config.max_iterations)

@@ -14,13 +14,20 @@ from hybridmap.geometry import Array
 from hybridmap.graph.connectivity import extend
 from hybridmap.graph.pose_graph import PoseGraph
 
+_NEAR = 100.0  # mean squared Mahalanobis residual from which another start is looked for
+
 
 def best_start(graph: PoseGraph) -> Array:
-    """The angular start or the graph's own `initial`, whichever has the lower chi2; (N, 3)."""
-    angular = angular_start(graph)
-    if angular is None or chi2(graph, graph.initial) <= chi2(graph, angular):
+    """The angular start or the graph's own `initial`, whichever has the lower chi2; (N, 3).
+
+    Where `initial` fits the edges within some standard deviations already, it is taken without a look at the other: a
+    chain of the wrong winding does not.
+    """
+    own = chi2(graph, graph.initial)
+    if own <= _NEAR * graph.n_edges:
         return graph.initial
-    return angular
+    angular = angular_start(graph)
+    return graph.initial if angular is None or own <= chi2(graph, angular) else angular
 
 
 def trusted_start(graph: PoseGraph, bound: float) -> Array:

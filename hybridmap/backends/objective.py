@@ -41,7 +41,7 @@ def total(squared: Array) -> float:
 
 def unit_variance(graph: PoseGraph, squared: Array, rejected: tuple[int, ...] = ()) -> float:
     """Sum of squared residuals (E,) of the edges that were not rejected, per degree of freedom; 1 without redundancy."""
-    kept = ~np.isin(graph.edge_ids, rejected)
+    kept = ~np.isin(graph.edge_ids, rejected) if rejected else np.ones(graph.n_edges, dtype=bool)
     freedom = 3 * (int(kept.sum()) - graph.n_nodes + 1)
     return float(squared[kept].sum()) / freedom if freedom > 0 else 1.0
 
