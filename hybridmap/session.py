@@ -135,7 +135,7 @@ class _Recorder:
         mapper = self._mapper
         keyframe = mapper.vision.keyframe(number) if mapper.vision is not None else {}
         initial = mapper.map.initial[number]
-        self.store.add_node(number, mapper.map.node(number), initial, keyframe, mapper.integrator.snapshot())
+        self.store.add_node(number, mapper.map.node(number), initial, keyframe, mapper.cells.activity_at(number))
 
     def _write_gain_changes(self) -> None:
         changes = self._mapper.calibration.changes

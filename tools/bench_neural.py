@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.neural import NeuralConfig
+from hybridmap.evaluate.cells.path_error import wander
 from hybridmap.metrics import Metric, to_json
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.grid import kernel_spectrum
@@ -57,15 +58,16 @@ class PlainSheets:
         self.activity = rates.astype(self.activity.dtype, copy=False)
 
 
-def rate(step: Callable[[], None], steps: int, repeats: int = 60) -> float:
-    """Steps per CPU-second, the best of some repeats."""
-    best = np.inf
+def rates(steps: dict[Callable[[], None], int], repeats: int = 150) -> list[float]:
+    """Steps per CPU-second of each, so many steps a repeat: turn by turn in one run, the best repeat of each."""
+    best = dict.fromkeys(steps, np.inf)
     for _ in range(repeats):
-        begin = time.process_time()
-        for _ in range(steps):
-            step()
-        best = min(best, (time.process_time() - begin) / steps)
-    return 1.0 / best
+        for step, count in steps.items():
+            begin = time.process_time()
+            for _ in range(count):
+                step()
+            best[step] = min(best[step], (time.process_time() - begin) / count)
+    return [1.0 / seconds for seconds in best.values()]
 
 
 def measure(dtype: str, rectifier: str, steps: int) -> dict[str, float]:
@@ -79,10 +81,15 @@ def measure(dtype: str, rectifier: str, steps: int) -> dict[str, float]:
         integrator.grid.step(motion.advance, motion.phasors)
         plain.step(shift, motion.phasors)
     apart = float(np.abs(integrator.grid.activity - plain.activity).max() / plain.activity.max())
-    sheets = rate(lambda: integrator.grid.step(motion.advance, motion.phasors), steps)
-    baseline = rate(lambda: plain.step(shift, motion.phasors), max(steps // 4, 1))
+    sheets, baseline = rates(
+        {
+            lambda: integrator.grid.step(motion.advance, motion.phasors): steps,
+            lambda: plain.step(shift, motion.phasors): max(steps // 8, 1),
+        }
+    )
     whole = PathIntegrator(config)
-    front = rate(Driving(whole, NODE_M), steps)
+    front, every = rates({Driving(whole, NODE_M): steps, Driving(whole, STEP_M): max(steps // 4, 1)})
+    wandered, cells = wandering(config)
     return {
         "baseline": baseline,
         "sheets": sheets,
@@ -90,7 +97,9 @@ def measure(dtype: str, rectifier: str, steps: int) -> dict[str, float]:
         "apart after 20 steps": apart,
         "front-end": front,
         "x real time at 100 Hz": front / ODOMETRY_HZ,
-        "with the pose every step": rate(Driving(whole, STEP_M), steps),
+        "with the pose every step": every,
+        "120 m at random": wandered,
+        "place cells by then": float(cells),
     }
 
 
@@ -120,6 +129,23 @@ def metrics_of(rows: dict[str, dict[str, float]]) -> list[Metric]:
     return metrics
 
 
+def wandering(config: NeuralConfig, way_m: float = 120.0) -> tuple[float, int]:
+    """Steps per CPU-second on a walk at random, the best of its last parts, and how many place cells it has by then."""
+    drive = wander(np.random.default_rng(1), way_m, ODOMETRY_HZ)
+    integrator = PathIntegrator(config)
+    ways, gone_m, part, times = np.hypot(drive.deltas[:, 0], drive.deltas[:, 1]), 0.0, len(drive.deltas) // 40, []
+    for first in range(0, len(drive.deltas) - part, part):
+        begin = time.process_time()
+        for delta, way in zip(drive.deltas[first : first + part].tolist(), ways[first : first + part].tolist(), strict=True):
+            integrator.step(delta, 1.0 / ODOMETRY_HZ)
+            gone_m += way
+            if gone_m >= NODE_M:
+                gone_m = 0.0
+                _ = integrator.pose, integrator.place_code
+        times.append(time.process_time() - begin)
+    return part / min(times[len(times) // 2 :]), len(integrator.place.weights)
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -134,9 +160,9 @@ def main() -> None:
     if arguments.json:
         print(to_json({}, metrics_of(rows)))
         return
-    print(f"{'steps per CPU-second':22s}" + "".join(f"{name:>25s}" for name in next(iter(rows.values()))))
-    for name, row in rows.items():
-        print(f"{name:22s}" + "".join(f"{value:25.4g}" for value in row.values()))
+    print(f"{'steps per CPU-second':28s}" + "".join(f"{name:>20s}" for name in rows))
+    for what in next(iter(rows.values())):
+        print(f"{what:28s}" + "".join(f"{row[what]:20.4g}" for row in rows.values()))
     for metric in metrics_of(rows):
         if metric.bar is not None:
             print(f"{metric.description}: {metric.value:.4g}, {'kept' if metric.passed else 'missed'}")

@@ -78,7 +78,8 @@ class NeuralConfig(Section):
     band_drive: float = Field(default=0.1, ge=0, le=1)
     """Gain of the band stripes' excitatory input to the sheets (the uniform input is 1); 0 leaves only the shift."""
     neuron_noise: float = Field(default=0.0, ge=0, le=0.5)
-    """Standard deviation of the noise that multiplies every cell's rate in every step; 0.05 is 5 %."""
+    """Standard deviation of the noise that multiplies the rate of every cell that a step updates; 0.05 is 5 %. Turning on the
+    spot updates the head-direction ring alone."""
     neuron_noise_seed: int = Field(default=0, ge=0)
     """Seed of that noise, where no generator is handed to the integrator."""
     gain: float = Field(default=1.0, gt=0, le=10)

@@ -79,7 +79,11 @@ class PlaceAttractor:
 
     def position_m(self) -> Array:
         """Return the bump's position (2,) by population vector, m in [0, extent)."""
-        z = np.array([self._phasors @ self.activity.sum(axis=1), self._phasors @ self.activity.sum(axis=0)])
+        return self.position_of(self.activity)
+
+    def position_of(self, activity: NDArray[np.floating]) -> Array:
+        """Return the position (2,) that an activity (N, N) stands for, m in [0, extent)."""
+        z = np.array([self._phasors @ activity.sum(axis=1), self._phasors @ activity.sum(axis=0)])
         return np.asarray(np.angle(z) / (2.0 * np.pi) % 1.0 * self.extent_m)
 
     def unwrapped_m(self, near_m: Array) -> Array:

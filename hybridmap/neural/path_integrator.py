@@ -81,11 +81,12 @@ class PathIntegrator:
                 dynamics do not need it.
 
         Raises:
-            StreamError: the displacement is not finite, or more than a kilometre.
+            StreamError: the displacement or the time is not finite, or it is more than a kilometre.
         """
         dx, dy, dyaw = np.asarray(delta_robot, dtype=np.float64).tolist()
-        if not math.isfinite(dx + dy + dyaw):
-            raise StreamError(f"self-motion: expected a finite displacement (dx, dy, dyaw), found ({dx}, {dy}, {dyaw})")
+        if not math.isfinite(dx + dy + dyaw + dt_s):
+            found = f"({dx}, {dy}, {dyaw}) in {dt_s} s"
+            raise StreamError(f"self-motion: expected a finite displacement (dx, dy, dyaw) and time, found {found}")
         if math.hypot(dx, dy) > _LARGEST_STEP_M:
             raise StreamError(
                 f"self-motion: expected at most {_LARGEST_STEP_M:g} m in one step, found {math.hypot(dx, dy):g} m"
@@ -96,9 +97,10 @@ class PathIntegrator:
         cos, sin = math.cos(0.5 * dyaw), math.sin(0.5 * dyaw)
         forward, left = config.gain * (cos * dx + sin * dy), config.gain * (cos * dy - sin * dx)
         c, s = self.head_direction.turn(config.turn_gain * dyaw + config.heading_bias_rad_m * dx)
+        translates = dx != 0.0 or dy != 0.0
         if config.neuron_noise > 0.0:
-            self._disturb()
-        if dx != 0.0 or dy != 0.0:
+            self._disturb(translates)
+        if translates:
             self._translate(c * forward - s * left, s * forward + c * left, dt_s)
 
     def use_gains(self, gain: float, turn_gain: float, heading_bias_rad_m: float) -> None:
@@ -176,23 +178,27 @@ class PathIntegrator:
         Args:
             snapshot: what `snapshot` gave.
             weight: 1 puts it back hard; less is a soft pull, by that share of the way: of the turn of the ring, and of the
-                shift of each band, sheet and the attractor, their wraps being taken from both decoded positions.
+                shift of each band, sheet and the attractor's bump, their wraps being taken from both decoded positions.
             delta_snapshot_robot: (3,) pose of the robot seen from where the snapshot was taken, m and rad: the stored
                 activity is moved by it.
 
         Raises:
             ConfigError: the weight is not in 0..1.
+            StreamError: the relative pose is no finite (3,), or more than a kilometre.
         """
         if not 0.0 <= weight <= 1.0:
             raise ConfigError(f"re-anchoring: expected a weight from 0 to 1, found {weight}")
         delta = np.asarray(delta_snapshot_robot, dtype=np.float64)
+        if delta.shape != (3,) or not math.hypot(*delta[:2]) <= _LARGEST_STEP_M or not math.isfinite(delta[2]):
+            raise StreamError(f"re-anchoring: expected a pose (x, y, yaw) within {_LARGEST_STEP_M:g} m, found {delta.tolist()}")
         here = self._moved(snapshot, delta) if delta.any() else snapshot
+        moved_m = np.asarray(here["near_m"] - snapshot["near_m"], dtype=np.float64)
         if weight < 1.0:
-            self._pull(here, weight)
+            self._pull(here, moved_m, weight)
             return
         self._put_back(here)
         if delta.any():
-            self.attractor.step(np.asarray(here["near_m"] - snapshot["near_m"], dtype=np.float64))
+            self.attractor.step(moved_m)
 
     def _put_back(self, snapshot: Snapshot) -> None:
         dtype = self.grid.activity.dtype
@@ -217,7 +223,8 @@ class PathIntegrator:
             "near_m": np.asarray(snapshot["near_m"], dtype=np.float64) + way,
         }
 
-    def _pull(self, snapshot: Snapshot, weight: float) -> None:
+    def _pull(self, snapshot: Snapshot, moved_m: Array, weight: float) -> None:
+        """Go a share of the way to a snapshot, whose attractor still stands `moved_m` (2,) behind the rest of it."""
         here = self.decode().position_m
         way = np.asarray(snapshot["near_m"], dtype=np.float64) - here
         expected = self.bands.wave_vectors @ way
@@ -229,7 +236,10 @@ class PathIntegrator:
         sheet_way = _unwrapped(np.asarray(snapshot["grid_phases"], dtype=np.float64) - sheets, expected[:, [0, 2]])
         self.bands.activity = self.bands.rates_at(bands + weight * band_way)
         self.grid.activity = shift_sheets(self.grid.activity, weight * sheet_way)
-        self.attractor.step(weight * way)
+        attractor = self.attractor
+        bump_way = attractor.position_of(np.asarray(snapshot["attractor"])) + moved_m - attractor.position_m()
+        bump_way -= attractor.extent_m * np.round((bump_way - way) / attractor.extent_m)
+        attractor.step(weight * bump_way)
         self._last_decoded_m = here + weight * way
 
     def _attractor_starts(self) -> Array:
@@ -261,10 +271,11 @@ class PathIntegrator:
             self.attractor.receive(self._projection.onto(rates), share)
             self._projection.learn(rates, self.attractor.activity.ravel())
 
-    def _disturb(self) -> None:
-        """Multiply the rate of every cell that carries the state by 1 + noise."""
+    def _disturb(self, translates: bool) -> None:
+        """Multiply the rates by 1 + noise: of the ring, which turns, and of the cells that this step updates."""
         noise, rng = self.config.neuron_noise, self._rng
-        for population in (self.head_direction, self.bands, self.grid, self.attractor):
+        moved = (self.bands, self.grid, self.attractor) if translates else ()
+        for population in (self.head_direction, *moved):
             rates = population.activity
             population.activity = rates * (1.0 + noise * rng.standard_normal(rates.shape)).astype(rates.dtype)
 

@@ -13,7 +13,7 @@ class Reanchoring:
     jump by is taken out of the pose in `odom` (REP-105), so that odometry edges stay odometry.
 
     Attributes:
-        weight: how far the cells are pulled, 0..1; with 0 nothing is kept and nothing happens.
+        weight: how far the cells are pulled, 0..1; with 0 they are left alone.
     """
 
     def __init__(self, integrator: PathIntegrator, weight: float) -> None:
@@ -29,9 +29,14 @@ class Reanchoring:
         return pose if self._pose_odom_cells is None else compose(self._pose_odom_cells, pose)
 
     def remember(self, node: int) -> None:
-        """Store the cells' activity at a new node."""
-        if self.weight > 0.0:
-            self._activity_at_node[node] = self._integrator.snapshot()
+        """Keep the cells' activity at a new node: of every node if they are to go back to it, else of the last alone."""
+        if self.weight == 0.0:
+            self._activity_at_node.clear()
+        self._activity_at_node[node] = self._integrator.snapshot()
+
+    def activity_at(self, node: int) -> Snapshot:
+        """What was remembered at a node."""
+        return self._activity_at_node[node]
 
     def recalibrate(self, node: int, delta_node_robot: Array) -> None:
         """Pull the cells to the activity of a matched node, moved by the pose (3,) of the robot seen from it."""

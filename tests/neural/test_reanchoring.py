@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 
 from hybridmap.config.neural import NeuralConfig
+from hybridmap.errors import StreamError
 from hybridmap.geometry import between, compose
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.reanchoring import Reanchoring
@@ -71,3 +72,34 @@ def test_without_a_weight_nothing_happens():
     cells.recalibrate(0, np.zeros(3))
     assert np.array_equal(integrator.pose, before)
     assert np.array_equal(cells.pose_odom_robot, before)
+
+
+@pytest.mark.parametrize("weight", [1.0, 1.0 - 1e-12])
+def test_the_place_pattern_comes_back_wherever_its_bump_had_gone(weight):
+    integrator = PathIntegrator(SOFTPLUS)
+    stored, stood = integrator.snapshot(), integrator.place_code
+    integrator.attractor.step(np.array([1.1, -0.7]))
+    assert float(stood @ integrator.place_code) < 0.1
+    integrator.restore(stored, weight)
+    _ = integrator.pose
+    assert float(stood @ integrator.place_code) == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("delta", [(float("nan"), 0.0, 0.0), (1.0, 2.0), (1e9, 0.0, 0.0), (0.0, 0.0, float("inf"))])
+def test_a_relative_pose_that_is_none_is_refused(delta):
+    integrator = PathIntegrator(SOFTPLUS)
+    before = integrator.pose
+    with pytest.raises(StreamError, match="re-anchoring: expected a pose"):
+        integrator.restore(integrator.snapshot(), 1.0, delta)
+    assert np.array_equal(integrator.pose, before)
+
+
+def test_what_a_node_stores_is_what_it_was_before_the_cells_jumped():
+    integrator = PathIntegrator(SOFTPLUS)
+    cells = Reanchoring(integrator, 1.0)
+    cells.remember(0)
+    away(integrator)
+    cells.remember(1)
+    there = integrator.decode().position_m
+    cells.recalibrate(0, np.zeros(3))
+    assert cells.activity_at(1)["near_m"] == pytest.approx(there, abs=1e-6)

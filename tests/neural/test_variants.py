@@ -1,5 +1,7 @@
 """The selectable variants of the cells: metric, kernel, noise, soft re-anchoring, the place cells' input."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -65,6 +67,25 @@ def test_noise_comes_from_the_generator_and_costs_accuracy():
     assert np.array_equal(first.grid.activity, again.grid.activity)
     assert not np.array_equal(first.grid.activity, other.grid.activity)
     assert 1e-4 < abs(geometry.wrap_angle(first.pose[2] - exact[2])) < 0.3
+
+
+def test_noise_reaches_every_population_that_carries_the_state():
+    quiet, noisy = PathIntegrator(NeuralConfig()), PathIntegrator(NeuralConfig(neuron_noise=0.05))
+    for integrator in (quiet, noisy):
+        integrator.step((0.02, 0.01, 0.05), 0.1)
+    for name in ("head_direction", "bands", "grid", "attractor"):
+        still, stirred = (getattr(integrator, name).activity for integrator in (quiet, noisy))
+        assert float(np.abs(still - stirred).max()) > 1e-4 * float(still.max()), name
+
+
+def test_noise_while_turning_on_the_spot_is_the_ring_s_alone():
+    """Cells that nothing updates have nothing to be noisy in; else the noise would multiply up without bound."""
+    integrator = PathIntegrator(NeuralConfig(neuron_noise=0.1))
+    before = {name: getattr(integrator, name).activity.copy() for name in ("bands", "grid", "attractor")}
+    for _ in range(300):
+        integrator.step((0.0, 0.0, 0.02), 0.1)
+    assert all(np.array_equal(getattr(integrator, name).activity, activity) for name, activity in before.items())
+    assert abs(integrator.head_direction.heading_rad - math.remainder(6.0, 2.0 * math.pi)) > 1e-6
 
 
 def test_noise_leaves_a_robot_that_stands_alone():
