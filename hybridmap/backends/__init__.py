@@ -3,5 +3,16 @@
 from hybridmap.backends.base import Backend, Solution, SolveReport, SolveStatus, SupportsPoseGraph
 from hybridmap.backends.registry import create, names
 from hybridmap.backends.replay import replay
+from hybridmap.backends.session import GraphSession
 
-__all__ = ["Backend", "Solution", "SolveReport", "SolveStatus", "SupportsPoseGraph", "create", "names", "replay"]
+__all__ = [
+    "Backend",
+    "GraphSession",
+    "Solution",
+    "SolveReport",
+    "SolveStatus",
+    "SupportsPoseGraph",
+    "create",
+    "names",
+    "replay",
+]
