@@ -11,13 +11,19 @@ from hybridmap.graph.pose_graph import PoseGraph
 
 
 class SolveStatus(StrEnum):
-    """Why a solver stopped."""
+    """Why a solver stopped; `diverged`, `singular` and `failed` came with no map, but for the one they began with."""
 
     CONVERGED = "converged"
     MAX_ITERATIONS = "max-iterations"
     STALLED = "stalled"
     DIVERGED = "diverged"
+    SINGULAR = "singular"
     FAILED = "failed"
+
+    @property
+    def has_map(self) -> bool:
+        """Whether the poses are a result."""
+        return self not in (SolveStatus.DIVERGED, SolveStatus.SINGULAR, SolveStatus.FAILED)
 
 
 @dataclass(frozen=True, slots=True)

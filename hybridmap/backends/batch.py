@@ -38,7 +38,7 @@ def run(
     tolerance: float = 1e-5,
     rescue: bool = True,
 ) -> Outcome:
-    """One optimiser run; exceptions become the status `failed`, standing still on a slope `stalled`.
+    """One optimiser run; exceptions become the status `singular` or `failed`, standing still on a slope `stalled`.
 
     Levenberg-Marquardt that fails or stalls (the normal equations square the condition of the graph) is followed by
     Dogleg on orthogonal factors, which do not.
@@ -74,7 +74,8 @@ def _attempt(method: str, graph: Any, start: Array, initial: Any, max_iterations
         result = optimizer.optimize()
     except RuntimeError as error:
         text = str(error).strip().splitlines()
-        return Outcome(start, SolveStatus.FAILED, f"{method}: {text[0] if text else type(error).__name__}", 0)
+        status = SolveStatus.SINGULAR if "ndetermina" in str(error) else SolveStatus.FAILED  # GTSAM's word for singular
+        return Outcome(start, status, f"{method}: {text[0] if text else type(error).__name__}", 0)
     poses, iterations = poses_of(result), int(optimizer.iterations())
     if not np.isfinite(poses).all():
         return Outcome(start, SolveStatus.DIVERGED, f"{method}: poses were not finite", iterations)

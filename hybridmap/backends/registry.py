@@ -23,6 +23,7 @@ _TABLE = {
     "gtsam-huber": ("robust", "KernelBackend"),
     "gtsam-cauchy": ("robust", "KernelBackend"),
     "gtsam-dcs": ("robust", "KernelBackend"),
+    "gtsam-geman-mcclure": ("robust", "KernelBackend"),
     "gtsam-gnc": ("gnc", "GncBackend"),
     "gtsam-calibrated": ("calibrated", "CalibratedBackend"),
 }

@@ -22,6 +22,7 @@ _KERNELS: dict[str, Callable[[RobustConfig], Any]] = {
     "gtsam-cauchy": lambda c: gtsam.noiseModel.mEstimator.Cauchy.Create(c.cauchy_scale),
     "gtsam-huber": lambda c: gtsam.noiseModel.mEstimator.Huber.Create(c.huber_scale),
     "gtsam-dcs": lambda c: gtsam.noiseModel.mEstimator.DCS.Create(c.dcs_phi),
+    "gtsam-geman-mcclure": lambda c: gtsam.noiseModel.mEstimator.GemanMcClure.Create(c.geman_mcclure_scale),
 }
 
 
@@ -61,7 +62,7 @@ class WarmKernel:
 
 
 class KernelBackend(GraphBackend):
-    """`gtsam-cauchy`, `gtsam-huber`, `gtsam-dcs`."""
+    """`gtsam-cauchy`, `gtsam-huber`, `gtsam-dcs`, `gtsam-geman-mcclure`."""
 
     def __init__(self, name: str, config: BackendsConfig) -> None:
         super().__init__(name, config)

@@ -21,9 +21,9 @@ def optimize(
 ) -> None:
     """Optimise a graph: chi2 before and after, status, iterations, CPU seconds, proof of optimality.
 
-    Exit code 1, and no file, where the back-end failed or diverged.
+    Exit code 1, and no file, where the back-end failed, diverged or found the graph singular.
     """
-    from hybridmap.backends import SolveStatus, create
+    from hybridmap.backends import create
     from hybridmap.backends.certificate import certify
     from hybridmap.backends.comparison import Row, metrics_of
     from hybridmap.cli.graphs import open_graph, settings_of
@@ -37,7 +37,7 @@ def optimize(
     chosen = create(backend, settings_of(source, config, setting))
     solution = chosen.solve(source.graph)
     report = solution.report
-    solved = report.status not in (SolveStatus.FAILED, SolveStatus.DIVERGED)
+    solved = report.status.has_map
     if out is not None and solved:
         write_g2o(out, source.graph, solution.poses)
     proof = certify(source.graph, solution.poses, report.rejected_edge_ids)

@@ -58,6 +58,8 @@ class RobustConfig(Section):
     """Whitened residual from which a Huber cost is linear."""
     dcs_phi: float = Field(default=1.0, gt=0)
     """Dynamic covariance scaling: squared whitened residual from which a loop is scaled down."""
+    geman_mcclure_scale: float = Field(default=2.0, gt=0)
+    """Whitened residual at which a Geman-McClure weight is a quarter."""
 
 
 class Isam2Config(Section):

@@ -140,7 +140,7 @@ def test_the_limit_of_iterations_is_reported():
 
 
 def test_the_same_graph_gives_the_same_bytes():
-    graph, _ = laps(np.random.default_rng(5), nodes=100)
+    graph, _ = laps(np.random.default_rng(5), nodes=60)
     for name in backends.names():
         first, second = (backends.create(name).solve(graph).poses.tobytes() for _ in range(2))
         assert first == second, name
@@ -170,5 +170,21 @@ def test_the_ill_conditioned_intel_graph_is_solved_or_called_unsolved(data_dir):
     for name in ("gtsam-lm", "gtsam-gn", "gtsam-dogleg", "gtsam-gnc"):
         report = backends.create(name).solve(graph).report
         assert report.chi2 <= report.chi2_initial, name
-        assert report.chi2 < 216.0 or report.status in ("stalled", "failed", "diverged", "max-iterations"), name
+        assert report.chi2 < 216.0 or report.status in ("stalled", "failed", "singular", "diverged", "max-iterations"), name
     assert backends.create("gtsam-lm").solve(graph).report.status == "converged"
+
+
+def test_a_singular_graph_is_called_so():
+    import gtsam
+
+    from hybridmap.backends.batch import run
+    from hybridmap.backends.factors import NoiseModels, factors, values
+
+    graph, _ = laps(np.random.default_rng(0), nodes=10)
+    loose = gtsam.NonlinearFactorGraph()  # nothing holds node 0, and node 9 hangs on nothing
+    for factor in factors(graph.with_edges(graph.targets != 9), NoiseModels()):
+        loose.push_back(factor)
+    outcome = run("gn", loose, graph.initial, 5, initial=values(graph.initial))
+    assert outcome.status == "singular"
+    assert not outcome.status.has_map
+    assert np.array_equal(outcome.poses, graph.initial)

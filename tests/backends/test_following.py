@@ -7,11 +7,13 @@ import pytest
 from graphs_for_tests import laps
 
 from hybridmap import backends
+from hybridmap.backends.false_loops import inject
 from hybridmap.backends.following import difference, prefix
 from hybridmap.backends.objective import chi2
 from hybridmap.config.backends import BackendsConfig, Isam2Config
 from hybridmap.errors import BackendError, GraphError
 from hybridmap.geometry import between, compose
+from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import EdgeKind
 
 FOLLOWERS = ["gtsam-lm", "gtsam-cauchy", "gtsam-gnc", "gtsam-isam2", "relaxation-ratslam", "odometry"]
@@ -167,3 +169,25 @@ def test_odometry_stays_odometry_where_registrations_know_better():
     assert np.allclose(backends.create("odometry").solve(refined).poses, graph.initial)
     *_, last = backends.replay(backends.create("odometry"), refined)
     assert np.allclose(last.poses, graph.initial)
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_isam2_returns_to_the_clean_optimum_when_false_edges_are_taken_out(data_dir):
+    graph = read_graph(data_dir / "posegraphs" / "intel.g2o")
+    false = inject(graph, 0.01, "random", np.random.default_rng(0))
+    backend = backends.create("gtsam-isam2")
+    clean = backend.solve(graph).report.chi2
+    backend.update(graph)
+    assert backend.update(false).report.chi2 > 10.0 * clean
+    for _ in range(3):
+        back = backend.update(graph)
+    assert back.report.chi2 <= 1.001 * clean
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_a_replay_of_manhattan_by_isam2_ends_at_the_batch_optimum(data_dir):
+    graph = read_graph(data_dir / "posegraphs" / "manhattanOlson3500.g2o")
+    *_, last = backends.replay(backends.create("gtsam-isam2"), graph)
+    assert last.report.chi2 <= 1.001 * backends.create("gtsam-lm").solve(graph).report.chi2
