@@ -57,11 +57,11 @@ class Decision:
             "reason": e.reason,
             "since_node": e.since_node,
             "relative": None if e.relative is None else e.relative.delta.tolist(),
-            "scores": dict(e.scores),
+            "scores": {name: _plain(value) for name, value in e.scores.items()},
             "checks": [
                 {
                     "figure": c.rule.figure,
-                    "value": c.value,
+                    "value": _plain(c.value),
                     "needs": "at least" if c.rule.at_least else "at most",
                     "limit": c.limit,
                     "setting": c.rule.setting,
@@ -371,6 +371,11 @@ class Explainer:
             return None
         poses = self._truth.at(stamps)
         return _moved(between(between(poses[0], poses[1]), edge.relative.delta))
+
+
+def _plain(value: float) -> float | None:
+    """A number as JSON can hold it: none for NaN and infinity."""
+    return float(value) if np.isfinite(value) else None
 
 
 def _moved(delta: Array) -> tuple[float, float]:

@@ -105,6 +105,18 @@ def test_the_story_of_a_node(tmp_path):
     assert json.loads(json.dumps(story.to_json()))["loops"][1]["reason"] == "too few inliers"
 
 
+def test_a_run_that_was_killed_and_figures_that_are_not_finite_are_told_too(tmp_path):
+    experiences = ring_map(0.5)
+    experiences.add_edge(edge(Status.REJECTED, "no figure", matches=float("nan"), slack_m=float("inf")))
+    write_session(tmp_path / "s", experiences, solve=False)
+    with Explainer(tmp_path / "s") as explainer:
+        story = explainer.node(9)
+    assert set(story.poses) == {"odometry"}
+    assert story.nearest is None
+    told = json.loads(json.dumps(story.to_json(), allow_nan=False))
+    assert told["loops"][0]["scores"] == {"matches": None, "slack_m": None}
+
+
 def test_the_story_of_an_instant(tmp_path):
     write_session(tmp_path / "s", ring_map())
     with Explainer(tmp_path / "s") as explainer:
