@@ -84,7 +84,7 @@ def test_readme_names_every_back_end() -> None:
     from hybridmap.backends import names
 
     table = (ROOT / "README.md").read_text().split("The back-ends:")[1].split("## ")[0]
-    assert set(re.findall(r"`((?:gtsam|relaxation)-\w+|odometry)`", table)) == set(names())
+    assert set(re.findall(r"`((?:gtsam|relaxation)-[\w-]+|odometry)`", table)) == set(names())
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
