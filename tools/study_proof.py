@@ -27,7 +27,7 @@ import yaml
 
 from hybridmap.metrics import Metric, to_json
 
-COMMAND = (sys.executable, "-c", "from hybridmap.cli import main; main()")
+COMMAND = (sys.executable, "-P", "-c", "from hybridmap.cli import main; main()")
 TABLES = ("cells.csv", "summary.csv", "metrics.json", "study.yaml", "report.html")
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "HYBRIDMAP_QUIET": "1"}
 PATIENCE_S = 900

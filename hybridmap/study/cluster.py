@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
+import socket
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from hybridmap.errors import StudyError
-from hybridmap.study.pools import ATTEMPTS, Lost
+from hybridmap.study.pools import Lost
 
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
@@ -30,12 +32,12 @@ class DaskCluster:
             import distributed
         except ImportError:
             raise StudyError("--scheduler needs the extra `cluster`: pip install 'hybridmap[cluster]'") from None
+        _require_listener(address)
         self._dask: Any = distributed
         try:
             self._client = distributed.Client(address, timeout=f"{_CONNECT_S}s", set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
-            said = " ".join(str(error).split())[:160] or type(error).__name__
-            raise StudyError(f"{address}: no Dask scheduler answers: {said}; expected tcp://HOST:PORT") from None
+            raise _no_scheduler(address, error) from None
         try:
             self._client.wait_for_workers(1, timeout=_CONNECT_S)
         except TimeoutError:
@@ -48,7 +50,7 @@ class DaskCluster:
         Raises:
             StudyError: the connection to the scheduler is lost; what is done so far has been yielded.
         """
-        futures = {self._client.submit(work, task, pure=False, retries=ATTEMPTS): index for index, task in enumerate(tasks)}
+        futures = {self._client.submit(work, task, pure=False): index for index, task in enumerate(tasks)}
         try:
             for future in self._dask.as_completed(list(futures), loop=self._client.loop):
                 if future.status == "cancelled":
@@ -68,3 +70,23 @@ class DaskCluster:
         if isinstance(error, ImportError):
             raise StudyError(f"a worker cannot import hybridmap: {error}; install the same version on all") from None
         return Lost.by(error)
+
+
+def _require_listener(address: str) -> None:
+    """Refuse an address at which nobody listens, at once and before Dask starts to try again and again.
+
+    Raises:
+        StudyError: it is no address, or the connection is refused.
+    """
+    found = re.fullmatch(r"(tcp|tls)://\[?([^/]+?)\]?:(\d{1,5})", address)
+    if found is None:
+        raise StudyError(f"--scheduler {address}: expected tcp://HOST:PORT, as `dask scheduler` prints it")
+    try:
+        socket.create_connection((found[2], int(found[3])), timeout=_CONNECT_S).close()
+    except (OSError, OverflowError) as error:
+        raise _no_scheduler(address, error) from None
+
+
+def _no_scheduler(address: str, error: BaseException) -> StudyError:
+    said = " ".join(str(error).split())[:160] or type(error).__name__
+    return StudyError(f"{address}: no Dask scheduler answers: {said}; start one with `dask scheduler`")
