@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import yaml
 
 from hybridmap.calibration.estimate import SIGNIFICANT_SIGMAS, Estimate
 from hybridmap.calibration.gains import GAIN_KEYS, Gains
+from hybridmap.config import Config
 from hybridmap.metrics import Metric
 
 _NAMED = (
@@ -18,9 +20,13 @@ _NAMED = (
 
 
 def metrics_of(estimate: Estimate, in_use: Gains) -> list[Metric]:
-    """Each gain with its standard deviation and how far it lies from the one in use; then what it was made from."""
+    """Each gain with its standard deviation and how far it lies from the one in use (NaN where the drive does not tell it);
+    then what it was made from.
+    """
     rows: list[Metric] = []
-    values, sigmas, off = estimate.gains.to_array(), estimate.sigmas, estimate.off(in_use)
+    told, sigmas, off = estimate.measured, estimate.sigmas, estimate.off(in_use)
+    values = np.append(estimate.gains.to_array(), estimate.delay_s)
+    values, sigmas, off = (np.where(told[: len(row)], row, np.nan) for row in (values, sigmas, off))
     for index, (name, unit, text) in enumerate(_NAMED):
         rows += [
             Metric(f"{name}/calibration", float(values[index]), unit, text),
@@ -29,7 +35,7 @@ def metrics_of(estimate: Estimate, in_use: Gains) -> list[Metric]:
         ]
     return [
         *rows,
-        Metric("delay/calibration", estimate.delay_s, "s", "odometry of stamp t is where the robot is at t + delay"),
+        Metric("delay/calibration", float(values[3]), "s", "odometry of stamp t is where the robot is at t + delay"),
         Metric("delay_sigma/calibration", float(sigmas[3]), "s", "its standard deviation"),
         Metric("leg/calibration", estimate.leg_m, "m", "length of the legs that were compared"),
         Metric("legs/calibration", estimate.legs, "1", "independent legs"),
@@ -39,23 +45,45 @@ def metrics_of(estimate: Estimate, in_use: Gains) -> list[Metric]:
     ]
 
 
+def changes(estimate: Estimate, in_use: Gains) -> bool:
+    """Whether the estimate changes a configuration: a gain differs from the one in use, or the delay from none."""
+    return estimate.differs(in_use) or estimate.delay_differs
+
+
 def verdict(estimate: Estimate, in_use: Gains) -> str:
-    """One line for people: what is significant, and what follows."""
-    off = estimate.off(in_use)
-    clear = [name for (name, _, _), far in zip(_NAMED, off, strict=True) if abs(far) > SIGNIFICANT_SIGMAS]
-    if not clear:
-        return f"no gain differs from the one in use by more than {SIGNIFICANT_SIGMAS:g} sigma: keep them"
-    return f"{', '.join(clear)} {'differ' if len(clear) > 1 else 'differs'} by more than {SIGNIFICANT_SIGMAS:g} sigma"
+    """One line for people: what is significant, what follows, and what the drive did not tell."""
+    names = [name for name, _, _ in _NAMED]
+    clear = [name for name, far in zip(names, estimate.off(in_use), strict=True) if abs(far) > SIGNIFICANT_SIGMAS]
+    if clear:
+        said = [f"{', '.join(clear)} {'differ' if len(clear) > 1 else 'differs'} by more than {SIGNIFICANT_SIGMAS:g} sigma"]
+    else:
+        said = [f"no gain differs from the one in use by more than {SIGNIFICANT_SIGMAS:g} sigma: keep them"]
+    if estimate.delay_differs:
+        said.append(
+            f"the delay differs from the one in use by {estimate.delay_s:.3g} s, more than {SIGNIFICANT_SIGMAS:g} sigma"
+        )
+    said += [
+        f"the drive does not tell the {name.replace('_', ' ')}: the one in use is kept"
+        for name, told in zip([*names, "delay"], estimate.measured, strict=True)
+        if not told
+    ]
+    return "; ".join(said)
 
 
 def calibrated(config_tree: dict[str, Any], estimate: Estimate, in_use: Gains) -> str:
-    """A configuration (the nested mapping of its file) with what the estimate changes in it, as YAML.
+    """A configuration (the nested mapping of its file) with what the estimate changes in it, as YAML that `Config.load` reads.
 
-    The gains change together, where one of them is significant: each is estimated given the others. So does the delay.
+    The gains change together, where one of them is significant: each is estimated given the others. One that was not
+    measured stays. The delay is judged alone, and added to the one in use: it is what that one left.
+
+    Raises:
+        ConfigError: the result is no configuration of this version, e.g. a delay beyond its limit.
     """
     neural, sensors = dict(config_tree.get("neural") or {}), dict(config_tree.get("sensors") or {})
     if estimate.differs(in_use):
-        neural |= dict(zip(GAIN_KEYS, estimate.gains.to_array().tolist(), strict=True))
+        neural |= dict(zip(GAIN_KEYS, estimate.kept(in_use).to_array().tolist(), strict=True))
     if estimate.delay_differs:
         sensors["odometry_delay_s"] = float(sensors.get("odometry_delay_s", 0.0)) + estimate.delay_s
-    return yaml.safe_dump(config_tree | {"neural": neural, "sensors": sensors}, sort_keys=False, allow_unicode=True)
+    tree = config_tree | {"neural": neural, "sensors": sensors}
+    Config.from_tree(tree, "calibrated configuration, not written")
+    return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True)

@@ -7,8 +7,10 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import ValidationError
 
 from hybridmap.config.neural import NeuralConfig
+from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array
 
 GAIN_KEYS = ("gain", "turn_gain", "heading_bias_rad_m")
@@ -45,6 +47,22 @@ class Gains:
         """From (3,): gain, turn gain, heading bias."""
         gain, turn_gain, bias = (float(value) for value in np.asarray(values, dtype=np.float64))
         return cls(gain, turn_gain, bias)
+
+    def checked(self, origin: str) -> Self:
+        """The same, if a configuration may hold them; `origin` names them in errors.
+
+        Raises:
+            EvaluationError: one lies outside its limits, e.g. a gain below zero.
+        """
+        try:
+            NeuralConfig.model_validate(dict(zip(GAIN_KEYS, self.to_array().tolist(), strict=True)))
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise EvaluationError(
+                f"{origin}: found {first['loc'][0]} {first['input']:.4g}, which no robot has ({first['msg'].lower()}); "
+                f"are odometry and poses of one recording?"
+            ) from None
+        return self
 
     def to_array(self) -> Array:
         """(3,): gain, turn gain, heading bias."""

@@ -22,8 +22,9 @@ from hybridmap.backends.factors import NoiseModels, anchor, factors, poses_of
 from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.gains import NEUTRAL, Gains
 from hybridmap.calibration.legs import Motion
+from hybridmap.calibration.observability import NotToldError, require_delay
 from hybridmap.calibration.odometry_terms import OdometryTerms, own_edges, terms_of
-from hybridmap.calibration.regression import CAUCHY
+from hybridmap.calibration.regression import CAUCHY, Sighting, require_told_by
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, between, compose, inverse
@@ -37,6 +38,8 @@ _AGREEING_STARTS = 3
 _SAME_RAD_M = 2e-4
 _OPEN_WAY = 0.1  # share of the way that only odometry spans; below it no winding of the chain is in doubt
 _PRIOR = np.array([0.2, 0.2, 0.2, 0.2])  # so wide that it only holds what the drive leaves open
+_OPEN = 0.5  # of the prior's variance that is left: above it, the prior says more than the drive does
+_NEUTRAL = np.append(NEUTRAL.to_array(), 0.0)
 _ITERATIONS = 60
 _MEDIAN_OF_NORM = {2: 1.1774, 3: 1.5382}  # median of the norm of so many standard normal components
 _logger = logging.getLogger(__name__)
@@ -69,8 +72,10 @@ def solve(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config
         config: settings of the relaxation and the kernels.
 
     Raises:
+        EvaluationError: the drive does not tell turn gain and heading bias, or the result is no odometry's calibration.
         BackendError: no start led to a solution.
     """
+    require_told_by(Sighting(motion, stamps_ns, graph.initial))
     problem = _Problem(graph, motion, stamps_ns, config)
     found: list[Joint] = []
     for bias in BIAS_STARTS_RAD_M if problem.open_way() > _OPEN_WAY else BIAS_STARTS_RAD_M[:1]:
@@ -88,7 +93,27 @@ def solve(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config
     best = min(found, key=lambda one: one.odometry_cost)
     variable = np.append(best.estimate.gains.to_array(), best.estimate.delay_s)
     scale = problem.scale(best.poses, variable)
-    return problem.solve(best.poses, variable, scale, best.bias_start_rad_m) or best
+    final = problem.solve(best.poses, variable, scale, best.bias_start_rad_m) or best
+    return replace(final, estimate=_told(final.estimate))
+
+
+def _told(estimate: Estimate) -> Estimate:
+    """The estimate without the gain and the delay that only the prior held.
+
+    Raises:
+        NotToldError: it holds turn gain or heading bias.
+    """
+    open_ = np.diag(estimate.covariance) > _OPEN * estimate.unit_variance * _PRIOR**2
+    if open_[1] or open_[2]:
+        raise NotToldError(
+            "calibration: the drive and its loops tell neither turn gain nor heading bias better than was known before; "
+            "expected a drive that turns and closes loops"
+        )
+    values = np.where(open_, _NEUTRAL, np.append(estimate.gains.to_array(), estimate.delay_s))
+    covariance = np.where(open_[:, None] | open_[None, :], 0.0, estimate.covariance)
+    covariance[open_, open_] = np.inf
+    gains = Gains.from_array(values[:3]).checked("calibration")
+    return replace(estimate, gains=gains, delay_s=require_delay(float(values[3])), covariance=covariance)
 
 
 class _Problem:
@@ -194,8 +219,7 @@ class _Problem:
         for index, (source, target) in enumerate(ends):
             out.push_back(gtsam.CustomFactor(unit, [source, target, self.key], _leg_error(self, self.terms, index)))
         out.push_back(anchor(self.graph.initial[0]))
-        neutral = np.append(NEUTRAL.to_array(), 0.0)
-        out.push_back(gtsam.PriorFactorVector(self.key, neutral, gtsam.noiseModel.Diagonal.Sigmas(_PRIOR)))
+        out.push_back(gtsam.PriorFactorVector(self.key, _NEUTRAL, gtsam.noiseModel.Diagonal.Sigmas(_PRIOR)))
         return out
 
 

@@ -41,9 +41,9 @@ class GainChange:
         return [self.stamp_ns, *self.gains.to_array().tolist()]
 
     def __str__(self) -> str:
-        values, sigmas = self.gains.to_array(), self.estimate.sigmas
-        named = zip(("gain", "turn gain", "heading bias"), values, sigmas, strict=False)
-        return "odometry gains changed: " + ", ".join(f"{name} {value:.4f} +- {sigma:.4f}" for name, value, sigma in named)
+        named = zip(("gain", "turn gain", "heading bias"), self.gains.to_array(), self.estimate.sigmas, strict=False)
+        told = (f"{name} {value:.4f} +- {sigma:.4f}" for name, value, sigma in named if np.isfinite(sigma))
+        return "odometry gains changed: " + ", ".join(told)
 
 
 class OnlineCalibration:
@@ -95,8 +95,8 @@ class OnlineCalibration:
             return None
         if not estimate.differs(self._in_use):
             return None
-        change = GainChange(stamp_ns, estimate.gains, estimate)
-        self._in_use = estimate.gains
+        self._in_use = estimate.kept(self._in_use)
+        change = GainChange(stamp_ns, self._in_use, estimate)
         self.changes.append(change)
         _logger.warning("%s", change)
         return change

@@ -8,10 +8,14 @@ heading at each end of a fast turn.
 Only two components of a leg are used: the heading at its end, linear in turn gain, bias and delay, and its length along the
 measured chord, linear in the gain. What is seen sideways depends on the mounting of the sensor and on *where* on the leg the
 heading went wrong, and would bias the estimate.
+
+A drive that does not tell turn gain and heading bias is refused. A gain or a delay that it does not tell is left out of the
+fit, and out of what `Estimate.kept` changes.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,6 +25,7 @@ from numpy.typing import NDArray
 from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.gains import NEUTRAL, Gains
 from hybridmap.calibration.legs import Legs, Motion
+from hybridmap.calibration.observability import MAX_SIGMA, NotToldError, require_delay, require_told
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array, between, wrap_angle
 
@@ -28,6 +33,9 @@ LEG_M = (1.0, 16.0)
 """Shortest and longest leg, m; the longest is about the window over which dead reckoning is judged."""
 INDEPENDENT_LEGS = 16.0
 """Legs are so short that the way holds this many one after the other, as far as the limits allow."""
+
+SHORTEST_M = 0.1
+"""Shortest leg that may be asked for, m: on less, the noise of the poses is all there is."""
 
 CAUCHY = 2.0
 """Scale of the Cauchy weights, in robust standard deviations: about 95 % efficiency for Gaussian noise."""
@@ -38,6 +46,9 @@ _WALK_RAD = np.radians(1.0)  # per sqrt(m)
 _PER_TURN = 0.03  # per sqrt(rad)
 _FLOOR_M, _WALK_M = 0.02, 0.03
 _STRAIGHT = 0.3  # a leg shorter than this share of its way says little about lengths
+_STRAIGHT_LEGS = 4
+_RUNAWAY_S = 10.0  # a delay that the fit may pass through, but not go beyond
+_HEADING = ("turn gain", "heading bias", "delay")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,14 +78,17 @@ def regress(sightings: Sequence[Sighting], leg_m: float | None = None) -> Estima
 
     Args:
         sightings: drives of one robot (or of robots of one kind).
-        leg_m: length of the legs, m; default: a sixteenth of the mean drive, within `LEG_M`.
+        leg_m: length of the legs, m, `SHORTEST_M` or more; default: a sixteenth of the mean drive, within `LEG_M`.
 
     Raises:
-        EvaluationError: too little travel between known poses.
+        EvaluationError: too little travel between known poses, a drive that does not tell turn gain and heading bias, or an
+            estimate that cannot be odometry's.
     """
+    if leg_m is not None:
+        require_leg(leg_m)
     ways = [_travel_at(sighting) for sighting in sightings]
     total = float(sum(way[-1] - way[0] for way in ways))
-    length = leg_m or leg_length(total / len(ways))
+    length = leg_length(total / len(ways)) if leg_m is None else leg_m
     drives = [cut(sighting, way, length) for sighting, way in zip(sightings, ways, strict=True)]
     count = sum(len(drive.legs) for drive in drives)
     if total < 4.0 * length or count < 8:
@@ -83,6 +97,27 @@ def regress(sightings: Sequence[Sighting], leg_m: float | None = None) -> Estima
             f"give a longer drive, or shorter legs"
         )
     return _solve(drives, length, total)
+
+
+def require_leg(leg_m: float) -> None:
+    """Refuse a length of legs, m, that is none.
+
+    Raises:
+        EvaluationError: it is not finite or below `SHORTEST_M`.
+    """
+    if not SHORTEST_M <= leg_m < math.inf:
+        raise EvaluationError(f"calibration: found legs of {leg_m:g} m, expected {SHORTEST_M:g} m or more")
+
+
+def require_told_by(sighting: Sighting) -> None:
+    """Refuse a drive whose odometry alone shows that no poses would tell turn gain and heading bias.
+
+    Raises:
+        NotToldError: as `require_told` has it.
+    """
+    way = _travel_at(sighting)
+    legs = cut(sighting, way, leg_length(float(way[-1] - way[0]))).legs
+    require_told(legs.jacobian(NEUTRAL)[:, 2, 1:3] / leg_sigmas(legs)[1][:, None])
 
 
 def leg_length(travel_m: float) -> float:
@@ -119,14 +154,15 @@ def _solve(drives: list[_Drive], leg_m: float, total_m: float) -> Estimate:
     sigmas = [leg_sigmas(drive.legs) for drive in drives]
     sigma_m, sigma_rad = (np.concatenate([pair[which] for pair in sigmas]) for which in (0, 1))
     overlap = max(1.0, float(travel.sum()) / total_m)
-    heading = _fit_heading(drives, sigma_rad, overlap)
+    heading = _heading(drives, sigma_rad, overlap)
     turn_gain, bias, delay_s = heading.values
     length = _fit_length(drives, Gains(1.0, turn_gain, bias), delay_s, sigma_m, travel, overlap)
+    gain, variance = (NEUTRAL.gain, math.inf) if length is None else (float(length.values[0]), length.covariance[0, 0])
     covariance = np.zeros((4, 4))
-    covariance[0, 0] = length.covariance[0, 0]
+    covariance[0, 0] = variance
     covariance[1:, 1:] = heading.covariance
     return Estimate(
-        gains=Gains(float(length.values[0]), float(turn_gain), float(bias)),
+        gains=Gains(gain, float(turn_gain), float(bias)).checked("calibration"),
         delay_s=float(delay_s),
         covariance=covariance,
         leg_m=leg_m,
@@ -145,30 +181,63 @@ class _Fit:
     weights: Array  # (L,)
 
 
-def _fit_heading(drives: list[_Drive], sigma: Array, overlap: float) -> _Fit:
-    """Turn gain, bias and delay from the headings at the legs' ends, by Gauss-Newton with Cauchy weights."""
+def _heading(drives: list[_Drive], sigma: Array, overlap: float) -> _Fit:
+    """Turn gain, bias and delay; the delay is 0 with infinite variance where the drives do not tell it."""
+    try:
+        return _fit_heading(drives, sigma, overlap, 3)
+    except NotToldError:
+        two = _fit_heading(drives, sigma, overlap, 2)
+    covariance = np.diag([0.0, 0.0, np.inf])
+    covariance[:2, :2] = two.covariance
+    return _Fit(np.append(two.values, 0.0), covariance, two.unit_variance, two.weights)
+
+
+def _fit_heading(drives: list[_Drive], sigma: Array, overlap: float, unknowns: int) -> _Fit:
+    """Turn gain, bias and (of three unknowns) delay from the headings at the legs' ends, by robust Gauss-Newton."""
     values = np.array([NEUTRAL.turn_gain, NEUTRAL.heading_bias_rad_m, 0.0])
     measured = np.concatenate([drive.measured[:, 2] for drive in drives])
     for _ in range(_ROUNDS):
         gains, delay_s = Gains(1.0, values[0], values[1]), float(values[2])
         predicted = np.concatenate([drive.legs.predict(gains, delay_s)[:, 2] for drive in drives])
-        slope = np.concatenate([drive.legs.jacobian(gains, delay_s)[:, 2, 1:] for drive in drives])
-        fit = _weigh(wrap_angle(predicted - measured) / sigma, slope / sigma[:, None], overlap)
-        values = values - fit.values
-        if np.all(np.abs(fit.values) < 1e-3 * np.sqrt(np.diag(fit.covariance))):
+        slope = np.concatenate([drive.legs.jacobian(gains, delay_s)[:, 2, 1 : 1 + unknowns] for drive in drives])
+        residual, slope = wrap_angle(predicted - measured) / sigma, slope / sigma[:, None]
+        weights = _weights(residual)
+        require_told(np.sqrt(weights / weights.mean())[:, None] * slope)
+        fit = _weigh(residual, slope, overlap)
+        values[:unknowns] -= fit.values
+        sigmas = np.sqrt(np.diag(fit.covariance))
+        if np.all(np.abs(fit.values) < 1e-3 * sigmas) or abs(values[2]) > _RUNAWAY_S:
             break
-    return _Fit(values, fit.covariance, fit.unit_variance, fit.weights)
+    _require_found(values, fit.values, sigmas)
+    return _Fit(values[:unknowns], fit.covariance, fit.unit_variance, fit.weights)
 
 
-def _fit_length(drives: list[_Drive], gains: Gains, delay_s: float, sigma_m: Array, travel_m: Array, overlap: float) -> _Fit:
-    """The gain from the legs' lengths along the measured chords; `gains` has a gain of one."""
+def _require_found(values: Array, last_step: Array, sigmas: Array) -> None:
+    """Refuse a fit that says nothing, or that has not come to rest, or whose delay is none that clocks have."""
+    vague = [name for name, sigma in zip(_HEADING, sigmas, strict=False) if not sigma <= MAX_SIGMA]
+    if vague:
+        raise NotToldError(
+            f"calibration: the drive does not tell the {' and the '.join(vague)}: found a standard deviation of "
+            f"{np.max(sigmas):.2g}, expected at most {MAX_SIGMA:.2g}; give a longer drive, one that turns"
+        )
+    require_delay(float(values[2]))
+    if np.any(np.abs(last_step) > sigmas + 1e-9):
+        raise EvaluationError(
+            f"calibration: the fit did not come to rest in {_ROUNDS} rounds; are odometry and poses of one recording?"
+        )
+
+
+def _fit_length(
+    drives: list[_Drive], gains: Gains, delay_s: float, sigma_m: Array, travel_m: Array, overlap: float
+) -> _Fit | None:
+    """The gain from the legs' lengths along the measured chords, None if they do not tell it; `gains` has a gain of one."""
     measured = np.concatenate([drive.measured[:, :2] for drive in drives])
     predicted = np.concatenate([drive.legs.predict(gains, delay_s)[:, :2] for drive in drives])
     length = np.hypot(measured[:, 0], measured[:, 1])
     straight = length > _STRAIGHT * travel_m
-    if np.count_nonzero(straight) < 4:
-        return _Fit(np.array([1.0]), np.array([[1.0]]), 1.0, np.ones(len(length)))
     along = np.sum(predicted * measured, axis=1)[straight] / length[straight]
+    if len(along) < _STRAIGHT_LEGS or not np.any(along):
+        return None
     sigma = sigma_m[straight]
     gain = 1.0
     for _ in range(_ROUNDS):
@@ -176,7 +245,8 @@ def _fit_length(drives: list[_Drive], gains: Gains, delay_s: float, sigma_m: Arr
         gain -= float(fit.values[0])
         if abs(fit.values[0]) < 1e-3 * np.sqrt(fit.covariance[0, 0]):
             break
-    return _Fit(np.array([gain]), fit.covariance, fit.unit_variance, fit.weights)
+    told = np.sqrt(fit.covariance[0, 0]) <= MAX_SIGMA
+    return _Fit(np.array([gain]), fit.covariance, fit.unit_variance, fit.weights) if told else None
 
 
 def _weigh(residual: Array, slope: Array, overlap: float) -> _Fit:
@@ -185,15 +255,15 @@ def _weigh(residual: Array, slope: Array, overlap: float) -> _Fit:
     Cauchy weights with the scale of the residuals' median. Overlapping legs count once: the information is divided by how
     many legs cover a place, and scaled by the weighted mean square of the residuals.
     """
-    scale = max(float(np.median(np.abs(residual))) * 1.4826, 1e-9)
-    weights = 1.0 / (1.0 + (residual / (CAUCHY * scale)) ** 2)
-    information = slope.T @ (weights[:, None] * slope)
-    try:
-        inverse = np.linalg.inv(information)
-    except np.linalg.LinAlgError:
-        raise EvaluationError("calibration: the drive tells neither turn nor way apart; expected one that turns") from None
+    weights = _weights(residual)
+    inverse = np.linalg.inv(slope.T @ (weights[:, None] * slope))
     independent = len(residual) / overlap
     freedom = max(independent - slope.shape[1], 1.0)
     unit_variance = float(weights @ residual**2 / weights.sum()) * independent / freedom
     step = inverse @ (slope.T @ (weights * residual))
     return _Fit(step, inverse * overlap * unit_variance, unit_variance, weights)
+
+
+def _weights(residual: Array) -> Array:
+    scale = max(float(np.median(np.abs(residual))) * 1.4826, 1e-9)
+    return np.asarray(1.0 / (1.0 + (residual / (CAUCHY * scale)) ** 2))

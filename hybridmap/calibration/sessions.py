@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.gains import GAIN_KEYS, Gains, remove
 from hybridmap.calibration.legs import Legs, Motion
-from hybridmap.calibration.regression import Sighting, regress
+from hybridmap.calibration.regression import Sighting, regress, require_leg
 from hybridmap.config import Config
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array, between
@@ -30,6 +30,7 @@ GAIN_CHANGES = "gain_changes"
 
 ESTIMATORS = ("alternating", "joint")
 
+_IN_USE = {"neural": GAIN_KEYS, "sensors": ("odometry_delay_s",)}
 _MAX_GAP_S = 1.0
 _KEY_M, _KEY_RAD = 0.25, 0.35  # travel or turn between two instants at which a reference is used
 _ROUNDS = 5
@@ -45,7 +46,7 @@ class Drive:
         graph: the accepted edges.
         stamps_ns: (N,) of the nodes.
         poses: (N, 3) of the nodes by the primary back-end.
-        config: of the session, as far as a calibration needs it: gains and back-ends.
+        config: of the session, as far as a calibration needs it: gains, delay and back-ends.
         config_tree: all of it, as it stands in the map file.
     """
 
@@ -63,7 +64,7 @@ def read_drive(folder: Path) -> Drive:
 
     Raises:
         StoreError: no session there.
-        ConfigError: its gains or back-ends are none.
+        ConfigError: its gains, delay or back-ends are none.
         EvaluationError: it holds no odometry.
     """
     SessionFolder(folder).require()
@@ -83,27 +84,86 @@ def read_drive(folder: Path) -> Drive:
 
 
 def estimate_of(
-    drives: Sequence[Drive], references: Sequence[Trajectory], estimator: str, leg_m: float | None = None
+    drives: Sequence[Drive],
+    references: Sequence[Trajectory] = (),
+    estimator: str | None = None,
+    leg_m: float | None = None,
 ) -> Estimate:
     """Calibrate drives on references, one a drive, or without any on their own maps.
 
     Args:
-        drives: of one robot, or of robots of one kind.
+        drives: of one robot, or of robots of one kind, under the same gains and delay.
         references: none, or one a drive.
-        estimator: `alternating` or `joint`; unused with references.
-        leg_m: length of the legs, m; None: by the drive.
+        estimator: `alternating` (also None) or `joint`; only without references.
+        leg_m: length of the legs, m; None: by the drive. Not for `joint`, which takes its own.
 
     Raises:
-        EvaluationError: unknown estimator, wrong number of references, or too little to go by.
+        EvaluationError: an option that is none or does not go with another, wrong number of references, a drive twice,
+            drives under different gains, or too little to go by.
         BackendError: a map cannot be optimised.
     """
+    require_options(len(drives), len(references), estimator, leg_m)
+    require_one_calibration(drives)
     if references:
-        if len(references) != len(drives):
-            raise EvaluationError(f"found {len(references)} references for {len(drives)} sessions, expected one each")
         return by_reference(drives, references, leg_m)
-    if estimator not in ESTIMATORS:
-        raise EvaluationError(f"unknown estimator {estimator!r}; there are {', '.join(ESTIMATORS)}")
     return joint_of(drives) if estimator == "joint" else alternating(drives, leg_m)
+
+
+def require_options(sessions: int, references: int, estimator: str | None, leg_m: float | None) -> None:
+    """Check what was asked for, before anything is read.
+
+    Raises:
+        EvaluationError: as `estimate_of` has it.
+    """
+    if estimator is not None and estimator not in ESTIMATORS:
+        raise EvaluationError(f"unknown estimator {estimator!r}; there are {', '.join(ESTIMATORS)}")
+    if estimator is not None and references:
+        raise EvaluationError(f"the estimator {estimator!r} is for sessions without a reference; give the one or the other")
+    if references and references != sessions:
+        raise EvaluationError(f"found {references} references for {sessions} sessions, expected one each")
+    if estimator == "joint" and sessions != 1:
+        raise EvaluationError(f"the joint estimator takes one session, found {sessions}; use `alternating` for several")
+    if estimator == "joint" and leg_m is not None:
+        raise EvaluationError("the joint estimator takes legs of its own; give --leg with `alternating` or a reference")
+    if leg_m is not None:
+        require_leg(leg_m)
+
+
+def require_one_calibration(drives: Sequence[Drive]) -> None:
+    """Refuse a recording that would count twice, and drives that no single calibration can follow on.
+
+    Raises:
+        EvaluationError: two drives are of one recording, or their gains or delays in use differ.
+    """
+    for second, drive in enumerate(drives):
+        for other in drives[:second]:
+            if _same_recording(drive.motion, other.motion):
+                raise EvaluationError(f"{drive.name}: the same drive as {other.name}; it would count twice, give it once")
+            for key, value in _in_use(other.config).items():
+                found = _in_use(drive.config)[key]
+                if found != value:
+                    raise EvaluationError(
+                        f"{drive.name}: was mapped with {key} {found:g}, {other.name} with {value:g}; expected one calibration "
+                        f"in use, calibrate them one by one or map them alike"
+                    )
+
+
+def common_tree(drives: Sequence[Drive]) -> dict[str, Any]:
+    """The configuration that all drives were mapped with.
+
+    Raises:
+        EvaluationError: they differ; the first difference is named.
+    """
+    first = _flat(drives[0].config_tree)
+    for drive in drives[1:]:
+        other = _flat(drive.config_tree)
+        for key in sorted(first.keys() | other.keys()):
+            if first.get(key) != other.get(key):
+                raise EvaluationError(
+                    f"{drive.name}: its configuration has {key} {other.get(key)!r}, that of {drives[0].name} "
+                    f"{first.get(key)!r}; expected one configuration for --out to change, leave it out or map them alike"
+                )
+    return drives[0].config_tree
 
 
 def joint_of(drives: Sequence[Drive]) -> Estimate:
@@ -115,8 +175,7 @@ def joint_of(drives: Sequence[Drive]) -> Estimate:
     """
     from hybridmap.calibration import joint
 
-    if len(drives) != 1:
-        raise EvaluationError(f"the joint estimator takes one session, found {len(drives)}; use `alternating` for several")
+    require_options(len(drives), 0, "joint", None)
     drive = drives[0]
     require_closures(drive)
     return joint.solve(drive.graph, drive.motion, drive.stamps_ns, drive.config.backends).estimate
@@ -181,17 +240,39 @@ def _regress_on(drives: Sequence[Drive], poses: Sequence[Array], leg_m: float | 
 def _optimise(drive: Drive, estimate: Estimate) -> Array:
     from hybridmap import backends
 
-    graph = corrected(drive, estimate.gains, estimate.delay_s)
+    graph = corrected(drive, estimate.kept(Gains.of(drive.config.neural)), estimate.delay_s)
     name = drive.config.backends.names[0]
     solver = backends.create("gtsam-gnc" if name == "odometry" else name, drive.config.backends)
     return solver.solve(graph).poses
 
 
 def _understood(tree: dict[str, Any], origin: str) -> Config:
-    """The gains and back-ends of a session's configuration; the rest may be of another version."""
-    gains = {key: value for key, value in (tree.get("neural") or {}).items() if key in GAIN_KEYS}
+    """The calibration and back-ends of a session's configuration; the rest may be of another version."""
+    in_use = {
+        section: {key: value for key, value in (tree.get(section) or {}).items() if key in keys}
+        for section, keys in _IN_USE.items()
+    }
     backends = {"backends": tree["backends"]} if "backends" in tree else {}
-    return Config.from_tree({"neural": gains, **backends}, origin)
+    return Config.from_tree(in_use | backends, origin)
+
+
+def _in_use(config: Config) -> dict[str, float]:
+    return {f"{section}.{key}": getattr(getattr(config, section), key) for section, keys in _IN_USE.items() for key in keys}
+
+
+def _same_recording(one: Motion, other: Motion) -> bool:
+    """Whether the shorter of two motions is the begin of the longer one."""
+    steps = min(len(one.steps), len(other.steps))
+    same = np.array_equal(one.stamps_ns[: steps + 1], other.stamps_ns[: steps + 1])
+    return same and np.allclose(one.steps[:steps], other.steps[:steps], rtol=0.0, atol=1e-6)
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mapping -> `section.key` to value."""
+    out: dict[str, Any] = {}
+    for key, value in tree.items():
+        out |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return out
 
 
 def _raw(steps: Array, stamps_ns: NDArray[np.int64], gains: Gains, changes: Sequence[Sequence[float]]) -> Array:

@@ -18,35 +18,44 @@ def calibrate(
         typer.Option(metavar="GT.tum", help="True trajectory of base_link, one a session, in the same order."),
     ] = None,
     estimator: Annotated[
-        str, typer.Option(metavar="NAME", help="Without a reference: `alternating` or `joint`.")
-    ] = "alternating",
-    leg: Annotated[float | None, typer.Option(help="Length of the compared legs, m. Default: by the drive, 1 to 16.")] = None,
+        str | None, typer.Option(metavar="NAME", help="Without a reference: `alternating` (default) or `joint`.")
+    ] = None,
+    leg: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="Length of the compared legs, m; not with `joint`. Default: by the drive, 1 to 16."),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE.yaml", help="Write the session's configuration with the gains.")
     ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
     """Linear gain, turn gain and heading bias (rad/m) of odometry, with standard deviations.
 
     What is written differs from the configuration in use only if the estimate does, by more than three sigma.
     """
-    from hybridmap.calibration.figures import calibrated, metrics_of, verdict
+    from hybridmap.calibration.figures import calibrated, changes, metrics_of, verdict
     from hybridmap.calibration.gains import Gains
-    from hybridmap.calibration.sessions import estimate_of, read_drive
+    from hybridmap.calibration.sessions import common_tree, estimate_of, read_drive, require_options
     from hybridmap.cli.show import emit
+    from hybridmap.errors import EvaluationError
     from hybridmap.trajectory import read_tum, write_text_atomic
 
+    require_options(len(folders), len(reference or []), estimator, leg)
+    if out is not None and out.exists() and (out.is_dir() or not overwrite):
+        raise EvaluationError(f"{out}: {'is a folder; name a file' if out.is_dir() else 'exists already; give --overwrite'}")
     drives = [read_drive(folder) for folder in folders]
     truths = [read_tum(path) for path in reference or []]
+    tree = {} if out is None else common_tree(drives)
     estimate = estimate_of(drives, truths, estimator, leg)
     in_use = Gains.of(drives[0].config.neural)
     if out is not None:
-        write_text_atomic(out, calibrated(drives[0].config_tree, estimate, in_use))
-    how = "reference" if truths else estimator
+        write_text_atomic(out, calibrated(tree, estimate, in_use))
+    how = "reference" if truths else estimator or "alternating"
     head = {
         "sessions": [str(folder) for folder in folders],
         "estimator": how,
-        "significant": estimate.differs(in_use),
+        "significant": changes(estimate, in_use),
         "message": verdict(estimate, in_use),
     }
     emit(head, metrics_of(estimate, in_use), as_json=as_json, title=f"{', '.join(map(str, folders))}: {how}")
