@@ -11,7 +11,8 @@ A *revisit* is a node that comes back to within 1 m and 30 degrees of a node mad
 loop edge (within 0.5 m and 10 degrees of the truth) starts within three nodes of it. An edge is *false* if the robust
 back-end gives it a weight above 0.5 and it is wrong by more than 0.5 m or 10 degrees. Errors of edges are those of all loop
 edges in the graph, right or wrong. chi2 is the median of the edges' squared errors over their own covariances, as a multiple of
-what it should be: 1 if they are calibrated, less if they claim too little.
+what it should be: 1 if they are calibrated, less if they claim too little. ms: process time a frame, by stage and in all; its bar
+is for `gtsam-isam2` alone, on 320x240 pictures at 10 Hz.
 """
 
 from __future__ import annotations
@@ -54,10 +55,10 @@ BARS: dict[str, Bar] = {
     "edge_p95_deg": Bar(1.5),
     "chi2_loop": Bar(2.0),
     "chi2_registration": Bar(2.0),
-    "ms_frame": Bar(10.0),
+    "ms_frame_isam2": Bar(10.0),
 }
 ATE_BARS_M = {"office": 0.06, "lab": 0.02}
-EVERYWHERE = ("false", "ms_frame")
+EVERYWHERE = ("false", "ms_frame_isam2")
 """Bars of every world; the others are those of office and lab."""
 LEAST_CHI2 = 0.5
 """Medians of chi2, as multiples of the expected one, lie between this and the bar."""
@@ -104,7 +105,7 @@ def figures_of(run: Run) -> dict[str, float]:
         "ate_odometry": run.ate_m("odometry"),
         **{f"ate_{name}": run.ate_m(name) for name in run.solutions if name != "odometry"},
         **{f"ms_{name}": cost[name] for name in cost},
-        "ms_frame": sum(cost.values()),
+        "ms_frame_isam2" if list(run.solutions) == ["gtsam-isam2"] else "ms_frame": sum(cost.values()),
     }
 
 

@@ -20,7 +20,7 @@ from hybridmap.vision.rgbd.stance import LevelPair, Stance, level_pair
 PLANAR = np.array([0, 1, 5])
 OUT_OF_PLANE = np.array([2, 3, 4])
 COARSE_POINTS = 400
-NEARLY_SETTLED, SETTLED = 2e-3, 1e-4
+NEARLY_SETTLED, SETTLED = 4e-3, 2e-4
 """While steps (m, rad) exceed the first, about so many points do; it ends with all of them and a step below the second."""
 LEAST_UNIT_VARIANCE = 0.1
 """Residuals are never held for better than this share of the variance that the sensor's model gives."""
