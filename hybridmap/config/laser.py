@@ -112,6 +112,8 @@ class ProbeConfig(Section):
     """Separated modes that a target may keep."""
     modes: int = Field(default=6, ge=1)
     """Modes that a probe may keep in all."""
+    modes_sure: int = Field(default=3, ge=1)
+    """The same where every gate is narrow (`commitment.sure_sigma_m`): then only one place is in question."""
     near_min: float = Field(default=0.5, gt=0, le=1)
     """Least share of the probe's points that lie near the target."""
     fit_min: float = Field(default=0.7, gt=0, le=1)

@@ -92,7 +92,8 @@ class Prober:
         candidates = sorted((k for k in candidates if k.starts), key=lambda k: -k.starts[0].score)
         modes = [mode for candidate in candidates[: c.targets] for mode in self._modes(candidate, probe)]
         modes.sort(key=lambda m: -m.score)
-        found = [self._verify(mode, probe) for mode in modes[: c.modes]]
+        sure = all(mode.gate.sigma_m < self._config.commitment.sure_sigma_m for mode in modes)
+        found = [self._verify(mode, probe) for mode in modes[: c.modes_sure if sure else c.modes]]
         return _distinct(found)
 
     def _extend_anchors(self) -> None:
