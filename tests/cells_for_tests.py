@@ -8,6 +8,7 @@ TINY = Scale(
     heading_steps=1000,
     still_steps=1000,
     overwrites=4,
+    overwritten_drives=1,
     arena_m=1.0,
     lattice_pitch_m=0.03,
     lattice_cells=1,

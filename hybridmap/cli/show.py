@@ -14,8 +14,6 @@ from hybridmap.metrics import Metric, to_json
 if TYPE_CHECKING:
     from rich.table import Table
 
-_ROUND_OFF = 1e-12  # below it a figure is shown as 0; JSON has every digit
-
 
 class Advance(Protocol):
     """Called as work gets done."""
@@ -50,8 +48,7 @@ def _value(row: Metric | None) -> str:
     if row is None:
         return ""
     verdict = "" if row.passed is None else " ✓" if row.passed else " ✗"
-    value = 0.0 if abs(row.value) < _ROUND_OFF else row.value
-    return "none" if math.isnan(value) else f"{value:.4g}{verdict}"
+    return "none" if math.isnan(row.value) else f"{row.value:.4g}{verdict}"
 
 
 def _plain_table(rows: list[Metric], title: str) -> Table:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -11,7 +12,7 @@ from hybridmap.errors import StoreError
 from hybridmap.evaluate.cells import Verification
 from hybridmap.evaluate.cells.rows import recurrence_verdict
 from hybridmap.metrics import Metric, to_json
-from hybridmap.report import tables, verify_figures
+from hybridmap.report import tables, verify_figures, verify_maps
 from hybridmap.trajectory import write_text_atomic
 
 PAGE, METRICS = "verify.html", "metrics.json"
@@ -19,12 +20,14 @@ _TEMPLATE = "verify.html.j2"
 
 
 def prepare_folder(folder: Path, *, overwrite: bool = False) -> None:
-    """Check that a verification may be written into a folder, before anything is run; makes nothing.
+    """Check that a verification may be written into a folder, before anything is run; leaves nothing.
 
     Raises:
-        StoreError: it is a file, holds something else, or holds a verification and `overwrite` is not given.
+        StoreError: it is a file, holds something else, or holds a verification and `overwrite` is not given,
+            or it cannot be written to.
     """
     if not folder.exists():
+        _try_to_write(folder)
         return
     if not folder.is_dir():
         raise StoreError(f"{folder}: is a file; expected a folder that is empty or does not exist")
@@ -34,6 +37,16 @@ def prepare_folder(folder: Path, *, overwrite: bool = False) -> None:
         raise StoreError(f"{folder}: not empty and no verification (it holds {other[0]!r}); choose another folder")
     if found and not overwrite:
         raise StoreError(f"{folder}: holds a verification already; choose another folder or give --overwrite")
+    _try_to_write(folder)
+
+
+def _try_to_write(folder: Path) -> None:
+    """Make a folder beside what will be written, and take it away again."""
+    beside = next((place for place in (folder, *folder.absolute().parents) if place.exists()), Path())
+    try:
+        Path(tempfile.mkdtemp(prefix=".hybridmap-", dir=beside)).rmdir()
+    except OSError as error:
+        raise StoreError(f"{folder}: cannot be written to: {error.strerror}") from None
 
 
 def write_verification(folder: Path, head: dict[str, Any], rows: Sequence[Metric], result: Verification) -> Path:
@@ -49,6 +62,21 @@ def write_verification(folder: Path, head: dict[str, Any], rows: Sequence[Metric
     except OSError as error:
         raise StoreError(f"{folder}: cannot be written to: {error.strerror}") from None
     return folder / PAGE
+
+
+def _scale_of(result: Verification) -> dict[str, str]:
+    """Sizes and numbers of what the captions speak of."""
+    lattice, place = result.lattice, result.place
+    noisy = next(iter(result.noise.values()))
+    return {
+        "arena_m": f"{lattice.grid.shape[-1] * lattice.pitch_m:.2g}",
+        "pixel_cm": f"{100.0 * lattice.pitch_m:.3g}",
+        "grid_cells": str(lattice.gridness.size),
+        "place_arena_m": f"{place.recruited.examples.shape[-1] * place.pitch_m:.2g}",
+        "place_pixel_cm": f"{100.0 * place.pitch_m:.3g}",
+        "noise_drives": str(len(noisy)),
+        "shift_mm": f"{1e3 * result.overwritten['softplus'].shift_m:.0f}",
+    }
 
 
 def _render(head: dict[str, Any], rows: Sequence[Metric], result: Verification) -> str:
@@ -69,15 +97,17 @@ def _render(head: dict[str, Any], rows: Sequence[Metric], result: Verification) 
         value={name: tables.number(row.value) for name, row in named.items()},
         judged=sum(row.passed is not None for row in rows),
         drives=len(first),
+        scale=_scale_of(result),
         distance=f"{first[0].distance_m[-1]:.0f}",
         verdict=recurrence_verdict(result.place),
         heading=verify_figures.heading_figure(result.head_direction),
-        stripes=verify_figures.stripes_figure(result.lattice),
-        grid=verify_figures.grid_figure(result.lattice),
-        square=verify_figures.grid_figure(result.square),
-        place=verify_figures.place_figure(result.place),
+        stripes=verify_maps.stripes_figure(result.lattice),
+        grid=verify_maps.grid_figure(result.lattice),
+        square=verify_maps.grid_figure(result.square),
+        place=verify_maps.place_figure(result.place),
         phase=verify_figures.phase_figure(result),
         modules=verify_figures.module_figure(first, result.lattice.spacings_m),
+        shadow=verify_figures.shadow_figure(result.overwritten["softplus"]),
         noise=verify_figures.noise_figure(result),
         printed_kernel=result.printed_kernel,
         version=version("hybridmap"),

@@ -3,7 +3,9 @@ import json
 import pytest
 
 from hybridmap.cli import main
+from hybridmap.cli.show import emit
 from hybridmap.evaluate import cells
+from hybridmap.metrics import Metric
 from tests.cells_for_tests import TINY
 
 
@@ -28,7 +30,7 @@ def test_verify_keeps_its_bars_and_writes_a_page_that_needs_nothing(run, tmp_pat
     assert shown["seed"] == 3
     assert json.loads((tmp_path / "cells" / "metrics.json").read_text()) == shown
     page = (tmp_path / "cells" / "verify.html").read_text()
-    assert page.count("data:image/svg+xml;base64,") == 8
+    assert page.count("data:image/svg+xml;base64,") == 9
     assert "http" not in page.replace("http-equiv", "")
     assert sorted(entry.name for entry in (tmp_path / "cells").iterdir()) == ["metrics.json", "verify.html"]
 
@@ -50,6 +52,36 @@ def test_errors_are_one_line_and_exit_code_2(run, tmp_path):
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "period-two oscillation" in err
     assert not (tmp_path / "new").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_refused_before_anything_runs(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(cells, "verify_cells", lambda *_: pytest.fail("it ran"))
+    for place in ("/proc/cells", tmp_path / "a file" / "cells"):
+        (tmp_path / "a file").write_text("")
+        code, out, err = run("--out", place)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert "cannot be written to" in err
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "spacing_min_m=1e-9", "spacing_max_m=1e9", "place.attractor_cell_m=1e-9", "kernel_widths=[1.0,1.0]",
+        "place.max_cells=1000000000", "head_direction_cells=100000000", "band_cells=1000000000",
+    ],
+)  # fmt: skip
+def test_cells_that_no_machine_could_hold_are_an_error_and_no_missed_bar(run, tmp_path, setting):
+    code, out, err = run("--out", tmp_path / "new", "--set", f"neural.{setting}")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert setting.partition("=")[0].split(".")[-1] in err
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_small_figures_are_shown_as_they_are(capsys, as_json):
+    emit({}, [Metric("verify/a", 1.7e-13, "rad", "small", 1e-9, True)], as_json=as_json)
+    shown = capsys.readouterr().out
+    assert "1.7e-13" in shown
 
 
 def test_a_verification_is_replaced_only_when_asked(run, tmp_path):

@@ -6,17 +6,12 @@ import pytest
 from hybridmap import geometry
 from hybridmap.evaluate.cells import rows_of, verify_cells
 from hybridmap.evaluate.cells.drives import corridor, pixel_order, raster, wander
-from hybridmap.evaluate.cells.rows import recurrence_verdict
+from hybridmap.evaluate.cells.rows import _change, recurrence_verdict
 from tests.cells_for_tests import TINY
 
 
 def broken(**settings):
     return {row.name: row for row in rows_of(verify_cells(3, TINY, settings))}
-
-
-@pytest.fixture(scope="module")
-def result():
-    return verify_cells(3, TINY, {})
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +25,8 @@ def test_every_row_of_the_table_is_there(rows):
         "head_direction_float64", "head_direction_float32", "band_orientation", "band_period", "gridness",
         "phase_error_relu_30hz", "phase_error_relu_100hz", "phase_error_softplus_30hz", "phase_error_softplus_100hz",
         "position_room_relu", "position_room_softplus", "position_corridor_relu", "position_corridor_softplus",
-        "no_shadow_integrator", "place_single_recruited", "standing_still", "printed_kernel_refused",
+        "no_shadow_integrator", "no_shadow_driving_on", "place_single_recruited", "attractor_one_bump_recruited_settled",
+        "attractor_one_bump_printed_settled", "standing_still", "printed_kernel_refused",
     }  # fmt: skip
     assert {"gridness_ideal", "gridness_square", "place_single_printed", "noise_1_percent", "turn_rate_modulation"} <= set(rows)
 
@@ -53,6 +49,9 @@ def test_recurrence_is_stated_whichever_way_it_comes_out(result):
     assert "printed rule" in text
     settled = dataclasses.replace(result.place, sheet=dict.fromkeys(result.place.sheet, result.place.recruited))
     assert recurrence_verdict(settled).count("does not change") == 2
+    assert [_change(percent) for percent in (0.4, 1.0, -4.9, 6.0, -6.0)] == [
+        "does not change", "hardly changes", "hardly changes", "raises", "lowers",
+    ]  # fmt: skip
 
 
 @pytest.mark.slow

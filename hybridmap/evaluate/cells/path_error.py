@@ -63,9 +63,14 @@ def corridor_errors(seed: np.random.SeedSequence, settings: dict[str, object]) -
     return path_errors(NeuralConfig.model_validate(settings), corridor(np.random.default_rng(seed), 30.0))
 
 
-def noise_errors(seed: np.random.SeedSequence, settings: dict[str, object], noise: float, distance_m: float) -> PathErrors:
+def noise_errors(
+    drive_seed: np.random.SeedSequence,
+    noise_seed: np.random.SeedSequence,
+    settings: dict[str, object],
+    noise: float,
+    distance_m: float,
+) -> PathErrors:
     """Errors of cells with multiplicative neuron noise in every population, on a drive through the room, 30 Hz."""
-    drive_seed, noise_seed = seed.spawn(2)
     drive = wander(np.random.default_rng(drive_seed), distance_m, 30.0)
     config = NeuralConfig.model_validate(settings | {"neuron_noise": noise})
     return path_errors(config, drive, np.random.default_rng(noise_seed))
@@ -80,7 +85,7 @@ class HeadDirectionResult:
         preferred_rad: (m,) preferred directions.
         tuning: (6, 360) rates of six cells at headings of 0 to 359 degrees.
         turn_rates_rad_s: (R,) turn rates of `rates`.
-        rates: (R, m) rates at those turn rates.
+        rates: (R, m) rates shown at those turn rates (`HeadDirectionRing.rates`; no other cell sees them).
     """
 
     error_rad: dict[str, float]
@@ -90,16 +95,17 @@ class HeadDirectionResult:
     rates: Array
 
 
-def head_direction(seed: np.random.SeedSequence, steps: int) -> HeadDirectionResult:
+def head_direction(seed: np.random.SeedSequence, settings: dict[str, object], steps: int) -> HeadDirectionResult:
     """Turn rings of both precisions by the same random turns and compare with their sum."""
     turns = np.random.default_rng(seed).normal(0.002, 0.02, steps)
+    cells = NeuralConfig.model_validate(settings).head_direction_cells
     errors = {}
     for dtype in ("float64", "float32"):
-        ring = HeadDirectionRing(NeuralConfig().head_direction_cells, np.dtype(dtype))
+        ring = HeadDirectionRing(cells, np.dtype(dtype))
         for turn in turns:
             ring.turn(float(turn))
         errors[dtype] = abs(float(geometry.wrap_angle(ring.heading_rad - turns.sum())))
-    ring = HeadDirectionRing(NeuralConfig().head_direction_cells)
+    ring = HeadDirectionRing(cells)
     tuning = []
     for _ in range(360):
         tuning.append(ring.activity[:: len(ring.activity) // 6][:6].copy())
@@ -139,23 +145,3 @@ def standstill(seed: np.random.SeedSequence, settings: dict[str, object], steps:
             integrator.grid.step(motion.advance, motion.phasors)
         ungated[rectifier] = float(integrator.module_errors(drive.poses[-1]).max())
     return StandstillResult(change, ungated)
-
-
-def overwritten(seed: np.random.SeedSequence, settings: dict[str, object], draws: int) -> Array:
-    """Overwrite the sheets with themselves shifted: how far the pose misses that shift (draws,), in finest spacings."""
-    from hybridmap.neural.torus import shift_sheets
-
-    rng = np.random.default_rng(seed)
-    misses = np.zeros(draws)
-    integrator = PathIntegrator(NeuralConfig.model_validate(settings))
-    for delta in wander(rng, 3.0, 30.0).deltas:
-        integrator.step(delta, 1.0 / 30.0)
-    sheets = integrator.grid.activity.copy()
-    for draw in range(draws):
-        integrator.grid.activity = sheets
-        before, way = integrator.pose, rng.uniform(-0.6, 0.6, 2)
-        shift = integrator.bands.wave_vectors[:, [0, 2]] @ way
-        integrator.grid.activity = shift_sheets(sheets, shift)
-        moved = integrator.pose - before
-        misses[draw] = float(np.hypot(*(moved[:2] - way)) / integrator.spacings_m.min())
-    return misses

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,12 +106,14 @@ class PlaceResult:
         pitch_m: side of a pixel.
         recruited, printed: fields of the place cells: with recruitment; by the printed rule from random weights.
         sheet: fields of the attractor's cells, by (`recruited` or `printed`, `input` or `settled`).
+        one_bump: share of the places at which the sheet holds a single bump, by the same.
     """
 
     pitch_m: float
     recruited: PlaceMaps
     printed: PlaceMaps
     sheet: dict[tuple[str, str], PlaceMaps]
+    one_bump: dict[tuple[str, str], float]
 
 
 def place_maps(
@@ -136,14 +139,15 @@ def place_maps(
     for _ in range(epochs):
         for drive_input in learnt[rng.permutation(len(learnt))]:
             printed.learn(drive_input)
-    maps, sheet = {}, {}
+    maps, sheet, one_bump = {}, {}, {}
     for name, population in (("recruited", integrator.place), ("printed", printed)):
         rates = population.respond(seen.T)
         maps[name] = _population(_as_maps(rates, order, count))
         shown = _onto_sheet(population.respond(learnt.T), bump, rates)
         for stage, activity in (("input", shown), ("settled", _settled(integrator, shown))):
             sheet[name, stage] = _population(_as_maps(activity, order, count), floor=_FIRING)
-    return PlaceResult(pitch_m, maps["recruited"], maps["printed"], sheet)
+            one_bump[name, stage] = one_bump_share(activity)
+    return PlaceResult(pitch_m, maps["recruited"], maps["printed"], sheet, one_bump)
 
 
 class PrintedRule:
@@ -199,6 +203,20 @@ def _settled(integrator: PathIntegrator, shown: NDArray[np.float32]) -> NDArray[
         attractor.settle(_SETTLING_STEPS)
         settled[:, pixel] = attractor.activity.ravel()
     return settled
+
+
+def one_bump_share(activity: NDArray[np.float32]) -> float:
+    """Share of the places, of those at which a square torus of cells (N * N, P) is active, with a single bump on it.
+
+    A bump is a cell that no other within two cells exceeds, above 20 % of the highest.
+    """
+    from scipy import ndimage
+
+    side = math.isqrt(len(activity))
+    sheets = activity[:, activity.any(axis=0)].reshape(side, side, -1)
+    highest = ndimage.maximum_filter(sheets, size=(5, 5, 1), mode="wrap")
+    bumps = ((sheets == highest) & (sheets > _FIRING * sheets.max(axis=(0, 1)))).sum(axis=(0, 1))
+    return float((bumps == 1).mean()) if bumps.size else float("nan")
 
 
 def _as_maps(rates: NDArray[np.float32], order: NDArray[np.int64], count: int) -> NDArray[np.float32]:

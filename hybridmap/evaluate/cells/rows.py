@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from hybridmap.evaluate.cells.path_error import PathErrors
 from hybridmap.evaluate.cells.physiology import gridness, ideal_map
 from hybridmap.evaluate.cells.rate_maps import PlaceResult
+from hybridmap.evaluate.cells.shadow import STEPS_ON
 from hybridmap.evaluate.cells.verification import Verification
+from hybridmap.geometry import Array
 from hybridmap.metrics import Metric
 
-_PHASE_BAR_PERCENT = {"relu": 0.6, "softplus": 0.02}
+PHASE_BAR_PERCENT = {"relu": 0.6, "softplus": 0.02}
+ROOM_BAR_MM, CORRIDOR_BAR_MM = 0.5, 0.1
+_SHADOW_BAR = 1e-6
+_ONE_BUMP_BAR_PERCENT = 99.0
+_LEARNT = {"recruited": "recruited place cells", "printed": "place cells by the printed rule"}
 _AT_MOST, _AT_LEAST = "at most", "at least"
 
 
@@ -51,7 +59,12 @@ def head_direction_rows(result: Verification) -> list[Metric]:
             "head_direction_float64", heading.error_rad["float64"], "rad", "decoded heading against the sum of the turns", 1e-9
         ),
         _row("head_direction_float32", heading.error_rad["float32"], "rad", "the same in float32", 1e-3),
-        _row("turn_rate_modulation", gain, "1", f"peak rate at {fastest:g} rad/s over that at rest"),
+        _row(
+            "turn_rate_modulation",
+            gain,
+            "1",
+            f"peak rate shown at {fastest:g} rad/s over that at rest; for display, no other cell sees it",
+        ),
     ]
 
 
@@ -90,7 +103,7 @@ def phase_rows(result: Verification) -> list[Metric]:
             100.0 * max(float(path.module.max()) for path in paths),
             "%",
             f"of the spacing: worst module on {len(paths)} drives of {paths[0].distance_m[-1]:.0f} m",
-            _PHASE_BAR_PERCENT[rectifier],
+            PHASE_BAR_PERCENT[rectifier],
         )
         for (rectifier, hz), paths in result.room.items()
     ]
@@ -103,20 +116,30 @@ def position_rows(result: Verification) -> list[Metric]:
         drives = [path for (f, _), paths in result.room.items() if f == rectifier for path in paths]
         room = 1e3 * max(float(path.position_m.max()) for path in drives)
         what = f"all modules together, largest error on {len(drives)} drives in 10 x 3 m"
-        rows.append(_row(f"position_room_{rectifier}", room, "mm", what, 0.5))
+        rows.append(_row(f"position_room_{rectifier}", room, "mm", what, ROOM_BAR_MM))
         down = 1e3 * float(corridor.position_m.max())
-        rows.append(_row(f"position_corridor_{rectifier}", down, "mm", "the same down a 16.8 m corridor", 0.1))
+        rows.append(_row(f"position_corridor_{rectifier}", down, "mm", "the same down a 16.8 m corridor", CORRIDOR_BAR_MM))
     return rows
 
 
 def shadow_rows(result: Verification) -> list[Metric]:
-    """Whether an overwritten activity moves the pose by exactly that."""
-    what = "spacings by which the pose misses a shift written into the sheets"
-    smooth, rectified = (float(result.overwritten[f].max()) for f in ("softplus", "relu"))
-    return [
-        _row("no_shadow_integrator", smooth, "1", f"{what}, softplus", 1e-6),
-        _row("no_shadow_integrator_relu", rectified, "1", f"{what}, relu"),
+    """Whether an overwritten activity moves the pose by exactly that, and which cells hold the position."""
+    at_once = "spacings by which the pose misses a shift written into the sheets"
+    on = f"the same with rings and sheets shifted together, largest over {STEPS_ON} steps of driving on"
+    rows = [
+        row
+        for rectifier, ending, bar in (("softplus", "", _SHADOW_BAR), ("relu", "_relu", None))
+        for row in (
+            _row(f"no_shadow_integrator{ending}", float(result.overwritten[rectifier].at_once.max()), "1", at_once, bar),
+            _row(f"no_shadow_driving_on{ending}", result.overwritten[rectifier].driving_on, "1", on, bar),
+        )
     ]
+    shown, shift_mm = result.overwritten["softplus"].shown, 1e3 * result.overwritten["softplus"].shift_m
+    for stripes, ending, how in ((True, "", ""), (False, "_without_stripes", " (band_drive 0)")):
+        for cells in ("sheets", "rings"):
+            what = f"of {shift_mm:.0f} mm written into the {cells} alone is in the pose {STEPS_ON} steps later{how}, softplus"
+            rows.append(_row(f"shift_of_{cells}{ending}", 100.0 * float(shown[cells, stripes][-1]), "%", what))
+    return rows
 
 
 def place_rows(result: Verification) -> list[Metric]:
@@ -132,26 +155,37 @@ def place_rows(result: Verification) -> list[Metric]:
 
 def recurrence_rows(result: Verification) -> list[Metric]:
     """What settled recurrent competition on the attractor's sheet adds, whichever way it comes out."""
-    rows = []
-    for learnt, cells in (("recruited", "recruited place cells"), ("printed", "place cells by the printed rule")):
+    rows, place = [], result.place
+    for learnt, cells in _LEARNT.items():
         for stage, how in (("input", "without competition"), ("settled", "after settled competition")):
-            share = 100.0 * result.place.sheet[learnt, stage].single
+            bumps = f"of the places at which the attractor's sheet holds one bump, {how}, driven by {cells}"
+            bar = _ONE_BUMP_BAR_PERCENT if stage == "settled" else None
+            one_bump = 100.0 * place.one_bump[learnt, stage]
+            rows.append(_row(f"attractor_one_bump_{learnt}_{stage}", one_bump, "%", bumps, bar, _AT_LEAST))
             what = f"of the attractor's cells have one field, {how}, driven by {cells}"
-            rows.append(_row(f"attractor_single_{learnt}_{stage}", share, "%", what))
+            rows.append(_row(f"attractor_single_{learnt}_{stage}", 100.0 * place.sheet[learnt, stage].single, "%", what))
     return rows
 
 
 def recurrence_verdict(place: PlaceResult) -> str:
     """In words: what recurrence adds."""
     sentences = []
-    for learnt, cells in (("recruited", "recruited place cells"), ("printed", "place cells by the printed rule")):
+    for learnt, cells in _LEARNT.items():
         before, after = (100.0 * place.sheet[learnt, stage].single for stage in ("input", "settled"))
-        change = "raises" if after > before + 1.0 else "lowers" if after < before - 1.0 else "does not change"
+        several, one = (100.0 * place.one_bump[learnt, stage] for stage in ("input", "settled"))
         sentences.append(
-            f"Behind {cells}, settled competition {change} the share of the attractor's cells with a single field "
-            f"({before:.0f} % before, {after:.0f} % after)."
+            f"Behind {cells}, settled competition {_change(after - before)} the share of the attractor's cells with a single "
+            f"field ({before:.1f} % before, {after:.1f} % after). The sheet holds one bump at a time in {several:.1f} % of the "
+            f"places before and in {one:.1f} % after."
         )
     return " ".join(sentences)
+
+
+def _change(percent: float) -> str:
+    """The verb for a change by some per cent of all cells."""
+    if abs(percent) < 0.5:
+        return "does not change"
+    return "hardly changes" if abs(percent) < 5.0 else "raises" if percent > 0.0 else "lowers"
 
 
 def standstill_rows(result: Verification) -> list[Metric]:
@@ -168,17 +202,37 @@ def noise_rows(result: Verification) -> list[Metric]:
     """Where noisy neurons lead."""
     rows = []
     for share, drives in result.noise.items():
-        distance, error = noise_curve(drives)
-        what = f"RMS position error after {distance[-1]:.0f} m with {100.0 * share:g} % noise on every rate, every step"
-        rows.append(_row(f"noise_{100.0 * share:g}_percent", float(error[-1]), "m", what))
+        curve = noise_curve(drives)
+        low, high = curve.quartiles[:, -1]
+        what = (
+            f"RMS position error of {len(drives)} drives after {curve.distance_m[-1]:.0f} m with {100.0 * share:g} % noise on "
+            f"every rate, every step; half of them between {low:.3g} and {high:.3g} m"
+        )
+        rows.append(_row(f"noise_{100.0 * share:g}_percent", float(curve.rms[-1]), "m", what))
     return rows
 
 
-def noise_curve(drives: Sequence[PathErrors]) -> tuple[np.ndarray, np.ndarray]:
-    """RMS position error (S,), m, over the drives, at the distances (S,) they have in common."""
+@dataclass(frozen=True, slots=True)
+class NoiseCurve:
+    """Errors of several drives over distance.
+
+    Attributes:
+        distance_m: (S,) that all drives have in common.
+        rms: (S,) over the drives.
+        quartiles: (2, S) between which half of the drives are.
+    """
+
+    distance_m: Array
+    rms: Array
+    quartiles: Array
+
+
+def noise_curve(drives: Sequence[PathErrors], what: Literal["position_m", "heading_rad"] = "position_m") -> NoiseCurve:
+    """Position errors, m, or heading errors, rad, of drives with noise."""
     count = min(len(drive.distance_m) for drive in drives)
-    squares = np.array([drive.position_m[:count] ** 2 for drive in drives])
-    return drives[0].distance_m[:count], np.sqrt(squares.mean(axis=0))
+    errors = np.array([getattr(drive, what)[:count] for drive in drives])
+    rms = np.sqrt((errors**2).mean(axis=0))
+    return NoiseCurve(drives[0].distance_m[:count], rms, np.quantile(errors, (0.25, 0.75), axis=0))
 
 
 def kernel_rows(result: Verification) -> list[Metric]:

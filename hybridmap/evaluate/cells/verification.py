@@ -15,10 +15,10 @@ import numpy as np
 
 from hybridmap.config.neural import NeuralConfig
 from hybridmap.errors import ConfigError
-from hybridmap.evaluate.cells import path_error, rate_maps
+from hybridmap.evaluate.cells import path_error, rate_maps, shadow
 from hybridmap.evaluate.cells.path_error import HeadDirectionResult, PathErrors, StandstillResult
 from hybridmap.evaluate.cells.rate_maps import LatticeMaps, PlaceResult
-from hybridmap.geometry import Array
+from hybridmap.evaluate.cells.shadow import Overwriting
 from hybridmap.neural import PathIntegrator
 
 RECTIFIERS = ("relu", "softplus")
@@ -32,6 +32,7 @@ class Scale:
     Attributes:
         paths: drives through the room, each of `distance_m`, at each rate with each rectifier.
         heading_steps, still_steps, overwrites: numbers of steps and of draws.
+        overwritten_drives: directions in which cells are shifted before driving on.
         arena_m, lattice_pitch_m, lattice_cells: side and pixel of the grid cells' arena, sampled cells a module.
         place_pitch_m, place_cells, place_epochs: pixel of the place cells' maps; cells and passes of the printed rule.
         noise: standard deviations of the neuron noise; `noise_repeats` drives of `noise_distance_m` for each.
@@ -43,6 +44,7 @@ class Scale:
     heading_steps: int = 24_000
     still_steps: int = 100_000
     overwrites: int = 20
+    overwritten_drives: int = 2
     arena_m: float = 1.6
     lattice_pitch_m: float = 0.0125
     lattice_cells: int = 6
@@ -50,8 +52,8 @@ class Scale:
     place_cells: int = 512
     place_epochs: int = 10
     noise: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1)
-    noise_repeats: int = 3
-    noise_distance_m: float = 60.0
+    noise_repeats: int = 12
+    noise_distance_m: float = 40.0
     workers: int | None = None
 
 
@@ -65,7 +67,7 @@ class Verification:
         place: place fields.
         room: errors of every drive through the room, by (rectifier, rate in Hz).
         corridor: errors down the corridor, by rectifier.
-        overwritten: how far the pose misses an overwritten shift, in finest spacings, by rectifier.
+        overwritten: what the pose shows of a shift written into cells, by rectifier.
         noise: errors of every drive with neuron noise, by its standard deviation.
         printed_kernel: what the cells say of the printed kernel; empty if they accept it.
     """
@@ -77,7 +79,7 @@ class Verification:
     place: PlaceResult
     room: dict[tuple[str, float], list[PathErrors]] = field(default_factory=dict)
     corridor: dict[str, PathErrors] = field(default_factory=dict)
-    overwritten: dict[str, Array] = field(default_factory=dict)
+    overwritten: dict[str, Overwriting] = field(default_factory=dict)
     noise: dict[float, list[PathErrors]] = field(default_factory=dict)
     printed_kernel: str = ""
 
@@ -129,14 +131,19 @@ def _tasks(seed: np.random.SeedSequence, scale: Scale, settings: dict[str, objec
     )
     tasks["lattice",] = rate_maps.lattice_maps, (lattice, settings, scale.arena_m, pitch, cells)
     tasks["square",] = rate_maps.lattice_maps, (square, settings | {"metric": "square"}, scale.arena_m, pitch, cells)
-    for share, share_seed in zip(scale.noise, noises.spawn(len(scale.noise)), strict=True):
-        for k, one in enumerate(share_seed.spawn(scale.noise_repeats)):
-            tasks["noise", share, k] = path_error.noise_errors, (one, settings, share, scale.noise_distance_m)
+    for k, one in enumerate(noises.spawn(scale.noise_repeats)):
+        drive_seed, noise_seed = one.spawn(2)
+        for share in scale.noise:  # the same drives and draws for all, so that what differs is the noise
+            arguments = (drive_seed, noise_seed, settings, share, scale.noise_distance_m)
+            tasks["noise", share, k] = path_error.noise_errors, arguments
     tasks["standstill",] = path_error.standstill, (still, settings, scale.still_steps)
-    tasks["head_direction",] = path_error.head_direction, (turns, scale.heading_steps)
+    tasks["head_direction",] = path_error.head_direction, (turns, settings, scale.heading_steps)
     for f in RECTIFIERS:
         tasks["corridor", f] = path_error.corridor_errors, (corridor, settings | {"rectifier": f})
-        tasks["overwritten", f] = path_error.overwritten, (overwritten, settings | {"rectifier": f}, scale.overwrites)
+        tasks["overwritten", f] = (
+            shadow.overwritten,
+            (overwritten, settings | {"rectifier": f}, scale.overwrites, scale.overwritten_drives),
+        )
     tasks["printed_kernel",] = printed_kernel, (settings,)
     return tasks
 
