@@ -39,6 +39,7 @@ _SAME_RAD_M = 2e-4
 _OPEN_WAY = 0.1  # share of the way that only odometry spans; below it no winding of the chain is in doubt
 _PRIOR = np.array([0.2, 0.2, 0.2, 0.2])  # so wide that it only holds what the drive leaves open
 _OPEN = 0.5  # of the prior's variance that is left: above it, the prior says more than the drive does
+_HELD = 3  # edges besides odometry: nine equations for four unknowns
 _NEUTRAL = np.append(NEUTRAL.to_array(), 0.0)
 _ITERATIONS = 60
 _MEDIAN_OF_NORM = {2: 1.1774, 3: 1.5382}  # median of the norm of so many standard normal components
@@ -94,6 +95,7 @@ def solve(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config
     variable = np.append(best.estimate.gains.to_array(), best.estimate.delay_s)
     scale = problem.scale(best.poses, variable)
     final = problem.solve(best.poses, variable, scale, best.bias_start_rad_m) or best
+    problem.require_held(final.poses)
     return replace(final, estimate=_told(final.estimate))
 
 
@@ -169,6 +171,28 @@ class _Problem:
         expected = np.array([_MEDIAN_OF_NORM[rows] for rows in self.terms.components])
         return max(float(np.median(norms / expected)), 1e-3)
 
+    def require_held(self, poses: Array) -> None:
+        """Refuse a map that dropped nearly all that could contradict its calibration.
+
+        Raises:
+            NotToldError: fewer than three edges besides odometry count at least half on it.
+        """
+        graph = self.graph.with_edges(self._others())
+        off = compose(inverse(graph.deltas), between(poses[graph.sources], poses[graph.targets]))
+        squared = np.einsum("ei,eij,ej->e", off, graph.information, off)
+        held = int(np.count_nonzero(squared <= self.config.robust.cauchy_scale**2))
+        if held < _HELD:
+            raise NotToldError(
+                f"calibration: found {held} of {graph.n_edges} loop closures that hold on the map, expected {_HELD} or more; "
+                f"give a drive that comes back to more places"
+            )
+
+    def _others(self) -> NDArray[np.bool_]:
+        """(E,) the edges that are no odometry between consecutive nodes."""
+        others = np.ones(self.graph.n_edges, dtype=bool)
+        others[self.own] = False
+        return others
+
     def _residuals(self, poses: Array, variable: Array) -> Array:
         predicted, _ = self.evaluate(variable)
         apart = between(poses[self.terms.sources], poses[self.terms.targets])
@@ -207,11 +231,9 @@ class _Problem:
 
     def _factors(self) -> Any:
         loops = gtsam.noiseModel.mEstimator.Cauchy.Create(self.config.robust.cauchy_scale)
-        others = np.ones(self.graph.n_edges, dtype=bool)
-        others[self.own] = False
         models = NoiseModels(lambda base: gtsam.noiseModel.Robust.Create(loops, base))
         out = gtsam.NonlinearFactorGraph()
-        for factor in factors(self.graph.with_edges(others), models):
+        for factor in factors(self.graph.with_edges(self._others()), models):
             out.push_back(factor)
         kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY)
         unit = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Unit.Create(3))

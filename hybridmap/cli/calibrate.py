@@ -22,7 +22,7 @@ def calibrate(
     ] = None,
     leg: Annotated[
         float | None,
-        typer.Option(min=0.1, help="Length of the compared legs, m; not with `joint`. Default: by the drive, 1 to 16."),
+        typer.Option(help="Length of the compared legs, m, 0.1 or more; not with `joint`. Default: by the drive, 1 to 16."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE.yaml", help="Write the session's configuration with the gains.")

@@ -49,6 +49,18 @@ def drive(rng, laps=4, gains=GAINS, noise=1.0, drop_outs=0):
     return Drive(chain(true), Motion(stamps, raw))
 
 
+def along(rng, steps, noise=1.0):
+    """A drive of given true steps (S, 3), its odometry right but for `noise` as in `drive`."""
+    true = np.asarray(steps, dtype=np.float64)
+    raw = true + noise * rng.normal(size=true.shape) * [0.002, 0.0, np.radians(0.4) * np.sqrt(0.05)]
+    return Drive(chain(true), Motion(np.arange(len(true) + 1) * STEP_NS + 7, raw))
+
+
+def circle(rng, step_m=0.02, turn_rad=0.05, steps=2000, noise=1.0):
+    """Round and round at one speed and one rate of turn: bias and turn gain do the same."""
+    return along(rng, [(step_m, 0.0, turn_rad)] * steps, noise)
+
+
 def sighting(one, rng=None, every=10, delay_s=0.0):
     """The true poses every second; with noise of 1 cm and 0.3 deg, stamped late by a delay."""
     chosen = np.arange(every, len(one.truth) - every, every)
@@ -92,7 +104,7 @@ def _seen_again(truth, number, registered):
         yield int(np.flatnonzero(near)[0]), EdgeKind.LOOP
 
 
-def write_session(folder, one, rng, registered=True, gains=None, changes=(), poses=None):
+def write_session(folder, one, rng, registered=True, gains=None, changes=(), poses=None, sensors="{}"):
     """A session folder around a drive; the stored odometry is what the given gains make of the raw one."""
     from hybridmap.backends.base import SolveReport, SolveStatus
     from hybridmap.calibration.gains import NEUTRAL, apply
@@ -108,6 +120,7 @@ def write_session(folder, one, rng, registered=True, gains=None, changes=(), pos
     config = (
         f"neural: {{gain: {used.gain}, turn_gain: {used.turn_gain}, heading_bias_rad_m: {used.heading_bias_rad_m}}}\n"
         "backends: {names: [gtsam-cauchy]}\n"
+        f"sensors: {sensors}\n"
     )
     session = SessionFolder(folder)
     session.prepare()

@@ -5,11 +5,13 @@ import pytest
 
 from hybridmap import backends
 from hybridmap.calibration import joint
+from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.gains import Gains
 from hybridmap.calibration.odometry_terms import own_edges, terms_of
 from hybridmap.config.backends import BackendsConfig
+from hybridmap.errors import EvaluationError
 from hybridmap.geometry import align, transform_points
-from tests.calibration.drives import drive, experience_map
+from tests.calibration.drives import circle, drive, experience_map
 
 CONFIG = BackendsConfig()
 BENT = Gains(1.0, 1.0, 0.06)
@@ -35,6 +37,44 @@ def test_it_solves_a_chain_that_a_robust_back_end_does_not(bent):
     assert ate(found.poses, truth) < 0.3
     alone = backends.create("gtsam-cauchy", CONFIG).solve(graph).poses
     assert ate(found.poses, truth) < 0.5 * ate(alone, truth)
+
+
+def test_a_start_of_the_bias_other_than_none_finds_what_none_misses():
+    """With 8 deg/m the chain grown without a bias winds once too often, and its optimum is another map."""
+    rng, very_bent = np.random.default_rng(3), Gains(1.0, 1.0, 0.14)
+    one = drive(rng, laps=3, gains=very_bent)
+    experiences, chosen = experience_map(one, rng, every=20)
+    found = joint.solve(experiences.pose_graph(), one.motion, one.motion.stamps_ns[chosen], CONFIG)
+    assert found.bias_start_rad_m != 0.0
+    assert found.estimate.gains.heading_bias_rad_m == pytest.approx(very_bent.heading_bias_rad_m, abs=0.006)
+    assert ate(found.poses, one.truth[chosen]) < 0.3
+
+
+def test_a_map_that_drops_its_loops_calibrates_nothing():
+    """Of two loops one is dropped, and the other alone would give a turn gain of 1.2987 +- 0.0004."""
+    rng = np.random.default_rng(3)
+    one = drive(rng, laps=2, gains=BENT)
+    experiences, chosen = experience_map(one, rng, every=20)
+    with pytest.raises(EvaluationError, match=r"found 1 of 2 loop closures that hold on the map, expected 3 or more"):
+        joint.solve(experiences.pose_graph(), one.motion, one.motion.stamps_ns[chosen], CONFIG)
+
+
+def test_a_circle_is_refused_before_anything_is_solved():
+    one = circle(np.random.default_rng(0))
+    experiences, chosen = experience_map(one, np.random.default_rng(0), every=20, registered=True)
+    with pytest.raises(EvaluationError, match="does not tell turn gain and heading bias apart"):
+        joint.solve(experiences.pose_graph(), one.motion, one.motion.stamps_ns[chosen], CONFIG)
+
+
+def test_what_the_drive_leaves_open_is_the_prior_and_not_reported():
+    """The variance that is left of the prior says so."""
+    covariance = np.diag(joint._PRIOR**2 * [0.9, 0.01, 0.01, 0.9])
+    estimate = joint._told(Estimate(Gains(1.02, 1.01, 0.01), 0.05, covariance, 4.0, 20.0, 80.0, 1.0, 0.0))
+    assert estimate.measured.tolist() == [False, True, True, False]
+    assert (estimate.gains, estimate.delay_s) == (Gains(1.0, 1.01, 0.01), 0.0)
+    open_ = np.diag(joint._PRIOR**2 * [0.01, 0.01, 0.9, 0.01])
+    with pytest.raises(EvaluationError, match="tell neither turn gain nor heading bias"):
+        joint._told(Estimate(Gains(1.02, 1.01, 0.01), 0.05, open_, 4.0, 20.0, 80.0, 1.0, 0.0))
 
 
 def test_registrations_leave_no_winding_in_doubt_and_long_legs_enter():

@@ -5,6 +5,7 @@ import logging
 import numpy as np
 import pytest
 
+from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.gains import NEUTRAL, Gains, remove
 from hybridmap.calibration.online import OnlineCalibration
 from hybridmap.config import Config
@@ -45,6 +46,22 @@ def test_a_clear_error_is_corrected_and_said(caplog):
     assert changes[-1].gains.heading_bias_rad_m == pytest.approx(GAINS.heading_bias_rad_m, abs=0.01)
     assert caplog.text.count("odometry gains changed") == len(changes)
     assert len(changes) <= 3  # once it is right there is nothing more to say
+
+
+def test_a_gain_that_was_not_measured_stays_and_is_not_said(monkeypatch):
+    from hybridmap.calibration import online
+
+    covariance = np.diag([np.inf, 1e-6, 1e-6, 1e-4])
+    estimate = Estimate(Gains(1.0, 0.9, 0.02), 0.0, covariance, 4.0, 20.0, 80.0, 1.0, 0.0)
+    monkeypatch.setattr(online, "regress", lambda _: estimate)
+    stage = OnlineCalibration(ON, Gains(1.05, 1.0, 0.0))
+    rng = np.random.default_rng(0)
+    graph = experience_map(drive(rng, laps=1), rng, registered=True)[0].pose_graph()
+    for k in range(100):
+        stage.observe(k * STEP_NS, np.array([1.0, 0.0, 0.0]))
+    change = stage.follow(100 * STEP_NS, lambda: graph, lambda: graph.initial)
+    assert change.gains == Gains(1.05, 0.9, 0.02)
+    assert str(change) == "odometry gains changed: turn gain 0.9000 +- 0.0010, heading bias 0.0200 +- 0.0010"
 
 
 def test_right_odometry_is_left_alone():

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.gains import NEUTRAL, Gains
-from hybridmap.calibration.sessions import alternating, by_reference, corrected, estimate_of, read_drive
+from hybridmap.calibration.sessions import alternating, by_reference, common_tree, corrected, estimate_of, read_drive
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import between
 from hybridmap.trajectory import Trajectory
@@ -68,3 +69,47 @@ def test_a_reference_of_another_clock_is_refused(one, tmp_path):
     far = Trajectory(one.motion.stamps_ns + 10**15, one.truth)
     with pytest.raises(EvaluationError, match="on the same clock"):
         by_reference([read], [far])
+
+
+def test_a_drive_given_twice_is_refused_even_as_a_copy_or_under_other_gains(one, tmp_path):
+    """Twice the same would count double: sigmas smaller by sqrt(2) for nothing."""
+    read = [read_drive(write_session(tmp_path / name, one, np.random.default_rng(0))) for name in ("a", "copy")]
+    part = type(one)(one.truth[:801], type(one.motion)(one.motion.stamps_ns[:801], one.motion.steps[:800]))
+    beginning = read_drive(write_session(tmp_path / "part", part, np.random.default_rng(0), gains=Gains(1.1, 1.0, 0.0)))
+    for second in (read[0], read[1], beginning):
+        with pytest.raises(EvaluationError, match=r"the same drive as .*/a; it would count twice"):
+            estimate_of([read[0], second])
+
+
+def test_drives_under_other_gains_or_delays_are_refused(one, tmp_path):
+    other = drive(np.random.default_rng(6))
+    first = read_drive(write_session(tmp_path / "a", one, np.random.default_rng(0)))
+    regained = read_drive(write_session(tmp_path / "b", other, np.random.default_rng(0), gains=Gains(1.1, 1.0, 0.0)))
+    delayed = read_drive(write_session(tmp_path / "c", other, np.random.default_rng(0), sensors="{odometry_delay_s: 0.1}"))
+    with pytest.raises(EvaluationError, match=r"/b: was mapped with neural\.gain 1\.1, .*/a with 1; expected one calibration"):
+        estimate_of([first, regained])
+    with pytest.raises(EvaluationError, match=r"/c: was mapped with sensors\.odometry_delay_s 0\.1, .*/a with 0"):
+        estimate_of([first, delayed])
+
+
+def test_drives_of_two_configurations_have_none_in_common(one, tmp_path):
+    first = read_drive(write_session(tmp_path / "a", one, np.random.default_rng(0)))
+    second = read_drive(write_session(tmp_path / "b", one, np.random.default_rng(0), sensors="{range_max_m: 9.0}"))
+    assert common_tree([first, first]) == first.config_tree
+    with pytest.raises(EvaluationError, match=r"/b: its configuration has sensors\.range_max_m 9\.0, that of .*/a None"):
+        common_tree([first, second])
+
+
+def test_a_gain_that_was_not_measured_stays_in_use_on_the_map_too(tmp_path, monkeypatch):
+    from hybridmap.calibration import sessions
+
+    estimate = Estimate(Gains(1.0, 0.97, -0.04), 0.0, np.diag([np.inf, 1e-6, 1e-6, 1e-4]), 4.0, 20.0, 80.0, 1.0, 0.0)
+    rng = np.random.default_rng(0)
+    read = read_drive(write_session(tmp_path / "s", drive(rng, laps=2), rng, gains=Gains(1.05, 1.0, 0.0)))
+    used = []
+    monkeypatch.setattr(sessions, "regress", lambda sightings, leg_m: estimate)
+    monkeypatch.setattr(
+        sessions, "corrected", lambda drive, gains, delay_s: used.append(gains) or corrected(drive, gains, delay_s)
+    )
+    assert not alternating([read]).measured[0]
+    assert used == [Gains(1.05, 0.97, -0.04)]

@@ -67,12 +67,63 @@ def test_the_configuration_stays_where_nothing_is_significant(monkeypatch, capsy
     assert yaml.safe_load((tmp_path / "c.yaml").read_text())["backends"]["names"] == ["gtsam-cauchy"]
 
 
+def test_the_delay_in_use_is_added_to(monkeypatch, capsys, one, tmp_path):
+    """Poses stamped 0.1 s late are a delay of 0.1 s more than the one in use."""
+    late = Trajectory(one.motion.stamps_ns + 100_000_000, one.truth)
+    write_tum(tmp_path / "late.tum", late)
+    folder = write_session(tmp_path / "s", one, np.random.default_rng(0), sensors="{odometry_delay_s: 0.25}")
+    words = ("calibrate", folder, "--reference", tmp_path / "late.tum", "--out", tmp_path / "c.yaml", "--json")
+    code, printed, _ = run(monkeypatch, capsys, *words)
+    assert code == 0
+    delay = next(row["value"] for row in json.loads(printed)["metrics"] if row["name"] == "delay/calibration")
+    assert delay == pytest.approx(0.1, abs=0.03)
+    assert Config.load(tmp_path / "c.yaml").sensors.odometry_delay_s == pytest.approx(0.25 + delay)
+
+
+def test_a_file_that_is_there_is_replaced_only_when_asked(monkeypatch, capsys, session, tmp_path):
+    out = tmp_path / "kept.yaml"
+    out.write_text("mine")
+    code, printed, errors = run(monkeypatch, capsys, "calibrate", session, "--out", out)
+    assert (code, printed, out.read_text()) == (2, "", "mine")
+    assert "exists already; give --overwrite" in errors
+    assert run(monkeypatch, capsys, "calibrate", session, "--out", out, "--overwrite")[0] == 0
+    assert Config.load(out).neural.gain != 1.0
+    code, _, errors = run(monkeypatch, capsys, "calibrate", session, "--out", tmp_path, "--overwrite")
+    assert (code, errors.count("\n")) == (2, 1)
+    assert f"{tmp_path}: is a folder; name a file" in errors
+
+
+def test_what_does_not_load_is_not_written(monkeypatch, capsys, one, tmp_path):
+    write_tum(tmp_path / "late.tum", Trajectory(one.motion.stamps_ns + 100_000_000, one.truth))
+    folder = write_session(tmp_path / "s", one, np.random.default_rng(0), sensors="{odometry_delay_s: 0.95}")
+    words = ("calibrate", folder, "--reference", tmp_path / "late.tum", "--out", tmp_path / "c.yaml")
+    code, printed, errors = run(monkeypatch, capsys, *words)
+    assert (code, printed) == (2, "")
+    assert "not written: sensors.odometry_delay_s" in errors
+    assert not (tmp_path / "c.yaml").exists()
+
+
+def test_two_configurations_have_no_common_one_to_write(monkeypatch, capsys, session, tmp_path):
+    other = drive(np.random.default_rng(6))
+    folder = write_session(tmp_path / "b", other, np.random.default_rng(0), sensors="{range_max_m: 9.0}")
+    code, printed, errors = run(monkeypatch, capsys, "calibrate", session, folder, "--out", tmp_path / "c.yaml")
+    assert (code, printed) == (2, "")
+    assert "its configuration has sensors.range_max_m 9.0" in errors
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
         (("calibrate", "nowhere"), "no such session folder"),
         (("calibrate", "SESSION", "--estimator", "magic"), "unknown estimator 'magic'; there are alternating, joint"),
         (("calibrate", "SESSION", "SESSION", "--estimator", "joint"), "the joint estimator takes one session, found 2"),
+        (("calibrate", "SESSION", "SESSION"), "it would count twice, give it once"),
+        (("calibrate", "SESSION", "--reference", "x.tum", "--estimator", "magic"), "unknown estimator 'magic'"),
+        (("calibrate", "SESSION", "--reference", "x.tum", "--estimator", "joint"), "is for sessions without a reference"),
+        (("calibrate", "SESSION", "--estimator", "joint", "--leg", "4"), "the joint estimator takes legs of its own"),
+        (("calibrate", "SESSION", "--leg", "0"), "found legs of 0 m, expected 0.1 m or more"),
+        (("calibrate", "SESSION", "--leg", "-1"), "found legs of -1 m, expected 0.1 m or more"),
+        (("calibrate", "SESSION", "--leg", "nan"), "found legs of nan m, expected 0.1 m or more"),
         (("calibrate", "SESSION", "--reference", "none.tum"), "none.tum: no such trajectory file"),
         (("calibrate", "SESSION", "--leg", "100"), "expected at least 400.0 m"),
     ],
