@@ -14,6 +14,7 @@ from hybridmap.report import style
 _RATES, _CORRELATION = "viridis", "RdBu_r"
 _LABEL_BOX = {"facecolor": "#000000", "edgecolor": "none", "alpha": 0.55, "pad": 1.0}
 _SMALL = 7.0
+_TIGHT = {"wspace": 0.07, "hspace": 0.07}
 _SPACINGS_SHOWN = 1.9
 _ZOOM_M = 0.4
 _EXAMPLES = 8
@@ -22,8 +23,8 @@ _EXAMPLES = 8
 def stripes_figure(lattice: LatticeMaps) -> str:
     """Rate maps of the three bands of every module; a `data:` URI."""
     modules = len(lattice.bands)
-    with style.figure(style.PAGE_WIDTH_IN, 3.5) as picture:
-        panels = picture.subplots(3, modules)
+    with style.figure(style.PAGE_WIDTH_IN, 3.5, (0.03, 0.93, 0.01, 0.945)) as picture:
+        panels = picture.subplots(3, modules, gridspec_kw=_TIGHT)
         for m in range(modules):
             for b in range(3):
                 _rate_map(panels[b, m], lattice.bands[m, b], f"{100.0 * lattice.spacings_m[m]:.0f} cm" if b == 0 else "")
@@ -37,8 +38,8 @@ def grid_figure(lattice: LatticeMaps) -> str:
     """Rate maps of two cells of every module, each with its score and peak, and their autocorrelograms; a `data:` URI."""
     modules, cells = lattice.grid.shape[:2]
     shown = min(2, cells)
-    with style.figure(style.PAGE_WIDTH_IN, 2.4 * shown + 0.1) as picture:
-        panels = picture.subplots(2 * shown, modules)
+    with style.figure(style.PAGE_WIDTH_IN, 2.45 * shown, (0.03, 0.93, 0.01, 0.925)) as picture:
+        panels = picture.subplots(2 * shown, modules, gridspec_kw={**_TIGHT, "hspace": 0.17})
         for m in range(modules):
             spacing = lattice.spacings_m[m]
             for c in range(shown):
@@ -65,15 +66,18 @@ def place_figure(place: PlaceResult) -> str:
         ("sheet, printed:\ninput", place.sheet["printed", "input"]),
         ("settled", place.sheet["printed", "settled"]),
     )
-    with style.figure(style.PAGE_WIDTH_IN, 7.2) as picture:
-        panels = picture.subplots(1 + len(groups), _EXAMPLES + 1, width_ratios=(*[1] * _EXAMPLES, 2.0))
+    with style.figure(style.PAGE_WIDTH_IN, 7.4, (0.065, 0.93, 0.035, 0.98)) as picture:
+        looks = {"width_ratios": (*[1] * _EXAMPLES, 0.3, 1.9), "wspace": 0.08, "hspace": 0.22}
+        panels = picture.subplots(1 + len(groups), _EXAMPLES + 2, gridspec_kw=looks)  # the last but one is a gap
         _zoomed_row(panels[0], place)
+        for gap in panels[:, _EXAMPLES]:
+            gap.set_axis_off()
         for row, (_, population) in zip(panels[1:], groups, strict=True):
             _row_of(row[:_EXAMPLES], population.examples)
-            _field_counts(row[_EXAMPLES], population)
+            _field_counts(row[-1], population)
         for first in panels[1:, 0]:
             _scale_bar(first, 0.5 / place.pitch_m, "50 cm" if first is panels[1, 0] else "")
-        panels[1, _EXAMPLES].set_title("cells (%) by number of fields", fontsize=_SMALL + 1.0, fontweight="normal")
+        panels[1, -1].set_title("% of cells, by fields", fontsize=_SMALL + 1.0, fontweight="normal")
         _name_rows(panels, ("recruited,\nenlarged", *(f"{name}\nn = {len(group.fields)}" for name, group in groups)))
         _rate_bar(picture, panels)
         return style.svg_uri(picture)
@@ -90,7 +94,7 @@ def _row_of(row: Any, examples: Any) -> None:
 def _zoomed_row(row: Any, place: PlaceResult) -> None:
     """The same recruited cells, each with what is around its peak."""
     reach = round(0.5 * _ZOOM_M / place.pitch_m)
-    examples = place.recruited.examples[: len(row) - 1]
+    examples = place.recruited.examples[:_EXAMPLES]
     for axes, rates in zip(row, examples, strict=False):
         i, j = np.unravel_index(int(rates.argmax()), rates.shape)
         _rate_map(axes, np.pad(rates, reach, constant_values=np.nan)[i : i + 2 * reach + 1, j : j + 2 * reach + 1])
@@ -106,6 +110,7 @@ def _field_counts(axes: Any, population: PlaceMaps) -> None:
     axes.bar(range(7), 100.0 * counts / max(1, counts.sum()), color=style.PRIMARY, width=0.8)
     axes.set_ylim(0, 100)
     axes.set_xticks(range(7), ["0", "1", "2", "3", "4", "5", "≥6"], fontsize=_SMALL)
+    axes.set_yticks((0, 50, 100))
     axes.tick_params(axis="y", labelsize=_SMALL)
 
 
@@ -147,12 +152,14 @@ def _rate_bar(picture: Any, panels: Any) -> None:
 
 
 def _colour_bar(picture: Any, panels: Any, label: str, cmap: str, limits: tuple[float, float]) -> None:
-    """One colour bar to the right of all the panels."""
+    """One colour bar to the right of the panels, as high as they are."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
+    top, bottom = panels.flat[0].get_position().y1, panels.flat[-1].get_position().y0
+    space = picture.add_axes((panels.flat[-1].get_position().x1 + 0.012, bottom, 0.009, top - bottom))
     scale = ScalarMappable(Normalize(*limits), cmap)
-    bar = picture.colorbar(scale, ax=list(panels.flat), fraction=0.012, pad=0.01, aspect=40, ticks=(*limits, 0.5 * sum(limits)))
+    bar = picture.colorbar(scale, cax=space, ticks=(*limits, 0.5 * sum(limits)))
     bar.set_label(label, fontsize=_SMALL + 1.0)
     bar.ax.tick_params(labelsize=_SMALL)
     bar.outline.set_visible(False)
