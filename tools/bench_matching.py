@@ -7,7 +7,6 @@ CPU, on one core, the best of several repeats, and the ratios are of one run.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.vision import MatchingConfig
+from hybridmap.metrics import Metric, to_json
 from hybridmap.vision.gating import nodes_within
 from hybridmap.vision.profile import normalised
 from hybridmap.vision.search import ProfileIndex
@@ -120,6 +120,19 @@ def measure(count: int, bands: int, numpy_up_to: int) -> dict[str, float]:
     return row
 
 
+def metrics_of(size: int, row: dict[str, float]) -> list[Metric]:
+    """One size of map as a flat list: times in ms, and ratios held against their bars."""
+    metrics = []
+    for what, value in row.items():
+        name = f"{what.replace(' / ', '_over_').replace(', ', '_').replace(' ', '_')}/{size}"
+        bar, least = BARS.get(what), what.startswith("numpy /")
+        passed = None if bar is None else value >= bar if least else value <= bar
+        unit = "1" if bar is not None or what == "in the gate" else "ms"
+        held = "" if bar is None else f"; at {'least' if least else 'most'} {bar:g}"
+        metrics.append(Metric(name, value, unit, f"{what}, {size} stored views{held}", bar, passed))
+    return metrics
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -134,7 +147,7 @@ def main() -> None:
     for row in rows.values():
         row["gated, against the smallest"] = row["gated"] / rows[smallest]["gated"]
     if arguments.json:
-        print(json.dumps({"bands": arguments.bands, "bars": BARS, "ms": rows}))
+        print(to_json({"bands": arguments.bands}, [metric for size, row in rows.items() for metric in metrics_of(size, row)]))
         return
     print(f"{f'ms of CPU, {arguments.bands} bands x {WIDTH}':30s}" + "".join(f"{size:>12d}" for size in rows))
     for name in dict.fromkeys(key for row in rows.values() for key in row):
