@@ -206,8 +206,8 @@ STUDIES = (
     Study(
         "speed-matching",
         "The speed of the search for known places",
-        "Four bands x 64: the exact search against bare `cv2.batchDistance` and plain numpy on the same data, and how the time a "
-        "frame grows with spatial gating, in one run on one core.",
+        "Four bands x 64: the exact search against bare `cv2.batchDistance` and plain numpy on the same data, and how the time "
+        "a frame grows with spatial gating, in one run on one core.",
         (Step("python tools/bench_matching.py", own_bars=True),),
     ),
     Study(
