@@ -38,9 +38,13 @@ def test_the_gate_holds_as_many_nodes_in_a_large_map(bench):
 def test_the_table_is_whole(bench, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["bench_matching.py", "--sizes", "200", "400", "--numpy-up-to", "200", "--json"])
     bench.main()
-    shown = json.loads(capsys.readouterr().out)
-    assert set(shown["bars"]) <= set(shown["ms"]["200"])
-    assert "numpy" not in shown["ms"]["400"]
+    shown = {metric["name"]: metric for metric in json.loads(capsys.readouterr().out)["metrics"]}
+    judged = {name for name, metric in shown.items() if "bar" in metric}
+    ratios = {"search_over_bare", "numpy_over_search", "gated_against_the_smallest"}
+    assert {f"{ratio}/200" for ratio in ratios} <= judged
+    assert shown["search_over_bare/200"]["passed"] is True
+    assert shown["numpy_over_search/200"]["passed"] is False
+    assert "numpy/400" not in shown
     monkeypatch.setattr("sys.argv", ["bench_matching.py", "--sizes", "200"])
     bench.main()
     assert "search / bare" in capsys.readouterr().out
