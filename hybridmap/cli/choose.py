@@ -57,11 +57,18 @@ def choose(
     """
     if config_name is None:
         config_name = world_of(source)
-    if config_name is None:
-        probe = open_stream(source, Config.load(None, overrides), start_s=start_s, end_s=end_s)
-        if probe.rig == Rig():
-            overrides = {**overrides, "vision.sensor": "none"}
-        else:
-            config_name = "laser" if probe.rig.laser is not None else "rgbd"
-    config = Config.load(config_name, overrides)
-    return Chosen(open_stream(source, config, start_s=start_s, end_s=end_s), config)
+    if config_name is not None:
+        config = Config.load(config_name, overrides)
+        return Chosen(open_stream(source, config, start_s=start_s, end_s=end_s), config)
+    default = Config.load(None, overrides)
+    stream = open_stream(source, default, start_s=start_s, end_s=end_s)
+    config = _config_for(stream.rig, overrides)
+    if config.sensors != default.sensors:
+        stream = open_stream(source, config, start_s=start_s, end_s=end_s)
+    return Chosen(stream, config)
+
+
+def _config_for(rig: Rig, overrides: Mapping[str, Any]) -> Config:
+    if rig == Rig():
+        return Config.load(None, {**overrides, "vision.sensor": "none"})
+    return Config.load("laser" if rig.laser is not None else "rgbd", overrides)
