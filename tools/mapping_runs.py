@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,11 +17,15 @@ from numpy.typing import NDArray
 from hybridmap.backends.base import Solution
 from hybridmap.config import Config
 from hybridmap.evaluate.edges import normalised_errors
+from hybridmap.evaluate.session import evaluate_session
 from hybridmap.evaluate.trajectory import absolute_error
 from hybridmap.graph.experience_map import ExperienceMap, Status
 from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.mapper import Mapper, Update
+from hybridmap.session import run as session_run
+from hybridmap.store import SessionFolder
 from hybridmap.store.track import Track, trajectory_of
+from hybridmap.streams.base import Stream
 from hybridmap.streams.open import open_stream
 from hybridmap.trajectory import Trajectory
 
@@ -91,6 +98,14 @@ def map_in_memory(source: str | Path, config: Config) -> Run:
         frames,
         dict(mapper.clock.cpu_s),
     )
+
+
+@contextmanager
+def judged_session(stream: Stream, config: Config, relations: Path | None) -> Iterator[tuple[SessionFolder, dict[str, float]]]:
+    """Map a stream into a folder that is thrown away; its session and every figure of `hybridmap evaluate`, by name."""
+    with tempfile.TemporaryDirectory() as folder:
+        session = session_run(stream, config, Path(folder) / "session").folder
+        yield session, {metric.name: metric.value for metric in evaluate_session(session.path, relations=relations)}
 
 
 def edge_errors(run: Run, kind: EdgeKind) -> EdgeErrors:

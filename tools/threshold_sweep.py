@@ -13,16 +13,15 @@ wrong if it is more than a metre from the truth. Exit code 1 if the map is worse
 from __future__ import annotations
 
 import argparse
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+
+from mapping_runs import judged_session
 
 from hybridmap.cli.choose import parse_settings
 from hybridmap.config import Config
 from hybridmap.evaluate.edges import edge_errors
-from hybridmap.evaluate.session import evaluate_session
 from hybridmap.graph.pose_graph import EdgeKind
-from hybridmap.session import run
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.streams.open import open_stream
 from hybridmap.trajectory import read_tum
@@ -73,9 +72,7 @@ def main() -> None:
 
 def outcome(source: str, config: Config, value: str, relations: Path | None = None) -> Outcome:
     """Map a source into a folder that is thrown away, and judge it."""
-    with tempfile.TemporaryDirectory() as folder:
-        session = run(open_stream(source, config), config, Path(folder) / "session").folder
-        metrics = {metric.name: metric.value for metric in evaluate_session(session.path, relations=relations)}
+    with judged_session(open_stream(source, config), config, relations) as (session, metrics):
         measure = "ate_rmse" if relations is None else "relation_trans_mean"
         primary = config.backends.names[0]
         wrong, kept, loops, rejected = _loops(session, primary)
