@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "hybridmap"
 MODULES = sorted(path.relative_to(ROOT) for path in PACKAGE.rglob("*.py"))
-HEAVY = ("open3d", "matplotlib", "gtsam", "cv2", "scipy", "rosbags")
+HEAVY = ("open3d", "matplotlib", "gtsam", "cv2", "scipy", "rosbags", "numba")
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
 

@@ -27,14 +27,14 @@ from hybridmap.backends.batch import run
 from hybridmap.backends.factors import NoiseModels, factor_graph, values
 from hybridmap.backends.false_loops import inject
 from hybridmap.backends.following import prefix
-from hybridmap.backends.link_blocks import BlockSweeps
-from hybridmap.backends.links import Links, Planar
+from hybridmap.backends.sweeps import relax_links
+from hybridmap.config.backends import RelaxationConfig
 from hybridmap.geometry import Array, between, compose, exp, wrap_angle
 from hybridmap.graph.connectivity import chain
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 
-_SWEEPS = 400
+_ROUNDS = 7  # of measuring everything in turn, so that all see the same machine
 
 
 def main() -> None:
@@ -81,11 +81,11 @@ def drive(nodes: int, edges: int, rng: np.random.Generator) -> PoseGraph:
     )
 
 
-def loop_over_arrays(graph: PoseGraph, links: Links, theta: float, sweeps: int) -> Array:
+def loop_over_arrays(graph: PoseGraph, theta: float, sweeps: int) -> Array:
     """The rule as one writes it: a Python loop over the rows of the arrays."""
-    poses = graph.initial.copy()
+    poses, order = graph.initial.copy(), np.argsort(graph.sources, kind="stable")
     for _ in range(sweeps):
-        for e in links.order:
+        for e in order:
             source, target = graph.sources[e], graph.targets[e]
             dx, dy, turn = graph.deltas[e]
             cos, sin = np.cos(poses[source, 2]), np.sin(poses[source, 2])
@@ -98,14 +98,15 @@ def loop_over_arrays(graph: PoseGraph, links: Links, theta: float, sweeps: int) 
     return poses
 
 
-def loop_over_floats(graph: PoseGraph, links: Links, theta: float, sweeps: int) -> Array:
+def loop_over_floats(graph: PoseGraph, theta: float, sweeps: int) -> Array:
     """The same with everything taken out of numpy beforehand: as fast as plain Python gets."""
     x, y, yaw = graph.initial.T.tolist()
-    rows = np.column_stack([links.sources, links.targets]).tolist()
-    of_links = [(*ends, *delta) for ends, delta in zip(rows, graph.deltas[links.order].tolist(), strict=True)]
+    order = np.argsort(graph.sources, kind="stable")
+    ends = zip(graph.sources[order].tolist(), graph.targets[order].tolist(), strict=True)
+    links = [(*both, *delta) for both, delta in zip(ends, graph.deltas[order].tolist(), strict=True)]
     two_pi = 2.0 * math.pi
     for _ in range(sweeps):
-        for source, target, dx, dy, turn in of_links:
+        for source, target, dx, dy, turn in links:
             cos, sin = math.cos(yaw[source]), math.sin(yaw[source])
             apart_x = theta * (x[target] - x[source] - cos * dx + sin * dy)
             apart_y = theta * (y[target] - y[source] - sin * dx - cos * dy)
@@ -122,32 +123,29 @@ def loop_over_floats(graph: PoseGraph, links: Links, theta: float, sweeps: int) 
 def sweep_study(data: Path | None) -> list[str]:
     """A sweep of the per-link rule against plain Python, all in the same order of links."""
     del data
-    graph = drive(1000, 1500, np.random.default_rng(0))
-    links, theta = Links.of(graph), 0.5
-    blocks = BlockSweeps(links, graph.n_nodes, theta)
-    start = Planar.of(graph.initial)
-    reached = blocks.run(start, 20, -1.0).poses.to_array()
+    graph, theta = drive(1000, 1500, np.random.default_rng(0)), 0.5
+    config = RelaxationConfig(theta=theta, tolerance_m=0.0)
+
+    def ours(sweeps: int, robust: bool = False) -> Array:
+        return relax_links(graph, graph.initial, sweeps, config, robust=robust).poses
+
     for plain in (loop_over_arrays, loop_over_floats):
-        off = reached - plain(graph, links, theta, 20)
+        off = ours(20) - plain(graph, theta, 20)
         assert max(np.abs(off[:, :2]).max(), np.abs(wrap_angle(off[:, 2])).max()) < 1e-9
-    arrays = cpu_s(lambda: loop_over_arrays(graph, links, theta, 5)) / 5
-    floats = cpu_s(lambda: loop_over_floats(graph, links, theta, 100)) / 100
-    ours = cpu_s(lambda: blocks.run(start, _SWEEPS, -1.0)) / _SWEEPS
-
-    def swept() -> None:
-        poses = start
-        for _ in range(100):
-            poses = links.sweep(poses, theta)
-
-    single = cpu_s(swept) / 100
-    prepare = cpu_s(lambda: BlockSweeps(links, graph.n_nodes, theta))
-    return [
-        f"sweep of {graph.n_nodes} nodes, {graph.n_edges} edges in {len(links.levels)} levels, us of CPU:",
-        f"  loop over arrays {arrays * 1e6:.0f}, loop over floats {floats * 1e6:.0f}",
-        f"  level by level {single * 1e6:.0f}: {arrays / single:.1f} x and {floats / single:.1f} x as fast",
-        f"  blocks of sweeps {ours * 1e6:.0f}: {arrays / ours:.1f} x and {floats / ours:.1f} x",
-        f"  prepared once in {prepare * 1e6:.0f}",
-    ]
+    studied: dict[str, tuple[int, Callable[[], object]]] = {
+        "loop over arrays": (3, lambda: loop_over_arrays(graph, theta, 3)),
+        "loop over floats": (100, lambda: loop_over_floats(graph, theta, 100)),
+        "relaxation-ratslam, 1,000 sweeps a call": (1000, lambda: ours(1000)),
+        "relaxation-ratslam, 20 sweeps a call": (1000, lambda: [ours(20) for _ in range(50)]),
+        "relaxation-robust, 1,000 sweeps a call": (1000, lambda: ours(1000, robust=True)),
+    }
+    spent = dict.fromkeys(studied, math.inf)
+    for _ in range(_ROUNDS):
+        for name, (sweeps, work) in studied.items():
+            spent[name] = min(spent[name], cpu_s(work, 1) / sweeps)
+    arrays, floats = spent["loop over arrays"], spent["loop over floats"]
+    head = f"sweep of {graph.n_nodes} nodes, {graph.n_edges} edges, us of CPU, times as fast as each loop:"
+    return [head, *(f"  {name:41}{s * 1e6:8.1f}{arrays / s:8.1f} x{floats / s:7.1f} x" for name, s in spent.items())]
 
 
 def overhead_study(data: Path | None) -> list[str]:

@@ -3,7 +3,8 @@
 A heading bias is no outlier: it is in every odometry edge, and no robust kernel takes it out. As a variable it bends the whole
 chain, so that loops which a drifted chain contradicts fit again. The problem has local minima (another winding number of
 the chain), so several starts of the bias are tried, each from poses that an incremental relaxation has grown along the
-chain made with that bias; the lowest cost of odometry wins.
+chain made with that bias; the lowest objective wins. The odometry's share alone would not tell: a drive that has shrunk to a
+point costs it little.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ from hybridmap.geometry import Array, between, compose, inverse
 from hybridmap.graph.connectivity import chain
 from hybridmap.graph.pose_graph import PoseGraph
 
-BIAS_STARTS_RAD_M = (0.0, -0.02, 0.02, -0.06, 0.06)
+BIAS_STARTS_RAD_M = (0.0, -0.02, 0.02, -0.06, 0.06, -0.12, 0.12)
 """Starts of the heading bias, rad/m; the drift of wheels seldom exceeds 3 deg/m."""
 
-_AGREEING_STARTS = 3
+_AGREEING_STARTS = 5
 _SAME_RAD_M = 2e-4
 _OPEN_WAY = 0.1  # share of the way that only odometry spans; below it no winding of the chain is in doubt
 _PRIOR = np.array([0.2, 0.2, 0.2, 0.2])  # so wide that it only holds what the drive leaves open
@@ -53,13 +54,13 @@ class Joint:
     Attributes:
         poses: (N, 3) of the nodes.
         estimate: the calibration.
-        odometry_cost: Cauchy cost of the whitened odometry residuals; the lowest of the starts.
+        cost: the objective, robust in odometry and loops; the lowest of the starts.
         bias_start_rad_m: from where it was found.
     """
 
     poses: Array
     estimate: Estimate
-    odometry_cost: float
+    cost: float
     bias_start_rad_m: float
 
 
@@ -86,12 +87,12 @@ def solve(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config
             continue
         found.append(solution)
         reached = solution.estimate.gains.heading_bias_rad_m
-        _logger.info("from %.3f rad/m: %.4f rad/m, odometry cost %.2f", bias, reached, solution.odometry_cost)
+        _logger.info("from %.3f rad/m: %.4f rad/m, cost %.2f", bias, reached, solution.cost)
         if len(found) == _AGREEING_STARTS and np.ptp([one.estimate.gains.heading_bias_rad_m for one in found]) < _SAME_RAD_M:
             break  # the starts on either side of zero lead to the same map
     if not found:
         raise BackendError("calibration: GTSAM solved the graph from none of the starts of the heading bias")
-    best = min(found, key=lambda one: one.odometry_cost)
+    best = min(found, key=lambda one: one.cost)
     variable = np.append(best.estimate.gains.to_array(), best.estimate.delay_s)
     scale = problem.scale(best.poses, variable)
     final = problem.solve(best.poses, variable, scale, best.bias_start_rad_m) or best
@@ -163,7 +164,7 @@ class _Problem:
         except RuntimeError as error:
             _logger.info("from %.3f rad/m: %s", bias_start_rad_m, str(error).strip().splitlines()[:1])
             return None
-        return self._result(solved, np.asarray(marginal), bias_start_rad_m)
+        return self._result(solved, np.asarray(marginal), float(nonlinear.error(solved)), bias_start_rad_m)
 
     def scale(self, poses: Array, variable: Array) -> float:
         """How much larger than assumed the odometry residuals are, by their median."""
@@ -206,7 +207,7 @@ class _Problem:
             self._evaluated = (mark, self.terms.legs.predict(gains, delay_s), self.terms.legs.jacobian(gains, delay_s))
         return self._evaluated[1], self._evaluated[2]
 
-    def _result(self, solved: Any, marginal: Array, bias_start_rad_m: float) -> Joint | None:
+    def _result(self, solved: Any, marginal: Array, cost: float, bias_start_rad_m: float) -> Joint | None:
         variable = np.asarray(solved.atVector(self.key))
         solved.erase(self.key)
         poses = poses_of(solved)
@@ -226,7 +227,6 @@ class _Problem:
             unit_variance=unit_variance,
             downweighted=float(np.mean(weights < 0.5)),
         )
-        cost = float(np.sum(CAUCHY**2 * np.log1p(squared / CAUCHY**2)))
         return Joint(poses, estimate, cost, bias_start_rad_m)
 
     def _factors(self) -> Any:

@@ -15,7 +15,7 @@ class RelaxationConfig(Section):
     theta: float = Field(default=0.5, gt=0, le=1)
     """Correction rate, the paper's vartheta."""
     theta_decay: float = Field(default=1.0, gt=0, le=1)
-    """`relaxation-ratslam`: factor on theta after every sweep of one call; below 1 it removes the limit cycle."""
+    """`relaxation-ratslam`, `-robust`: factor on theta after every sweep of one call; below 1 it removes the limit cycle."""
     sweeps_per_node: int = Field(default=20, ge=1)
     """Sweeps each time the graph has grown."""
     solve_sweeps: int = Field(default=5000, ge=1)

@@ -23,6 +23,14 @@ def laps(rng, nodes=60, per_lap=20, noise=1.0, every=1):
     return graph_of(truth, pairs, rng, noise), truth
 
 
+def star(degree):
+    """A hub with as many spokes, and loops along the rim."""
+    truth = np.array([[0.0, 0.0, 0.0]] + [[np.cos(a), np.sin(a), a] for a in np.linspace(0, 6, degree)])
+    pairs = [(0, k, EdgeKind.ODOMETRY) for k in range(1, degree + 1)]
+    pairs += [(k, k + 1, EdgeKind.LOOP) for k in range(1, degree)]
+    return graph_of(truth, pairs, np.random.default_rng(0), noise=3.0)
+
+
 def graph_of(truth, pairs, rng, noise=1.0):
     """Measure pairs (source, target, kind) of true poses with noise; `initial` is the chain."""
     sources, targets = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
