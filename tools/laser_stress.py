@@ -11,6 +11,7 @@ Exit code 1 if a map is worse than its odometry.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from mapping_runs import judged_session
 from hybridmap.cli.choose import parse_settings
 from hybridmap.config import Config
 from hybridmap.geometry import Array, between, compose
+from hybridmap.metrics import Metric, to_json
 from hybridmap.store import MapStore
 from hybridmap.streams.base import LaserScan, Sample, SelfMotion, Stream
 from hybridmap.streams.open import open_stream
@@ -33,14 +35,18 @@ def main() -> None:
     """Parse the command line, map every case, print."""
     options = _parser().parse_args()
     settings = parse_settings(options.set)
-    print(HEADER, flush=True)
-    worse = []
+    table = sys.stderr if options.json else sys.stdout
+    print(HEADER, file=table, flush=True)
+    worse, metrics = [], []
     for case in options.cases:
         for seed in options.seeds:
             found = outcome(options.source, case, seed, Config.load("laser", settings), options.relations)
-            print(f"| {case} | {seed} | {' | '.join(found.cells())} |", flush=True)
+            print(f"| {case} | {seed} | {' | '.join(found.cells())} |", file=table, flush=True)
             worse += [case] if found.map_m > found.odometry_m else []
-    print(f"\nworse than odometry: {', '.join(worse) if worse else 'never'}")
+            metrics.append(found.metric(f"{case}-{seed}"))
+    print(f"\nworse than odometry: {', '.join(worse) if worse else 'never'}", file=table)
+    if options.json:
+        print(to_json({}, metrics))
     raise SystemExit(1 if worse else 0)
 
 
@@ -60,6 +66,11 @@ class Outcome:
     map_deg: float
     accepted: int
     rejected: int
+
+    def metric(self, name: str) -> Metric:
+        """The map's error; its bar is the error of odometry."""
+        passed = self.map_m <= self.odometry_m
+        return Metric(f"relation_trans_mean/{name}", self.map_m, "m", "of the robust map", self.odometry_m, passed)
 
     def cells(self) -> list[str]:
         """For a table."""
@@ -209,6 +220,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--relations", type=Path, required=True)
     parser.add_argument("--cases", nargs="+", choices=list(CASES), default=list(CASES))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output; the table goes to stderr")
     parser.add_argument("--set", action="append", default=[], help="KEY=VALUE on top of the configuration")
     return parser
 

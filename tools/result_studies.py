@@ -159,6 +159,49 @@ STUDIES = (
         needs="real/hololens_office/rgb.txt",
     ),
     Study(
+        "rgbd",
+        "Revisits, edges and maps of simulated RGB-D drives, five seeds",
+        "Recall of revisits, false loops that the robust back-end keeps, errors of the loop edges, their squared errors over their "
+        "own covariances (1: calibrated; the bar's other side is 0.5), and the map.",
+        (Step("python tools/rgbd_study.py --recordings $OUT --worlds office lab", own_bars=True),),
+    ),
+    Study(
+        "rgbd-cost",
+        "The cost of an RGB-D frame",
+        "Process time a frame, everything included, at 320 x 240 pixels and 10 Hz with `gtsam-isam2`.",
+        (
+            Step(
+                "python tools/rgbd_study.py --recordings $OUT --worlds office --seeds 1 --camera 320x240@10 --backend gtsam-isam2",
+                own_bars=True,
+            ),
+        ),
+    ),
+    Study(
+        "never-harmful",
+        "A threshold from far too strict to far too loose",
+        "Error of the robust map at each value of an acceptance threshold; its bar is the error of odometry.",
+        (
+            Step(
+                "python tools/threshold_sweep.py $HYBRIDMAP_DATA/real/fr079/fr079.mcap --config laser"
+                " --relations $HYBRIDMAP_DATA/real/fr079/relations.txt"
+                " --key vision.laser.probes.fit_min --values 0.99 0.95 0.85 0.7 0.5 0.3 0.1 0.01",
+                own_bars=True,
+            ),
+            Step(
+                "python tools/threshold_sweep.py office --key vision.rgbd.pnp.min_inliers --values 400 150 60 30 12 8 6 4",
+                own_bars=True,
+            ),
+        ),
+        needs="real/fr079/fr079.mcap",
+    ),
+    Study(
+        "backends",
+        "The back-ends: cost against plain Python and against GTSAM alone",
+        "Process time, as ratios within one run.",
+        (Step("python tools/backend_bench.py sweep overhead gnc isam2 --data $HYBRIDMAP_DATA", own_bars=True),),
+        needs="posegraphs/city10000.g2o",
+    ),
+    Study(
         "manhattan",
         "manhattanOlson3500, one referee",
         "A standard pose graph through several back-ends. Its best known chi2 is 146.08.",

@@ -18,6 +18,7 @@ bar is for `gtsam-isam2` alone, on 320x240 pictures at 10 Hz.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ from hybridmap.config import Config
 from hybridmap.evaluate.closures import ClosureLimits, closure_errors
 from hybridmap.evaluate.edges import EXPECTED_MEDIAN
 from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.metrics import Metric, to_json
 
 LIMITS = ClosureLimits(right_m=0.5, right_deg=10.0, revisit_m=1.0, revisit_deg=30.0, revisit_gap_s=10.0, window_nodes=3)
 
@@ -67,6 +69,7 @@ LEAST_CHI2 = 0.5
 def main() -> None:
     """Parse the command line, map, print."""
     arguments = _parser().parse_args()
+    out = sys.stderr if arguments.json else sys.stdout
     width, height, rate = _camera(arguments.camera)
     camera = {} if width is None else {"width_px": width, "height_px": height, "rate_hz": rate}
     settings = {f"simulation.camera.{key}": value for key, value in camera.items()}
@@ -80,8 +83,10 @@ def main() -> None:
             config = Config.load(world, {"seed": seed, **settings, **overrides})
             figures = figures_of(map_in_memory(drive, config))
             rows.append((world, seed, figures))
-            print("\n".join(table(rows[-1:])), flush=True)
-    print("\n".join(["", *table(rows)]))
+            print("\n".join(table(rows[-1:])), file=out, flush=True)
+    print("\n".join(["", *table(rows)]), file=out)
+    if arguments.json:
+        print(to_json({}, [metric for row in rows for metric in metrics_of(*row)]))
 
 
 def figures_of(run: Run) -> dict[str, float]:
@@ -109,6 +114,17 @@ def figures_of(run: Run) -> dict[str, float]:
     }
 
 
+def metrics_of(world: str, seed: int, figures: dict[str, float]) -> list[Metric]:
+    """Every figure of one drive, held against its bar if it has one."""
+    found = []
+    for name, value in figures.items():
+        bar = _bar(name, world)
+        limit, passed = (None, None) if bar is None else (bar.limit, _holds(name, bar, value))
+        about = "" if bar is None else f"at {'least' if bar.least else 'most'} {bar.limit:g}"
+        found.append(Metric(f"{name}/{world}-{seed}", value, _unit(name), about, limit, passed))
+    return found
+
+
 def table(rows: Sequence[tuple[str, int, dict[str, float]]]) -> list[str]:
     """Markdown: one column a drive, one line a figure, what misses its bar marked."""
     names = list(dict.fromkeys(name for _, _, figures in rows for name in figures))
@@ -124,8 +140,18 @@ def table(rows: Sequence[tuple[str, int, dict[str, float]]]) -> list[str]:
 
 def _cell(name: str, world: str, value: float) -> str:
     bar = _bar(name, world)
-    held = bar is None or (bar.holds(value) and not (name.startswith("chi2") and value < LEAST_CHI2))
-    return f"{value:.4g}" + ("" if held else " ✗")
+    return f"{value:.4g}" + ("" if bar is None or _holds(name, bar, value) else " ✗")
+
+
+def _unit(name: str) -> str:
+    endings = {"_cm": "cm", "_deg": "deg"}
+    beginnings = {"ate_": "m", "ms_": "ms"}
+    ended = next((unit for ending, unit in endings.items() if name.endswith(ending)), "1")
+    return next((unit for beginning, unit in beginnings.items() if name.startswith(beginning)), ended)
+
+
+def _holds(name: str, bar: Bar, value: float) -> bool:
+    return bar.holds(value) and not (name.startswith("chi2") and value < LEAST_CHI2)
 
 
 def _bar(name: str, world: str) -> Bar | None:
@@ -172,6 +198,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4, 5], help="seeds of the sensors' errors")
     parser.add_argument("--camera", help="size and rate of the camera, such as 320x240@10; default: the world's")
     parser.add_argument("--backend", nargs="+", help="back-ends; default: the configuration's")
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output; the table goes to stderr")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings")
     return parser
 

@@ -13,6 +13,7 @@ wrong if it is more than a metre from the truth. Exit code 1 if the map is worse
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from hybridmap.cli.choose import parse_settings
 from hybridmap.config import Config
 from hybridmap.evaluate.edges import edge_errors
 from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.metrics import Metric, to_json
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.streams.open import open_stream
 from hybridmap.trajectory import read_tum
@@ -58,15 +60,18 @@ class Outcome:
 def main() -> None:
     """Parse the command line, sweep, print."""
     options = _parser().parse_args()
+    table = sys.stderr if options.json else sys.stdout
     outcomes = []
-    print(HEADER, flush=True)
+    print(HEADER, file=table, flush=True)
     for value in options.values:
         settings = parse_settings([*options.set, f"{options.key}={value}"])
         config = Config.load(options.config or options.source, settings)
         outcomes.append(outcome(options.source, config, value, options.relations))
-        print(line(outcomes[-1]), flush=True)
+        print(line(outcomes[-1]), file=table, flush=True)
     worse = [one.value for one in outcomes if not one.harmless]
-    print(f"\nworse than odometry: {', '.join(worse) if worse else 'never'}")
+    print(f"\nworse than odometry: {', '.join(worse) if worse else 'never'}", file=table)
+    if options.json:
+        print(to_json({"key": options.key}, [metric_of(one) for one in outcomes]))
     raise SystemExit(1 if worse else 0)
 
 
@@ -83,6 +88,11 @@ HEADER = (
     "| value | loops | no weight | wrong by > 1 m | of them kept | odometry, m | map, m | |\n"
     "|---|---:|---:|---:|---:|---:|---:|---|"
 )
+
+
+def metric_of(one: Outcome) -> Metric:
+    """The map's error at one value; its bar is the error of odometry."""
+    return Metric(f"map/{one.value}", one.map_m, "m", "error of the robust map", one.odometry_m, one.harmless)
 
 
 def line(one: Outcome) -> str:
@@ -113,6 +123,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--key", required=True, help="the setting, such as vision.rgbd.pnp.min_inliers")
     parser.add_argument("--values", nargs="+", required=True, help="from far too strict to far too loose")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings that stay")
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output; the table goes to stderr")
     parser.add_argument("--relations", type=Path, help="verified relations, where there is no truth")
     return parser
 
