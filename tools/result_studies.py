@@ -161,8 +161,8 @@ STUDIES = (
     Study(
         "rgbd",
         "Revisits, edges and maps of simulated RGB-D drives, five seeds",
-        "Recall of revisits, false loops that the robust back-end keeps, errors of the loop edges, their squared errors over their "
-        "own covariances (1: calibrated; the bar's other side is 0.5), and the map.",
+        "Recall of revisits, false loops that the robust back-end keeps, errors of the loop edges, their squared errors over "
+        "their own covariances (1: calibrated; the bar's other side is 0.5), and the map.",
         (Step("python tools/rgbd_study.py --recordings $OUT --worlds office lab", own_bars=True),),
     ),
     Study(
@@ -171,7 +171,8 @@ STUDIES = (
         "Process time a frame, everything included, at 320 x 240 pixels and 10 Hz with `gtsam-isam2`.",
         (
             Step(
-                "python tools/rgbd_study.py --recordings $OUT --worlds office --seeds 1 --camera 320x240@10 --backend gtsam-isam2",
+                "python tools/rgbd_study.py --recordings $OUT --worlds office --seeds 1 --camera 320x240@10"
+                " --backend gtsam-isam2",
                 own_bars=True,
             ),
         ),
