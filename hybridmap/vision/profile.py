@@ -40,8 +40,7 @@ def image_profile(
         (2 * bands, width) float32: intensity bands, then depth bands. Columns without any depth take the band's mean.
     """
     intensity = _cell_means(grey, width, bands)
-    valid = (depth_m > 0).astype(np.float32)
-    share = _cell_means(valid, width, bands)
+    share = _cell_means((depth_m > 0).view(np.uint8), width, bands)
     depth = _cell_means(depth_m, width, bands)
     seen = share > 1e-6
     mean = np.where(seen, depth / np.where(seen, share, 1.0), 0.0)

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from hybridmap.geometry import Array
 from hybridmap.streams.base import Camera
-from hybridmap.vision.rgbd.spatial import apply, inverse_rigid
+from hybridmap.vision.rgbd.spatial import inverse_rigid
 from hybridmap.vision.rgbd.stance import Stance
 
 MAX_JUMP = 0.05
 MAX_BEND = 0.015
-MIN_SHARE = 0.6
+MIN_SHARE = 0.2
 """Neighbouring cells are one surface where inverse depth differs by less than a share, or bends by less than a share of itself;
 a cell is known where this share of its pixels is."""
 
@@ -59,18 +59,30 @@ class Surface:
         grid: where it comes from.
         stance: how the camera was held at that keyframe.
         T_camera_base: (4, 4) inverse of its pose.
-        points, normals: (N, 3) valid points in `base_link`, m.
-        sigma_m: (N,) their noise.
+        rows: (7, N) valid points in `base_link`, m; below them their normals and the standard deviation along these, m.
         number: (R, C) int32, index of a cell's point; -1 for none.
     """
 
     grid: DepthGrid
     stance: Stance
     T_camera_base: Array
-    points: Array
-    normals: Array
-    sigma_m: Array
+    rows: Array
     number: NDArray[np.int32]
+
+    @property
+    def points(self) -> Array:
+        """(N, 3) in `base_link`, m."""
+        return self.rows[:3].T
+
+    @property
+    def normals(self) -> Array:
+        """(N, 3) in `base_link`, unit length."""
+        return self.rows[3:6].T
+
+    @property
+    def sigma_m(self) -> Array:
+        """(N,) standard deviation along the normals, m."""
+        return np.asarray(self.rows[6])
 
 
 def make_grid(depth_m: NDArray[np.float32], camera: Camera, cell_px: int, depth_sigma: float) -> DepthGrid:
@@ -85,11 +97,11 @@ def make_grid(depth_m: NDArray[np.float32], camera: Camera, cell_px: int, depth_
     coarse = reduced(camera, cell_px)
     cells = _average(depth_m, coarse.height_px, coarse.width_px, cell_px)
     depth = 1.0 / cells.inverse
-    u = (np.arange(coarse.width_px) - coarse.cx_px) / coarse.fx_px
-    v = (np.arange(coarse.height_px) - coarse.cy_px) / coarse.fy_px
-    rays = np.stack(np.broadcast_arrays(u[None, :], v[:, None], 1.0), axis=-1)
-    points = rays * depth[..., None]
-    sigma = 0.001 + 0.5 * depth_sigma * depth**2
+    points = np.empty((*depth.shape, 3))
+    points[..., 0] = (cells.column - coarse.cx_px) * depth / coarse.fx_px
+    points[..., 1] = (cells.row - coarse.cy_px) * depth / coarse.fy_px
+    points[..., 2] = depth
+    sigma = 0.001 + 0.5 * depth_sigma * depth**2 / np.sqrt(cells.share)
     return DepthGrid(coarse, points, _normals(points), _on_one_surface(cells), sigma)
 
 
@@ -97,41 +109,51 @@ def place(grid: DepthGrid, stance: Stance) -> Surface:
     """Put a grid into the robot's frame, with the camera as it was at that keyframe."""
     valid, T_base_camera = grid.valid, stance.T_base_camera
     number = np.full(valid.shape, -1, dtype=np.int32)
-    number[valid] = np.arange(int(valid.sum()), dtype=np.int32)
-    return Surface(
-        grid,
-        stance,
-        inverse_rigid(T_base_camera),
-        apply(T_base_camera, grid.points[valid]),
-        grid.normals[valid] @ T_base_camera[:3, :3].T,
-        grid.sigma_m[valid],
-        number,
-    )
+    rows = np.empty((7, np.count_nonzero(valid)))
+    number[valid] = np.arange(rows.shape[1], dtype=np.int32)
+    rows[:3] = T_base_camera[:3, :3] @ grid.points[valid].T + T_base_camera[:3, 3:]
+    rows[3:6] = T_base_camera[:3, :3] @ grid.normals[valid].T
+    rows[6] = grid.sigma_m[valid]
+    return Surface(grid, stance, inverse_rigid(T_base_camera), rows, number)
 
 
 @dataclass(frozen=True, slots=True)
 class _Cells:
-    """Cells of a depth image: mean inverse depth (R, C), its spread within the cell, and where most pixels are valid."""
+    """Cells of a depth image, each array (R, C).
+
+    Attributes:
+        inverse, spread: mean inverse depth of the valid pixels, and its standard deviation within the cell, 1/m.
+        column, row: where the middle of these pixels lies, cells.
+        share: of the pixels that are valid.
+        known: that is enough.
+    """
 
     inverse: Array
     spread: Array
+    column: Array
+    row: Array
+    share: Array
     known: NDArray[np.bool_]
 
 
 def _average(depth_m: NDArray[np.float32], rows: int, columns: int, cell_px: int) -> _Cells:
-    """Average *inverse* depth: on a plane it is linear over the image, however grazing the view."""
+    """Average *inverse* depth: on a plane it is linear over the image, so that a mean belongs to the middle of its pixels."""
     import cv2
 
     cut = np.ascontiguousarray(depth_m[: rows * cell_px, : columns * cell_px])
-    seen = cut > 0
-    inverse = np.divide(np.float32(1.0), cut, out=np.zeros_like(cut), where=seen)
-    stack = cv2.merge([inverse, inverse * inverse, seen.astype(np.float32)])
-    small = cv2.resize(stack, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float64)
-    share = np.maximum(small[..., 2], 1e-6)
-    mean = small[..., 0] / share
-    known = small[..., 2] > MIN_SHARE
-    spread = np.sqrt(np.maximum(small[..., 1] / share - mean**2, 0.0))
-    return _Cells(np.where(known, mean, 1.0), spread, known)
+    seen = (cut > 0).astype(np.float32)
+    inverse = np.divide(np.float32(1.0), cut, out=np.zeros_like(cut), where=cut > 0)
+    u = (np.arange(columns * cell_px, dtype=np.float32) + np.float32(0.5)) / np.float32(cell_px) - np.float32(0.5)
+    v = (np.arange(rows * cell_px, dtype=np.float32)[:, None] + np.float32(0.5)) / np.float32(cell_px) - np.float32(0.5)
+    share, mean, square, column, row = (
+        cv2.resize(layer, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float64)
+        for layer in (seen, inverse, inverse * inverse, seen * u, seen * v)
+    )
+    known = share > MIN_SHARE
+    share = np.maximum(share, 1e-6)
+    mean, column, row = mean / share, column / share, row / share
+    spread = np.sqrt(np.maximum(square / share - mean**2, 0.0))
+    return _Cells(np.where(known, mean, 1.0), spread, column, row, share, known)
 
 
 def _on_one_surface(cells: _Cells) -> NDArray[np.bool_]:

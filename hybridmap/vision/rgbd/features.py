@@ -83,7 +83,7 @@ def _points_at(pixels: Array, depth_m: NDArray[np.float32], camera: Camera) -> t
     n = valid.sum(axis=0)
     z = np.where(valid, around, 0.0).sum(axis=0) / np.maximum(n, 1)
     spread = around.max(axis=0) - np.where(valid, around, np.inf).min(axis=0)
-    good = (n >= 5) & (spread < MAX_SPREAD * z)
+    good = (n >= 3) & (spread < MAX_SPREAD * z)
     x = (pixels[:, 0] - camera.cx_px) / camera.fx_px
     y = (pixels[:, 1] - camera.cy_px) / camera.fy_px
     return np.stack([x * z, y * z, z], axis=1), good

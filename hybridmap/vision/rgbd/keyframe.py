@@ -12,6 +12,9 @@ from hybridmap.vision.profile import Profile
 from hybridmap.vision.rgbd.depth_grid import Surface, reduced
 from hybridmap.vision.rgbd.features import Features
 
+NEAREST_M, FARTHEST_M = 1e-6, 1e6
+"""Depth beyond these is none: 0, NaN or Inf."""
+
 
 @dataclass(frozen=True, slots=True)
 class WorkingImage:
@@ -55,7 +58,7 @@ def working_image(frame: RgbdFrame, factor: int) -> WorkingImage:
     import cv2
 
     grey = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
-    depth = np.where((frame.depth_m > 0) & (frame.depth_m < np.inf), frame.depth_m, np.float32(0))
+    depth = np.asarray(cv2.copyTo(frame.depth_m, cv2.inRange(frame.depth_m, NEAREST_M, FARTHEST_M)), dtype=np.float32)
     if factor > 1:
         height, width = grey.shape[0] // factor, grey.shape[1] // factor
         grey = cv2.resize(grey[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA)

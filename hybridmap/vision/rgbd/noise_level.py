@@ -29,21 +29,21 @@ class NoiseLevel:
 
     def __init__(self, initial: float) -> None:
         """Begin with a factor that holds until enough closures have been seen."""
-        self._initial = initial
+        self._factor = initial
         self._squared: deque[float] = deque(maxlen=REMEMBERED)
 
     @property
     def factor(self) -> float:
         """What covariances are multiplied by; 1 or more."""
-        if len(self._squared) < ENOUGH:
-            return self._initial
-        return max(1.0, SHARED * float(np.quantile(np.array(self._squared), QUANTILE)) / CHI2_QUANTILE)
+        return self._factor
 
     def observe(self, first: RelativePose, second: RelativePose, across: RelativePose) -> None:
         """Take in a closure: from k-2 to k-1, from k-1 to k, and from k-2 to k, with covariances as the residuals give them."""
         around = compose_relative(first, second)
         error = log(between(around.delta, across.delta))
         self._squared.append(float(error @ np.linalg.solve(around.covariance + across.covariance, error)))
+        if len(self._squared) >= ENOUGH:
+            self._factor = max(1.0, SHARED * float(np.quantile(np.array(self._squared), QUANTILE)) / CHI2_QUANTILE)
 
     def applied(self, relative: RelativePose, translation_floor_m: float, rotation_floor_deg: float) -> RelativePose:
         """The same measurement with the factor on its covariance, and a floor under its standard deviations."""

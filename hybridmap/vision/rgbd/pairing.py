@@ -9,6 +9,7 @@ import numpy as np
 from hybridmap.config.rgbd import RegistrationConfig
 from hybridmap.geometry import Array
 from hybridmap.vision.rgbd.depth_grid import Surface
+from hybridmap.vision.rgbd.spatial import wrenches
 
 NEAREST_M = 0.1
 """A point must be at least this far in front of the camera that it is projected into."""
@@ -16,14 +17,15 @@ NEAREST_M = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Pairing:
-    """Matched points, everything along the axes of the fixed base.
+    """Points of a moving surface beside those in whose cells of a fixed one they fall, along the axes of the fixed base.
 
     Attributes:
-        normal, turned: (n, 3) unit normals of the fixed and of the moving points.
-        arm: (n, 3) moving points seen from the moving base, m.
+        normal, turned: (3, n) unit normals of the fixed and of the moving points.
+        arm: (3, n) moving points seen from the moving base, m.
         residual: (n,) point-to-plane distances, m.
-        variance: (n,) that the sensor's model gives them, m^2.
-        looked_at, in_view: how many moving points were projected, and how many fell on a known cell.
+        variance: (n,) that the sensor's model gives them, m^2; infinite where the two do not match.
+        matched: how many do.
+        looked_at: how many moving points were projected; n of them fell on a known cell.
     """
 
     normal: Array
@@ -31,49 +33,51 @@ class Pairing:
     arm: Array
     residual: Array
     variance: Array
+    matched: int
     looked_at: int
-    in_view: int
 
-    def __len__(self) -> int:
+    @property
+    def in_view(self) -> int:
+        """How many moving points fell on a known cell: n."""
         return len(self.residual)
 
+    def mean(self, values: Array) -> float:
+        """Mean over the points that match, of values (n,)."""
+        return float(values[np.isfinite(self.variance)].sum()) / max(self.matched, 1)
 
-def associate(fixed: Surface, moving: Surface, T: Array, config: RegistrationConfig, stride: int = 1) -> Pairing:
+    def terms(self) -> tuple[Array, Array]:
+        """H (6, 6) and b (6,) of the normal equations, with Cauchy weights."""
+        J = wrenches(self.arm, self.normal)
+        weighted = J / (self.variance + 0.25 * self.residual**2)
+        return weighted @ J.T, -weighted @ self.residual
+
+
+def associate(fixed: Surface, moving: Array, T: Array, config: RegistrationConfig) -> Pairing:
     """Pair each moving point with the one in whose cell of the fixed grid it falls.
 
     Args:
-        fixed, moving: surfaces in their own bases.
+        fixed: the surface in its own base.
+        moving: (7, N) rows of the other surface, or some of their columns.
         T: (4, 4) the moving base in the fixed one.
         config: how far apart, and how differently inclined, the points of a pair may be.
-        stride: look at every so many of the moving points only.
     """
-    camera = fixed.grid.camera
-    points = moving.points[::stride]
-    seen = points @ (fixed.T_camera_base[:3, :3] @ T[:3, :3]).T + fixed.T_camera_base[:3] @ T[:, 3]
-    z = np.maximum(seen[:, 2], 1e-6)
-    column = camera.fx_px * seen[:, 0] / z + (camera.cx_px + 0.5)
-    row = camera.fy_px * seen[:, 1] / z + (camera.cy_px + 0.5)
-    inside = (seen[:, 2] > NEAREST_M) & (column >= 0) & (column < camera.width_px) & (row >= 0) & (row < camera.height_px)
+    camera, turn = fixed.grid.camera, T[:3, :3]
+    matrix = np.array([[camera.fx_px, 0.0, camera.cx_px + 0.5], [0.0, camera.fy_px, camera.cy_px + 0.5], [0.0, 0.0, 1.0]])
+    projection = matrix @ fixed.T_camera_base[:3] @ T
+    seen = projection[:, :3] @ moving[:3] + projection[:, 3:]
+    z = np.maximum(seen[2], 1e-6)
+    column, row = seen[0] / z, seen[1] / z
+    inside = (seen[2] > NEAREST_M) & (column >= 0) & (column < camera.width_px) & (row >= 0) & (row < camera.height_px)
     m = np.flatnonzero(inside)
-    f = fixed.number[row[m].astype(np.int32), column[m].astype(np.int32)]
-    m, f = m[f >= 0], f[f >= 0]
-    normal = fixed.normals.take(f, axis=0)
-    turned = moving.normals[::stride].take(m, axis=0) @ T[:3, :3].T
-    arm = points.take(m, axis=0) @ T[:3, :3].T
-    offset = arm + (T[:3, 3] - fixed.points.take(f, axis=0))
-    residual = np.einsum("ij,ij->i", normal, offset)
-    sigma_fixed, sigma_moving = fixed.sigma_m[f], moving.sigma_m[::stride][m]
-    reach = config.max_distance_m + 3.0 * (sigma_fixed + sigma_moving)
+    f = fixed.number.ravel()[row[m].astype(np.int32) * camera.width_px + column[m].astype(np.int32)]
+    known = f >= 0
+    theirs, ours = fixed.rows.take(f[known], axis=1), moving.take(m[known], axis=1)
+    normal, arm, turned = theirs[3:6], turn @ ours[:3], turn @ ours[3:6]
+    offset = arm + (T[:3, 3:] - theirs[:3])
+    residual = np.einsum("ij,ij->j", normal, offset)
+    reach = config.max_distance_m + 3.0 * (theirs[6] + ours[6])
     keep = np.abs(residual) < reach
-    keep &= np.einsum("ij,ij->i", turned, normal) > np.cos(np.deg2rad(config.max_normal_deg))
-    keep &= np.einsum("ij,ij->i", offset, offset) < 4.0 * reach * reach
-    k = np.flatnonzero(keep)
-    return Pairing(
-        normal.take(k, axis=0),
-        turned.take(k, axis=0),
-        arm.take(k, axis=0),
-        residual[k],
-        sigma_fixed[k] ** 2 + sigma_moving[k] ** 2,
-        len(points),
-        len(m),
-    )
+    keep &= np.einsum("ij,ij->j", turned, normal) > np.cos(np.deg2rad(config.max_normal_deg))
+    keep &= np.einsum("ij,ij->j", offset, offset) < 4.0 * reach * reach
+    variance = np.where(keep, theirs[6] ** 2 + ours[6] ** 2, np.inf)
+    return Pairing(normal, turned, arm, residual, variance, int(np.count_nonzero(keep)), moving.shape[1])

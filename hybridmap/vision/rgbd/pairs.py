@@ -2,13 +2,88 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from hybridmap.geometry import Array
-from hybridmap.vision.rgbd.depth_registration import PointPairs
 from hybridmap.vision.rgbd.features import Correspondences
 from hybridmap.vision.rgbd.keyframe import Keyframe
-from hybridmap.vision.rgbd.spatial import apply
+from hybridmap.vision.rgbd.spatial import apply, wrenches
+
+AGREEING = 11.3
+"""Squared error of a pair over its covariance that one in a hundred right pairs exceeds (3 degrees of freedom)."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointPairs:
+    """Keypoints seen in both frames. Each carries its information across the ray of sight, and more or less along it.
+
+    Attributes:
+        fixed, moving: (K, 3) points in the base of either frame, m.
+        ray: (K, 3) unit vectors, the lines of sight in the fixed base.
+        across: (K,) information in every direction, m^-2.
+        excess: (K,) what is to be added to it along the ray, m^-2 (negative: depth is the less certain).
+    """
+
+    fixed: Array
+    moving: Array
+    ray: Array
+    across: Array
+    excess: Array
+
+    def __len__(self) -> int:
+        return len(self.fixed)
+
+    def agreeing(self, T_fixed_moving: Array) -> int:
+        """How many lie where a pose (4, 4) has them, as well as they are known."""
+        error = apply(T_fixed_moving, self.moving) - self.fixed
+        return int(np.count_nonzero(self._squared(error, np.einsum("ki,ki->k", self.ray, error)) < AGREEING))
+
+    def near(self, T_fixed_moving: Array, reach_m: float) -> PointPairs | None:
+        """The pairs that a guess (4, 4) brings within `reach_m` of each other; None where fewer than three."""
+        gap = np.linalg.norm(apply(T_fixed_moving, self.moving) - self.fixed, axis=1)
+        keep = np.flatnonzero(gap < reach_m)
+        if len(keep) < 3:
+            return None
+        return PointPairs(self.fixed[keep], self.moving[keep], self.ray[keep], self.across[keep], self.excess[keep])
+
+    def terms(self, T_fixed_moving: Array) -> tuple[Array, Array]:
+        """H (6, 6) and b (6,) of the normal equations at a pose (4, 4), with Cauchy weights.
+
+        The information across depends on sums over the arms alone; what is added along the ray gives one wrench a pair.
+        """
+        arm = T_fixed_moving[:3, :3] @ self.moving.T
+        error = arm + T_fixed_moving[:3, 3:] - self.fixed.T
+        along = np.einsum("ki,ik->k", self.ray, error)
+        weight = 1.0 / (1.0 + self._squared(error.T, along) / 9.0)
+        across, excess = weight * self.across, weight * self.excess
+        sight = wrenches(arm, self.ray.T)
+        pull = across * error + (excess * along) * self.ray.T
+        moment = arm @ pull.T
+        turn = moment[[1, 2, 0], [2, 0, 1]] - moment[[2, 0, 1], [1, 2, 0]]
+        return _isotropic(arm, across) + (sight * excess) @ sight.T, -np.concatenate([pull.sum(axis=1), turn])
+
+    def _squared(self, error: Array, along: Array) -> Array:
+        return np.asarray(self.across * np.einsum("ki,ki->k", error, error) + self.excess * along**2)
+
+
+def _isotropic(arm: Array, information: Array) -> Array:
+    """Sum (6, 6) of information J' J with J = [1, -[arm]x], over arms (3, K) and information (K,)."""
+    carried = arm * information
+    total = float(information.sum())
+    x, y, z = carried.sum(axis=1).tolist()
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = (carried @ arm.T).tolist()
+    return np.array(
+        [
+            [total, 0.0, 0.0, 0.0, z, -y],
+            [0.0, total, 0.0, -z, 0.0, x],
+            [0.0, 0.0, total, y, -x, 0.0],
+            [0.0, -z, y, yy + zz, -xy, -xz],
+            [z, 0.0, -x, -xy, xx + zz, -yz],
+            [-y, x, 0.0, -xz, -yz, xx + yy],
+        ]
+    )
 
 
 def point_pairs(
@@ -31,20 +106,8 @@ def point_pairs(
     if len(matches.first) < 3:
         return None
     a, b = fixed.features.points[matches.first], moving.features.points[matches.second]
-    rotation = fixed.surface.stance.T_base_camera[:3, :3]
-    ray = (a / np.linalg.norm(a, axis=1, keepdims=True)) @ rotation.T
-    z = a[:, 2]
-    along = 1.0 / (2.0 * (0.005 + depth_sigma * z**2) ** 2)
-    across = 1.0 / (2.0 * (z / focal_px) ** 2)
-    outer = np.einsum("ki,kj->kij", ray, ray)
-    information = across[:, None, None] * np.eye(3) + (along - across)[:, None, None] * outer
-    return PointPairs(apply(fixed.surface.stance.T_base_camera, a), apply(moving.surface.stance.T_base_camera, b), information)
-
-
-def near(pairs: PointPairs, T_fixed_moving: Array, reach_m: float) -> PointPairs | None:
-    """The pairs that a guess (4, 4) brings within `reach_m` of each other; None where fewer than three."""
-    gap = np.linalg.norm(apply(T_fixed_moving, pairs.moving) - pairs.fixed, axis=1)
-    keep = gap < reach_m
-    if keep.sum() < 3:
-        return None
-    return PointPairs(pairs.fixed[keep], pairs.moving[keep], pairs.information[keep])
+    T_base_camera, z = fixed.surface.stance.T_base_camera, a[:, 2]
+    ray = (a / np.linalg.norm(a, axis=1, keepdims=True)) @ T_base_camera[:3, :3].T
+    along = 0.5 / (0.005 + depth_sigma * z**2) ** 2
+    across = 0.5 * (focal_px / z) ** 2
+    return PointPairs(apply(T_base_camera, a), apply(moving.surface.stance.T_base_camera, b), ray, across, along - across)

@@ -69,13 +69,19 @@ def small_rotvec(R: Array) -> Array:
     return np.asarray(0.5 * twice_sin * angle / sin)
 
 
-def cross_into(out: Array, a: Array, b: Array) -> None:
-    """Row-wise cross product of (N, 3) arrays, into `out` (numpy's own is several times slower)."""
-    ax, ay, az = a[:, 0], a[:, 1], a[:, 2]
-    bx, by, bz = b[:, 0], b[:, 1], b[:, 2]
-    out[:, 0] = ay * bz - az * by
-    out[:, 1] = az * bx - ax * bz
-    out[:, 2] = ax * by - ay * bx
+def wrenches(arm: Array, direction: Array) -> Array:
+    """Directions (3, N) over their moments (numpy's own cross product is several times slower): (6, N).
+
+    So the distance of a point at `arm` (3, N) along its direction changes with a shift and with a turn about the origin.
+    """
+    out = np.empty((6, arm.shape[1]))
+    ax, ay, az = arm
+    bx, by, bz = direction
+    out[:3] = direction
+    out[3] = ay * bz - az * by
+    out[4] = az * bx - ax * bz
+    out[5] = ax * by - ay * bx
+    return out
 
 
 def apply(T_a_b: Array, points_b: Array) -> Array:

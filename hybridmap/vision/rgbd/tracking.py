@@ -12,11 +12,11 @@ from hybridmap.geometry import Array, RelativePose, between, compose, compose_re
 from hybridmap.streams.base import Camera
 from hybridmap.vision.base import Proposal, Verdict
 from hybridmap.vision.rgbd.depth_grid import place
-from hybridmap.vision.rgbd.depth_registration import PointPairs, Registration, register
+from hybridmap.vision.rgbd.depth_registration import Registration, register
 from hybridmap.vision.rgbd.features import match
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.noise_level import NoiseLevel
-from hybridmap.vision.rgbd.pairs import near, point_pairs
+from hybridmap.vision.rgbd.pairs import PointPairs, point_pairs
 from hybridmap.vision.rgbd.spatial import from_planar
 from hybridmap.vision.rgbd.stance import Stance
 
@@ -88,7 +88,7 @@ class Tracker:
     def _pairs(self, fixed: Keyframe, moving: Keyframe, guess: Array) -> PointPairs | None:
         matches = match(fixed.features, moving.features, self._ratio)
         pairs = point_pairs(fixed, moving, matches, self._focal_px, self._config.depth_sigma)
-        return None if pairs is None else near(pairs, guess, self._config.keypoint_reach_m)
+        return None if pairs is None else pairs.near(guess, self._config.keypoint_reach_m)
 
     def _judge(self, source: int, target: int, fit: Registration | None, prior: RelativePose) -> Proposal:
         key = self._new_key()

@@ -42,6 +42,22 @@ def test_grid_points_and_normals_lie_on_the_walls():
     assert np.median(placed.normals[floor, 2]) == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.parametrize(("lost", "share"), [(0.3, 0.9), (0.6, 0.4)])
+def test_missing_pixels_cost_few_cells_and_no_accuracy(lost, share):
+    """Single pixels without depth, as grazing or dark surfaces give them: what is left of a cell is put where it was seen."""
+    view, rng = camera(height_m=1.2, pitch_deg=-25.0), np.random.default_rng(2)
+    frame = render(view, [-1.0, 0.0, 0.0])
+    stance = Stance(view.T_base_camera, *LEVEL, False)
+    whole = make_grid(frame.depth_m, view, CONFIG.grid_px, CONFIG.depth_sigma)
+    torn = frame.depth_m * (rng.random(frame.depth_m.shape) >= lost)
+    left = place(make_grid(torn, view, CONFIG.grid_px, CONFIG.depth_sigma), stance)
+    assert len(left.points) > share * whole.valid.sum()
+    floor = left.normals[:, 2] > 0.99
+    assert floor.sum() > 30
+    assert np.abs(left.points[floor, 2]).max() < 1e-5
+    assert np.median(left.sigma_m) > np.median(whole.sigma_m[whole.valid])
+
+
 def test_registration_recovers_the_motion_from_a_wrong_start():
     view = camera()
     first, second = np.array([0.3, 0.1, -0.7]), np.array([0.5, 0.0, -0.5])
