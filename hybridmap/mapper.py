@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -79,7 +79,7 @@ class Mapper:
         self.book = EdgeBook(self.map, config.edges)
         self.integrator = PathIntegrator(config.neural)
         self.cells = Reanchoring(self.integrator, config.neural.reanchor_weight)
-        self.vision = create_front_end(config.vision, rig if rig is not None else rig_of(config.sensors), config.seed)
+        self.vision = create_front_end(config.vision, rig or rig_of(config.sensors), config.seed, self.clock)
         self.backends = Ensemble(config.backends, self.clock)
         self.calibration = OnlineCalibration(config.calibration, Gains.of(config.neural))
         self.retraced: Retraced | None = None
@@ -132,13 +132,14 @@ class Mapper:
         reason = self._novelty.reason(moved, lambda: self.integrator.place_code, view is not None and view.new_template)
         if reason is None:
             return self._update(pose_odom, "nothing new")
-        node = self._make_node(pose_odom, moved, view)
-        edges = self._join_to_chain(node)
-        if view is not None:
-            edges += self._refine_self_motion(node, view)
-            edges += self._close_loops(node)
-        self._since_node = (0.0, 0.0)
-        self._correct()
+        with self.clock.stage("graph"):
+            node = self._make_node(pose_odom, moved, view)
+            edges = self._join_to_chain(node)
+            if view is not None:
+                edges += self._refine_self_motion(node, view)
+                edges += self._close_loops(node)
+            self._since_node = (0.0, 0.0)
+            self._correct()
         return self._update(pose_odom, reason + self._calibrate(), node, edges)
 
     def finish(self) -> list[Update]:
@@ -178,10 +179,11 @@ class Mapper:
         """(N, 3) current poses of all nodes by a back-end (default: the primary)."""
         return self.backends.poses(self.map.pose_graph(), backend)
 
-    def belief(self) -> Belief:
-        """What the map believes, for the gating of loop closures."""
+    def belief(self, doubted: Sequence[int] = ()) -> Belief:
+        """What the map believes, for the gating of loop closures; edges of the numbers `doubted` hold nothing together."""
         own = self.config.edges.gate == "odometry"
         graph = self.map.pose_graph().only(EdgeKind.ODOMETRY) if own else self.map.pose_graph()
+        graph = graph.with_edges(~np.isin(graph.edge_ids, doubted)) if len(doubted) else graph
         return Belief(
             poses_map_node=graph.initial if own else self.backends.poses(graph),
             stamps_s=np.array([node.stamp_ns for node in self.map.nodes]) / NS_PER_S,
@@ -206,7 +208,7 @@ class Mapper:
             return []
         doubted = self.book.doubted(solution.report)
         with self.clock.stage("matching"):
-            proposals = self.vision.verify(doubted, self.belief()) if doubted else []
+            proposals = self.vision.verify(doubted, self.belief(solution.report.rejected_edge_ids)) if doubted else []
         return self.book.enter_again(proposals, self.backends.primary)
 
     def _report_rejected(self) -> list[int]:

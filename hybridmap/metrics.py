@@ -50,16 +50,25 @@ def to_json(head: dict[str, Any], metrics: Iterable[Metric]) -> str:
 
 
 class StageClock:
-    """Process time by stage; kept apart from results, which never depend on it."""
+    """Process time by stage; kept apart from results, which never depend on it.
+
+    Attributes:
+        cpu_s: seconds by stage. A stage within another counts by itself alone, so that the sum is that of all stages.
+    """
 
     def __init__(self) -> None:
         self.cpu_s: dict[str, float] = {}
+        self._within: list[float] = []
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the process time of the block to a stage."""
+        """Add the process time of the block to a stage, but for that of the stages within it."""
+        self._within.append(0.0)
         start = time.process_time()
         try:
             yield
         finally:
-            self.cpu_s[name] = self.cpu_s.get(name, 0.0) + time.process_time() - start
+            spent = time.process_time() - start
+            self.cpu_s[name] = self.cpu_s.get(name, 0.0) + spent - self._within.pop()
+            if self._within:
+                self._within[-1] += spent

@@ -29,6 +29,8 @@ class RegistrationConfig(Section):
     """How many earlier nodes a new one is registered to."""
     grid_px: int = Field(default=5, ge=2)
     """Depth is averaged over, and sampled at, cells of so many pixels (at the working width)."""
+    grid_columns: int = Field(default=48, ge=8)
+    """Cells are smaller where a picture is too narrow for so many columns of them."""
     iterations: int = Field(default=10, ge=1)
     """Gauss-Newton steps."""
     max_distance_m: float = Field(default=0.15, gt=0)
@@ -59,6 +61,10 @@ class RegistrationConfig(Section):
     """The same for a camera whose tilt comes from the floor plane, degrees."""
     contradiction_sigma: float = Field(default=8.0, gt=0)
     """A good registration that differs from odometry by more than this many sigma contradicts it."""
+
+    def cell_px(self, width_px: int) -> int:
+        """Side of a cell at a working width, pixels."""
+        return max(2, min(self.grid_px, width_px // self.grid_columns))
 
     def floors(self, held: bool) -> tuple[float, float]:
         """Floors of a consecutive edge, m and degrees."""
@@ -156,7 +162,9 @@ class RgbdClosingConfig(Section):
     repropose_sigma_deg: float = Field(default=3.0, gt=0)
     """By depth alone: how far the map may be off, degrees."""
     repropose_per_node: int = Field(default=2, ge=1)
-    """At the end, candidates tried for a node."""
+    """Candidates tried for a node."""
+    repropose_online: int = Field(default=1, ge=0)
+    """While driving, earlier nodes tried again with each new one, once a closure has moved them; 0: none."""
 
 
 class RgbdConfig(Section):

@@ -106,6 +106,7 @@ _OTHERWISE = (
         "too few others",
         "closures of {vision.relocalising.support} nodes over {vision.relocalising.span_m} m of travel that agree",
     ),
+    ("sigma of it", "views that fit as the map has their nodes, or a map that is less sure of where these lie"),
     (
         "outside the gate",
         f"a less certain map, or a wider gate: {{{_LASER}.gate_sigmas}} sigma + {{{_LASER}.gate_m}} m and "

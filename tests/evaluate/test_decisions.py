@@ -70,6 +70,7 @@ def test_depth_alone_scans_and_steps_have_rules_of_their_own():
         ("contradicts the cluster of 4 probes", "a cluster of its own"),
         ("contradicted by registration: x", "edges.drop_contradicted: false"),
         ("lost: waits for others that put the robot there", "4 nodes"),
+        ("features and depth agree on 1.50 m, 3.0 deg from the map, 9.1 sigma of it", "a map that is less sure"),
         ("something nobody foresaw", ""),
     ],
 )

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.rgbd import RgbdConfig
 from hybridmap.config.vision import MatchingConfig, RelocalisingConfig
-from hybridmap.geometry import Array, RelativePose, between, compose, wrap_angle
-from hybridmap.vision.base import Belief, Proposal, Verdict
+from hybridmap.geometry import Array, RelativePose, between, wrap_angle
+from hybridmap.metrics import StageClock
+from hybridmap.vision.base import Belief, Doubted, Proposal, Verdict
 from hybridmap.vision.gating import GATE_FIELDS, nodes_within
 from hybridmap.vision.profile import Profile
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp import Verification, Verifier
 from hybridmap.vision.rgbd.relocalising import Relocaliser
+from hybridmap.vision.rgbd.revisits import Revisits
+from hybridmap.vision.rgbd.second_look import SecondLook
+from hybridmap.vision.rgbd.support import Hypothesis, Support
 from hybridmap.vision.templates import MODERATE_THRESHOLD, Matcher
 
 Indices = NDArray[np.int64]
@@ -26,23 +29,6 @@ RANKED = 6
 DEFAULT_RELOCALISING = RelocalisingConfig()
 SURE = 4.0
 """While driving, depth alone is trusted only where the map's own uncertainty is below this many `repropose_sigma`."""
-
-
-@dataclass(slots=True)
-class _Hypothesis:
-    """A measured edge, waiting for support or accepted."""
-
-    proposal: Proposal
-    relative: RelativePose
-    finding: str
-
-    @property
-    def source(self) -> int:
-        return self.proposal.source
-
-    @property
-    def target(self) -> int:
-        return self.proposal.target
 
 
 class LoopCloser:
@@ -56,6 +42,7 @@ class LoopCloser:
         verifier: Verifier,
         yaw_of_shift: Callable[[int], float],
         new_key: Callable[[], int],
+        clock: StageClock,
         relocalising: RelocalisingConfig = DEFAULT_RELOCALISING,
     ) -> None:
         self._keyframes = keyframes
@@ -64,6 +51,7 @@ class LoopCloser:
         self._verifier = verifier
         self._yaw_of_shift = yaw_of_shift
         self._new_key = new_key
+        self._clock = clock
         self._matcher = Matcher(
             config.matching, matching.mu_r, matching.mu_d, matching.max_shift, matching.g_bar, matching.sequence
         )
@@ -71,14 +59,14 @@ class LoopCloser:
         self._relocalising = relocalising
         unverified = config.verify == "none"
         self._c_t = matching.c_t if matching.c_t is not None or not unverified else MODERATE_THRESHOLD[config.matching]
-        self._hypotheses: defaultdict[int, list[_Hypothesis]] = defaultdict(list)
-        self._pending: list[_Hypothesis] = []
-        self._filed: set[tuple[int, int]] = set()
+        self._support = Support(config.closing)
+        self._revisits = Revisits(config.closing)
         self._tried: set[tuple[int, int]] = set()
         self._travel_at_closure = 0.0
         self._noted, self._note = -1, dict[str, Array]()
         sigma_m, sigma_rad = config.closing.repropose_sigma_m, np.deg2rad(config.closing.repropose_sigma_deg)
         self._map_covariance = np.diag([sigma_m, sigma_m, sigma_rad]) ** 2
+        self._second_look = SecondLook(keyframes, verifier, self._map_covariance)
         self._rounds_left = config.closing.repropose_rounds
 
     def add_node(self, profile: Profile) -> None:
@@ -87,6 +75,7 @@ class LoopCloser:
 
     def close(self, node: int, belief: Belief) -> list[Proposal]:
         """Look for loops of one node, and settle what was pending."""
+        since_m = self._travel_at_closure
         gated = self._gate(node, belief)
         changed = self._try_candidates(node, self._ranked(node, gated), belief) if len(gated) else []
         if self._config.verify != "none":
@@ -95,7 +84,23 @@ class LoopCloser:
                 near = self._nearest(node, 1, belief)
                 changed += self._try_again(node, near, belief, {j for j in near if self._is_sure(node, j, belief)})
             changed += self._relocalise(node, gated, changed, belief)
-        return [*changed, *self._give_up(before=node - self._closing.pending_nodes)]
+            if not broken:
+                changed += self._catch_up(belief)
+        if self._travel_at_closure > since_m:
+            self._revisits.closed(node, since_m, belief)
+        return [*changed, *self._support.give_up(before=node - self._closing.pending_nodes)]
+
+    def _catch_up(self, belief: Belief) -> list[Proposal]:
+        """Try a few of the nodes again that a closure has moved."""
+        out: list[Proposal] = []
+        for _ in range(self._closing.repropose_online):
+            node = self._revisits.next_moved(belief)
+            if node is None:
+                break
+            if self._support.accepted(node) < self._closing.accept:
+                near = self._nearest(node, self._closing.repropose_per_node, belief)
+                out += self._try_again(node, near, belief, {j for j in near if self._is_sure(node, j, belief)})
+        return out
 
     def tracked(self, node: int, steps: list[Proposal]) -> None:
         """Take notice of how a new node was registered to the ones before it."""
@@ -121,7 +126,8 @@ class LoopCloser:
         found = self._relocaliser.search(node, np.setdiff1d(old, gated).astype(np.int64), belief)
         closures = {(p.source, p.target) for p in found if p.kind == "loop" and p.verdict is Verdict.ACCEPTED}
         if closures:
-            self._filed |= closures
+            for source, target in closures:
+                self._support.join(source, target)
             self._travel_at_closure = float(belief.travel_m[node])
         return found
 
@@ -132,13 +138,24 @@ class LoopCloser:
             self._rounds_left -= 1
             first_break = self._relocaliser.whereabouts.first_break
             for node in range(len(self._keyframes)):
-                accepted = sum(h.proposal.verdict is Verdict.ACCEPTED for h in self._hypotheses.get(node, ()))
-                if accepted < self._closing.accept:
+                if self._support.accepted(node) < self._closing.accept:
                     near = self._nearest(node, self._closing.repropose_per_node, belief)
                     placed = first_break is None or node < first_break
                     out += self._try_again(node, near, belief, near if placed else ())
         out += self._relocaliser.dismiss("too few others put the robot there")
-        return [*out, *self._give_up(before=len(self._keyframes))]
+        return [*out, *self._support.give_up(before=len(self._keyframes))]
+
+    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Proposal]:
+        """Measure doubted loops again; `belief` is that of the map without them."""
+        if self._config.verify == "none":
+            return []
+        out = []
+        for d in doubted:
+            found = self._second_look.measure(d, belief)
+            verdict = Verdict.REJECTED if found.relative is None else Verdict.ACCEPTED
+            out.append(Proposal(d.key, "loop", d.source, d.target, verdict, found.reason, found.relative, found.scores))
+            self._support.replace(out[-1])
+        return out
 
     def _is_sure(self, node: int, target: int, belief: Belief) -> bool:
         """The map knows well enough where a node lies to be a guess for depth alone."""
@@ -167,7 +184,8 @@ class LoopCloser:
     def _ranked(self, node: int, gated: Indices) -> dict[int, dict[str, float]]:
         """The best candidates by profile, some nodes apart, with their scores."""
         ranked = RANKED * self._closing.candidates
-        match = self._matcher.best(self._keyframes[node].profile, ranked, gated, ending_at=node)
+        with self._clock.stage("search"):
+            match = self._matcher.best(self._keyframes[node].profile, ranked, gated, ending_at=node)
         self._note["ranked"] = np.column_stack([match.indices, match.score, match.shift])
         chosen: dict[int, dict[str, float]] = {}
         for i, target in enumerate(match.indices.tolist()):
@@ -219,52 +237,10 @@ class LoopCloser:
         if found.relative is None:
             return [proposal]
         waiting = replace(proposal, verdict=Verdict.PENDING, reason="waits for support")
-        return self._raise(_Hypothesis(waiting, found.relative, found.reason), belief)
-
-    def _raise(self, new: _Hypothesis, belief: Belief) -> list[Proposal]:
-        """File a hypothesis; accept it and what it supports if another one agrees."""
-        near = self._beside(new)
-        friends = [h for h in near if h.proposal.verdict is Verdict.PENDING and self._agrees(new, h, belief)]
-        accepted = (h for h in near if h.proposal.verdict is Verdict.ACCEPTED)
-        supported = bool(friends) or self._closing.support_nodes == 0 or any(self._agrees(new, h, belief) for h in accepted)
-        self._hypotheses[new.source].append(new)
-        self._pending.append(new)
-        self._filed.add((new.source, new.target))
-        if not supported:
-            return [new.proposal]
-        changed = [new, *friends]
-        for h in changed:
-            h.proposal = replace(h.proposal, verdict=Verdict.ACCEPTED, reason=f"{h.finding}; supported")
-        self._travel_at_closure = max(self._travel_at_closure, float(belief.travel_m[new.source]))
-        return [h.proposal for h in changed]
-
-    def _beside(self, new: _Hypothesis) -> list[_Hypothesis]:
-        """Edges from other nodes near its source, to nodes near its target."""
-        reach = self._closing.support_nodes
-        sources = (source for source in range(new.source - reach, new.source + reach + 1) if source != new.source)
-        return [h for source in sources for h in self._hypotheses.get(source, ()) if abs(h.target - new.target) <= reach]
-
-    def _agrees(self, a: _Hypothesis, b: _Hypothesis, belief: Belief) -> bool:
-        """Two edges give the same pose through the chain between them."""
-        poses = belief.poses_map_node
-        around = compose(between(poses[a.source], poses[b.source]), b.relative.delta)
-        around = compose(around, between(poses[b.target], poses[a.target]))
-        gap = between(a.relative.delta, around)
-        length = sum(
-            abs(float(belief.travel_m[i] - belief.travel_m[j])) for i, j in ((a.source, b.source), (a.target, b.target))
-        )
-        limit_m = self._closing.support_m + 0.03 * length
-        limit_rad = np.deg2rad(self._closing.support_deg + 0.5 * length)
-        return bool(np.hypot(gap[0], gap[1]) < limit_m and abs(gap[2]) < limit_rad)
-
-    def _give_up(self, before: int) -> list[Proposal]:
-        """Reject what has waited for support too long."""
-        self._pending = [h for h in self._pending if h.proposal.verdict is Verdict.PENDING]
-        late = [h for h in self._pending if h.source < before]
-        for h in late:
-            self._filed.discard((h.source, h.target))
-            h.proposal = replace(h.proposal, verdict=Verdict.REJECTED, reason="no other edge supports it")
-        return [h.proposal for h in late]
+        changed = self._support.file(Hypothesis(waiting, found.relative, found.reason), belief)
+        if changed[0].verdict is Verdict.ACCEPTED:
+            self._travel_at_closure = max(self._travel_at_closure, float(belief.travel_m[node]))
+        return changed
 
     def _nearest(self, node: int, most: int, belief: Belief) -> dict[int, dict[str, float]]:
         """Earlier nodes that see the same place from nearly the same pose and are not joined to this one yet, nearest first."""
@@ -277,7 +253,7 @@ class LoopCloser:
         chosen: dict[int, dict[str, float]] = {}
         for i in np.argsort(np.where(near, cost, np.inf), kind="stable")[: int(near.sum())]:
             target = int(i)
-            if (node, target) in self._filed:
+            if self._support.has(node, target):
                 continue
             if all(abs(target - other) >= self._closing.separation for other in chosen):
                 chosen[target] = {"map_distance_m": float(gap[i])}

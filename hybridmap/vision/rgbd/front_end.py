@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +12,9 @@ from numpy.typing import NDArray
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, RelativePose
+from hybridmap.metrics import StageClock
 from hybridmap.streams.base import Camera, Observation, RgbdFrame
-from hybridmap.vision.base import Belief, Proposal, View
+from hybridmap.vision.base import Belief, Doubted, Proposal, View
 from hybridmap.vision.profile import image_profile
 from hybridmap.vision.rgbd.closing import LoopCloser
 from hybridmap.vision.rgbd.depth_grid import make_grid, place
@@ -35,20 +37,22 @@ from hybridmap.vision.templates import ViewTemplates
 class RgbdFrontEnd:
     """Scanline profiles, depth registration of consecutive nodes, loops verified by features and depth.
 
-    Implements `vision.base.FrontEnd`.
+    Implements `vision.base.VerifyingFrontEnd`.
 
     Args:
         config: settings of the visual side.
         camera: pinhole and mounting of the frames.
         seed: for RANSAC.
+        clock: is given the stage `search`; what else closing takes is verification.
     """
 
-    def __init__(self, config: VisionConfig, camera: Camera, seed: int) -> None:
+    def __init__(self, config: VisionConfig, camera: Camera, seed: int, clock: StageClock | None = None) -> None:
         rgbd, matching, templates = config.rgbd, config.matching, config.templates
         self._config = config
         self._full_camera = camera
         self._factor = working_factor(camera, rgbd.max_width_px)
         self._camera = working_camera(camera, rgbd.max_width_px)
+        self._cell_px = rgbd.registration.cell_px(self._camera.width_px)
         self._bands = config.profile.bands if rgbd.matching == "four-band" else 1
         self._templates = ViewTemplates(
             templates.threshold, templates.stable_frames, templates.max_shift, matching.mu_r, matching.mu_d
@@ -61,7 +65,14 @@ class RgbdFrontEnd:
         self._verifier = Verifier(self._camera, rgbd.pnp, rgbd.features, rgbd.registration, level, seed)
         self._posture = Posture(rgbd.tilt, camera.T_base_camera, self._verifier.solver, rgbd.features.ratio)
         self._closer = LoopCloser(
-            self._keyframes, matching, rgbd, self._verifier, self._yaw_of_shift, keys.__next__, config.relocalising
+            self._keyframes,
+            matching,
+            rgbd,
+            self._verifier,
+            self._yaw_of_shift,
+            keys.__next__,
+            clock or StageClock(),
+            config.relocalising,
         )
         self._frame: RgbdFrame | None = None
         self._image: WorkingImage | None = None
@@ -93,7 +104,7 @@ class RgbdFrontEnd:
         features = detect(
             self._image.grey, self._image.depth_m, self._camera, rgbd.features.count, rgbd.features.fast_threshold
         )
-        grid = make_grid(self._image.depth_m, self._camera, rgbd.registration.grid_px, rgbd.registration.depth_sigma)
+        grid = make_grid(self._image.depth_m, self._camera, self._cell_px, rgbd.registration.depth_sigma)
         stance = self._posture.stance(grid, features, self._keyframes[-1] if self._keyframes else None)
         self._keyframes.append(Keyframe(view.profile, features, place(grid, stance)))
         self._images.append((node, self._frame))
@@ -112,6 +123,10 @@ class RgbdFrontEnd:
     def finish(self, belief: Belief) -> list[Proposal]:
         """Re-propose on the optimised map; settle what is pending."""
         return self._closer.finish(belief)
+
+    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Proposal]:
+        """Measure again, from where their nodes lie on the map, loops that a back-end holds for false."""
+        return self._closer.verify(doubted, belief)
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
         """`profile` float32, `color` (H, W, 3) uint8 RGB, `depth_mm` (H, W) uint16, `T_base_camera` (4, 4) as it was then.

@@ -20,6 +20,9 @@ from hybridmap.vision.rgbd.pnp_solver import PnpSolver
 from hybridmap.vision.rgbd.spatial import FloorPose, from_planar, inverse_rigid, to_floor
 from hybridmap.vision.rgbd.stance import level_pair
 
+GUESSED = 2.0
+"""Standard deviations of a guess over which features are looked for around it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Verification:
@@ -91,6 +94,32 @@ class Verifier:
             direction = round(np.degrees(loosest_direction(fit.relative.covariance)[1]))
             return Verification(None, f"depth slides: free along {direction} deg ({fit.slack_m:.2f} m)", scores)
         return Verification(self._calibrated(fit.relative, source, target), "depth agrees with the map", scores)
+
+    def verify_near(self, source: Keyframe, target: Keyframe, guess: RelativePose) -> Verification:
+        """Measure from where the map has the target: by depth and the features that the guess brings together, else by depth.
+
+        Args:
+            source, target: the keyframes.
+            guess: the target in the source's frame as the map has it, and how far that may be off.
+        """
+        pairs = point_pairs(
+            source,
+            target,
+            match(source.features, target.features, self._ratio),
+            self._focal_px,
+            self._registration.depth_sigma,
+        )
+        start = from_planar(guess.delta)
+        reach_m = self._registration.keypoint_reach_m + GUESSED * loosest_direction(guess.covariance)[0]
+        close = None if pairs is None else pairs.near(start, reach_m)
+        if close is None or len(close) < self._pnp.min_inliers:
+            return self.verify_on_map(source, target, guess)
+        fit = register(source.surface, target.surface, start, guess, self._registration, close)
+        agreeing = 0 if fit is None else close.agreeing(fit.T_fixed_moving)
+        if fit is None or agreeing < self._pnp.min_inliers or fit.inliers < self._registration.min_inliers:
+            return self.verify_on_map(source, target, guess)
+        scores = {"inliers": float(agreeing), "depth_inliers": fit.inliers, "overlap": fit.overlap, "points": float(fit.points)}
+        return Verification(self._calibrated(fit.relative, source, target), "features and depth agree with the map", scores)
 
     def _implausible(self, flat: FloorPose, reverse: FloorPose, held: bool, scores: dict[str, float]) -> str | None:
         """Why the two poses cannot be right, or None."""

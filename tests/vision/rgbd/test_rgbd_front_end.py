@@ -237,6 +237,14 @@ def test_wide_images_are_reduced(poses):
     assert front_end.keyframe(0)["color"].shape == (360, 480, 3)
 
 
+@pytest.mark.parametrize(("width", "columns"), [(160, 53), (240, 48), (320, 64), (640, 64)])
+def test_cells_are_smaller_where_the_picture_is_narrow(width, columns):
+    view = camera(width=width)
+    front_end = RgbdFrontEnd(VisionConfig(), view, seed=0)
+    front_end.add_node(0, front_end.observe(render(view, np.zeros(3)), np.zeros(3)))
+    assert front_end._keyframes[0].surface.grid.valid.shape[1] == columns
+
+
 def test_wrong_frames_are_refused():
     front_end = RgbdFrontEnd(VisionConfig(), VIEW, seed=0)
     with pytest.raises(StreamError, match="found LaserScan"):
