@@ -8,6 +8,7 @@ import pytest
 
 from hybridmap.config import Config
 from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.streams.base import RgbdFrame, SelfMotion
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -30,7 +31,7 @@ def test_a_drive_in_memory_has_its_track_its_costs_and_its_errors(short_drive):
     runs, run = short_drive
     assert run.frames == 26
     assert len(run.track) == len(run.truth)
-    assert set(run.cpu_s) >= {"profile", "tracking", "matching", "neural", "backend/gtsam-gnc"}
+    assert set(run.cpu_s) >= {"profile", "tracking", "matching", "neural", "graph", "rest", "backend/gtsam-gnc"}
     assert run.ate_m("gtsam-gnc") < 0.1
     edges = runs.edge_errors(run, EdgeKind.REGISTRATION)
     assert len(edges.numbers) == len(edges.trans_m) == len(edges.rot_deg) == len(edges.chi2) > 5
@@ -67,3 +68,30 @@ def test_a_sweep_judges_one_value():
     one = sweep.outcome("lab", config, "12")
     assert (one.loops, one.rejected, one.wrong, one.wrong_kept) == (0, 0, 0, 0)
     assert 0 < one.map_m <= one.odometry_m
+
+
+def test_a_drive_is_spoilt_the_same_way_each_time_and_as_the_case_says():
+    robustness, streams = importlib.import_module("rgbd_robustness"), importlib.import_module("hybridmap.streams.open")
+    config = Config.load("lab", {"simulation.duration_s": 3.0})
+    clean = list(streams.open_stream("lab", config))
+    case = robustness.Case(lost=0.3, range_max_m=2.0, color_noise=10.0, exposure_s=0.05, noise=3.0)
+    spoilt = robustness.Spoilt(streams.open_stream("lab", config), case, seed=4)
+    once, again = list(spoilt), list(spoilt)
+    frames = [(a, b) for a, b in zip(clean, once, strict=True) if isinstance(b, RgbdFrame)]
+    assert all(np.array_equal(a.color, b.color) for a, b in zip(once, again, strict=True) if isinstance(a, RgbdFrame))
+    for before, after in frames:
+        near = (before.depth_m > 0) & (before.depth_m <= 2.0)
+        assert after.depth_m.max() <= 2.0
+        assert (after.depth_m[near] > 0).mean() == pytest.approx(0.7, abs=0.05)
+        assert np.std(after.color.astype(float) - before.color) > 5.0
+    motion = [(a, b) for a, b in zip(clean, once, strict=True) if isinstance(b, SelfMotion)]
+    assert [a.stamp_ns for a, _ in motion] == [b.stamp_ns for _, b in motion]
+    assert not np.array_equal(motion[-1][0].pose_odom_robot, motion[-1][1].pose_odom_robot)
+    assert motion[-1][0].pose_odom_robot == pytest.approx(motion[-1][1].pose_odom_robot, abs=0.3)
+
+
+def test_a_map_worse_than_odometry_and_a_false_edge_miss_their_bars():
+    robustness = importlib.import_module("rgbd_robustness")
+    figures = {"ate_gtsam-gnc": 0.1, "ate_odometry": 0.3, "false": 0.0}
+    assert [m.passed for m in robustness.held("x", figures)] == [True, True]
+    assert [m.passed for m in robustness.held("x", {**figures, "ate_odometry": 0.05, "false": 1.0})] == [False, False]

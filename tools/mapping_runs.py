@@ -22,6 +22,7 @@ from hybridmap.evaluate.trajectory import absolute_error
 from hybridmap.graph.experience_map import ExperienceMap, Status
 from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.mapper import Mapper, Update
+from hybridmap.metrics import StageClock
 from hybridmap.session import run as session_run
 from hybridmap.store import SessionFolder
 from hybridmap.store.track import Track, trajectory_of
@@ -45,7 +46,7 @@ class Run:
         track: where the robot was between nodes.
         truth: of `base_link`, None where the source knows none.
         frames: camera frames or scans that came in.
-        cpu_s: process time by stage.
+        cpu_s: process time by stage; `rest` is what the mapper spends outside of them.
     """
 
     experiences: ExperienceMap
@@ -84,10 +85,18 @@ class EdgeErrors:
 
 def map_in_memory(source: str | Path, config: Config) -> Run:
     """Map a recording or a simulated world without a session folder."""
-    stream = open_stream(source, config)
-    mapper = Mapper(config, stream.rig)
-    updates = [update for sample in stream for update in mapper.add(sample)]
-    updates += mapper.finish()
+    return map_stream(open_stream(source, config), config)
+
+
+def map_stream(stream: Stream, config: Config) -> Run:
+    """Map a stream without a session folder."""
+    mapper, whole, updates = Mapper(config, stream.rig), StageClock(), list[Update]()
+    for sample in stream:
+        with whole.stage("rest"):
+            updates += mapper.add(sample)
+    with whole.stage("rest"):
+        updates += mapper.finish()
+    cpu_s = dict(mapper.clock.cpu_s)
     frames = sum(stream.report.counts.get(name, 0) for name in ("frames", "scans"))
     return Run(
         mapper.map,
@@ -96,7 +105,7 @@ def map_in_memory(source: str | Path, config: Config) -> Run:
         _track(updates),
         stream.groundtruth,
         frames,
-        dict(mapper.clock.cpu_s),
+        {**cpu_s, "rest": whole.cpu_s["rest"] - sum(cpu_s.values())},
     )
 
 

@@ -178,6 +178,13 @@ STUDIES = (
         ),
     ),
     Study(
+        "rgbd-robustness",
+        "Worse cameras, worse wheels",
+        "Error of the robust map where pictures are spoilt, wheels worse or the camera is another one; its bar is the error of "
+        "odometry. Beside it the false loops that the robust back-end keeps.",
+        (Step("python tools/rgbd_robustness.py --recordings $OUT", own_bars=True),),
+    ),
+    Study(
         "never-harmful",
         "A threshold from far too strict to far too loose",
         "Error of the robust map at each value of an acceptance threshold; its bar is the error of odometry.",
