@@ -70,9 +70,9 @@ class EdgeBook:
         """Say of each loop that is in the graph but has no weight that it is so; returns which."""
         for number in report.rejected_edge_ids:
             edge = self._map.edge(number)
-            self._map.update_edge(
-                number, replace(edge, reason=f"{edge.reason}; given no weight by {report.backend} at the end")
-            )
+            why = ", as it contradicts the other loops" if number in report.inconsistent_edge_ids else ""
+            reason = f"{edge.reason}; given no weight by {report.backend} at the end{why}"
+            self._map.update_edge(number, replace(edge, reason=reason))
         return list(report.rejected_edge_ids)
 
     def _drop_odometry(self, proposal: Proposal) -> list[int]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hybridmap.backends import objective
+from hybridmap.backends.base import SolveReport
 from hybridmap.calibration.sessions import GAIN_CHANGES
 from hybridmap.config import Config
 from hybridmap.errors import HybridMapError, StreamError
@@ -214,6 +215,16 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
     return Session(folder, head, metrics)
 
 
+def _weak(name: str, report: SolveReport) -> list[Metric]:
+    """Edges of motion that a back-end with a kernel on them holds for drop-outs of the wheels."""
+    if not report.weak_edges:
+        return []
+    return [
+        Metric(f"weak_edges/{name}", len(report.weak_edges), "1", "odometry and registration edges of next to no weight"),
+        Metric(f"hanging_nodes/{name}", report.hanging_nodes, "1", "nodes that only such edges and rejected loops hold"),
+    ]
+
+
 def _second_look(mapper: Mapper) -> list[Metric]:
     tried, edges = mapper.book.tried_again, mapper.map.edges
     solution = mapper.backends.solutions.get(mapper.backends.primary)
@@ -255,6 +266,7 @@ def _figures(mapper: Mapper, recorder: _Recorder, duration_s: float) -> list[Met
             Metric(f"chi2_initial/{name}", chain, "1", "referee's chi2 of the odometry chain"),
             Metric(f"chi2/{name}", objective.chi2(graph, solution.poses), "1", f"referee's chi2 at the end: {report.status}"),
             Metric(f"loops_rejected/{name}", len(report.rejected_edge_ids), "1", "accepted loops that it gave no weight"),
+            *_weak(name, report),
         ]
     for stage, cpu_s in mapper.clock.cpu_s.items():
         rows.append(Metric(f"cpu_s/{stage}", cpu_s, "s", "process time of the stage"))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -58,6 +60,8 @@ def test_loops_without_weight_are_named_with_their_keys(book):
     assert book.report(report(3)) == [3]
     assert book._map.edge(3).reason == "as it is; given no weight by gtsam-gnc at the end"
     assert book._map.edge(3).status is Status.ACCEPTED
+    book.report(replace(report(4), inconsistent_edge_ids=(4,)))
+    assert book._map.edge(4).reason.endswith("given no weight by gtsam-gnc at the end, as it contradicts the other loops")
 
 
 def test_what_became_of_them_is_said(book):

@@ -5,7 +5,13 @@ r"""What a back-end makes of false loops in the standard graphs, over seeds: the
     python tools/false_loop_study.py $HYBRIDMAP_DATA/posegraphs/intel.g2o --bias 0.06 --shares 0 --seeds 1 --modes random \
         --backends odometry relaxation-ratslam relaxation-robust gtsam-lm gtsam-dcs gtsam-cauchy gtsam-gnc gtsam-calibrated
 
-ATE is against the least-squares optimum of the clean graph. A share of 0.4 means that 40 % of all loops are false.
+    python tools/false_loop_study.py $HYBRIDMAP_DATA/posegraphs/intel.g2o --dropouts 0.01 --shares 0 --modes random \
+        --backends gtsam-lm gtsam-cauchy gtsam-gnc --set robust.odometry=cauchy
+    python tools/false_loop_study.py $HYBRIDMAP_DATA/posegraphs/intel.g2o --seeds 3 --shares 0 0.1 0.4 \
+        --backends gtsam-lm gtsam-gnc --set consistency.enabled=true
+
+`--set` takes settings of the section `backends`. ATE is against the least-squares optimum of the clean graph. A share of
+0.4 means that 40 % of all loops are false.
 """
 
 from __future__ import annotations
@@ -18,7 +24,10 @@ from pathlib import Path
 import numpy as np
 
 from hybridmap import backends
-from hybridmap.backends.false_loops import bend, inject
+from hybridmap.backends.false_loops import bend, drop_out, inject
+from hybridmap.cli.choose import parse_settings
+from hybridmap.config import Config
+from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array, align, transform_points
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import PoseGraph
@@ -50,11 +59,14 @@ def main() -> None:
     parser.add_argument("--modes", nargs="+", choices=["random", "aliased"], default=["random", "aliased"])
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--bias", type=float, default=0.0, metavar="RAD_M", help="heading bias added to odometry, rad/m")
+    parser.add_argument("--dropouts", type=float, default=0.0, metavar="SHARE", help="of odometry edges 20 deg and 0.5 m off")
+    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings of the back-ends")
     parser.add_argument("--first", type=int, default=0, metavar="SEED")
     chosen = parser.parse_args()
     graph = read_graph(chosen.graph)
     clean = backends.create("gtsam-lm").solve(graph).poses
     graph = bend(graph, chosen.bias) if chosen.bias else graph
+    settings = Config.load(None, {f"backends.{key}": value for key, value in parse_settings(chosen.set).items()}).backends
     print(f"{chosen.graph.name}: {graph.n_nodes} nodes, {int(graph.is_loop.sum())} true loops; ATE in m, CPU in s")
     print(
         f"{'back-end':20}{'kind':9}{'share':>6}{'ATE median':>12}{'max':>9}{'<= 0.05':>9}"
@@ -64,14 +76,21 @@ def main() -> None:
         for share in chosen.shares:
             for mode in chosen.modes:
                 seeds = range(chosen.first, chosen.first + chosen.seeds)
-                cells = [cell(graph, clean, name, inject(graph, share, mode, np.random.default_rng(s))) for s in seeds]
+                cells = [cell(disturbed(graph, chosen.dropouts, share, mode, s), graph, clean, name, settings) for s in seeds]
                 print(line(name, mode, share, cells, int(graph.is_loop.sum())), flush=True)
 
 
-def cell(graph: PoseGraph, clean: Array, name: str, false: PoseGraph) -> Cell:
+def disturbed(graph: PoseGraph, dropouts: float, share: float, mode: str, seed: int) -> PoseGraph:
+    """The graph with false loops, and then with drop-outs of its wheels."""
+    rng = np.random.default_rng(seed)
+    false = inject(graph, share, mode, rng)
+    return drop_out(false, dropouts, rng) if dropouts else false
+
+
+def cell(false: PoseGraph, graph: PoseGraph, clean: Array, name: str, settings: BackendsConfig) -> Cell:
     """Solve one disturbed graph in a fresh back-end."""
     started = time.process_time()
-    solution = backends.create(name).solve(false)
+    solution = backends.create(name, settings).solve(false)
     cpu_s = time.process_time() - started
     rejected = np.array(solution.report.rejected_edge_ids, dtype=np.int64)
     lost = int(np.isin(rejected, graph.edge_ids).sum())

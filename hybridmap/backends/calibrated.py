@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from hybridmap.backends.batch import run
 from hybridmap.backends.clusters import rejected_clusters
 from hybridmap.backends.covariance import Covariances
-from hybridmap.backends.factors import NoiseModels, factor_graph
+from hybridmap.backends.factors import factor_graph
 from hybridmap.backends.following import Outcome
 from hybridmap.backends.gnc import GncBackend
-from hybridmap.backends.objective import gate_of, residuals, truncated_cost
+from hybridmap.backends.kernels import noise_models
+from hybridmap.backends.objective import gate_of, residuals
+from hybridmap.backends.weak import softened, truncated_cost
 from hybridmap.geometry import Array, adjoint, between, exp, log
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 
@@ -83,16 +85,17 @@ class CalibratedBackend(GncBackend):
             outcome = super()._best(straight, poses)
             if outcome.rejected == before:
                 break
-        return _Found(straight, outcome, gains, truncated_cost(straight, outcome.poses, gate_of(self._config)))
+        cost = truncated_cost(straight, outcome.poses, gate_of(self._config), self._config.robust)
+        return _Found(straight, outcome, gains, cost)
 
     def _calibrate(self, graph: PoseGraph, own: NDArray[np.int64], gains: Array, outcome: Outcome) -> tuple[Array, Array]:
         """Gauss-Newton on the three numbers, each time with the poses that are best for them; both."""
-        kept = ~np.isin(graph.edge_ids, outcome.rejected)
+        kept, models = ~np.isin(graph.edge_ids, outcome.rejected), noise_models(self._config.robust)
         poses = outcome.poses
         for _ in range(_ROUNDS):
             straight = _calibrated(graph, own, gains).with_edges(kept)
-            poses = run("lm", factor_graph(straight, NoiseModels()), poses, self._config.max_iterations).poses
-            step = _gain_step(graph.with_edges(kept), straight, poses, gains)
+            poses = run("lm", factor_graph(straight, models), poses, self._config.max_iterations).poses
+            step = _gain_step(graph.with_edges(kept), softened(straight, poses, self._config.robust), poses, gains)
             if not np.isfinite(step).all():
                 break
             gains = gains + step

@@ -8,10 +8,35 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import splu
+from scipy.stats import chi2 as chi2_law
 
+from hybridmap.backends.objective import SLACK, residuals
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, adjoint, between
 from hybridmap.graph.pose_graph import PoseGraph
+
+_AT_ONCE = 64  # pairs of nodes, whose columns are dense
+_EXPECTED = 0.999  # quantile of the innovation up to which a loop is expected
+
+
+def expected_loops(graph: PoseGraph, poses: Array, loops: NDArray[np.int64], variance: float) -> NDArray[np.bool_]:
+    """Which loops a map that was made without them expects: their innovation is what loop and map are uncertain by.
+
+    Args:
+        graph: edges of the map, and these loops.
+        poses: (N, 3) of the map, m and rad.
+        loops: (L,) indices of edges.
+        variance: unit variance of the map, by which its covariances and the loops' are scaled down where it is below 1.
+
+    Raises:
+        BackendError: the map is singular without them.
+    """
+    backbone = graph.with_edges(np.setdiff1d(np.arange(graph.n_edges), loops))
+    covariance = Covariances(backbone, poses).relative(graph.sources[loops], graph.targets[loops])
+    covariance = (covariance + np.linalg.inv(graph.information[loops])) * min(1.0, variance)
+    r = residuals(graph.with_edges(loops), poses)
+    innovation = np.einsum("ei,ei->e", r, np.linalg.solve(covariance, r[:, :, None])[:, :, 0])
+    return np.asarray(innovation <= SLACK * chi2_law.ppf(_EXPECTED, df=3))
 
 
 class Covariances:
@@ -48,7 +73,12 @@ class Covariances:
     def relative(self, sources: NDArray[np.int64], targets: NDArray[np.int64]) -> Array:
         """Covariances (L, 3, 3) of targets seen from sources, in the targets' frames."""
         carried = -adjoint(between(self._poses[targets], self._poses[sources]))
-        return self._projected(np.broadcast_to(np.eye(3), carried.shape), targets, carried, sources)
+        out = np.empty((len(sources), 3, 3))
+        for first in range(0, len(sources), _AT_ONCE):
+            part = slice(first, first + _AT_ONCE)
+            ends = np.broadcast_to(np.eye(3), carried[part].shape)
+            out[part] = self._projected(ends, targets[part], carried[part], sources[part])
+        return out
 
     def solve(self, columns: Array) -> Array:
         """H^-1 times columns (3N - 3, K), in the order of the nodes from node 1 on."""

@@ -17,24 +17,26 @@ Wrap = Callable[[Any], Any]
 
 
 class NoiseModels:
-    """Noise models shared between edges of equal information; `wrap` (a kernel) is for loop edges."""
+    """Noise models shared between edges of equal information; `loop` and `motion` wrap kernels round those of their edges."""
 
-    def __init__(self, wrap: Wrap | None = None) -> None:
+    def __init__(self, loop: Wrap | None = None, motion: Wrap | None = None) -> None:
+        """With a kernel for loops and one for edges of motion (`PoseGraph.is_motion`); None: quadratic."""
         self._plain: dict[bytes, Any] = {}
-        self._robust: dict[bytes, Any] = {}
-        self._wrap = wrap
+        self._robust: dict[tuple[bytes, bool], Any] = {}
+        self._loop, self._motion = loop, motion
 
-    def __call__(self, information: Array, *, loop: bool) -> Any:
+    def __call__(self, information: Array, *, loop: bool = False, motion: bool = False) -> Any:
         """The noise model of one edge."""
         key = information.tobytes()
         model = self._plain.get(key)
         if model is None:
             model = self._plain[key] = gtsam.noiseModel.Gaussian.Information(information)
-        if not loop or self._wrap is None:
+        wrap = self._loop if loop else self._motion if motion else None
+        if wrap is None:
             return model
-        robust = self._robust.get(key)
+        robust = self._robust.get((key, loop))
         if robust is None:
-            robust = self._robust[key] = self._wrap(model)
+            robust = self._robust[key, loop] = wrap(model)
         return robust
 
 
@@ -47,9 +49,10 @@ def factors(graph: PoseGraph, models: NoiseModels) -> list[Any]:
         graph.deltas.tolist(),
         graph.information,
         graph.is_loop.tolist(),
+        graph.is_motion.tolist(),
         strict=True,
     )
-    return [make(s, t, pose(*delta), models(info, loop=loop)) for s, t, delta, info, loop in rows]
+    return [make(s, t, pose(*delta), models(info, loop=loop, motion=motion)) for s, t, delta, info, loop, motion in rows]
 
 
 def anchor(initial: Array) -> Any:

@@ -1,4 +1,4 @@
-"""False loop closures and bent odometry put into a graph on purpose, to see what a back-end survives."""
+"""False loop closures, bent odometry and drop-outs put into a graph on purpose, to see what a back-end survives."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.errors import GraphError
+from hybridmap.geometry import compose
 from hybridmap.graph.connectivity import chain
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 
+_DROP_OUT_M, _DROP_OUT_RAD = 0.5, np.deg2rad(20.0)
 _RUN = 5  # aliased loops that come one after the other and agree with each other
 
 
@@ -52,6 +54,32 @@ def bend(graph: PoseGraph, bias_rad_m: float) -> PoseGraph:
     deltas = graph.deltas.copy()
     odometry = graph.kinds == EdgeKind.ODOMETRY
     deltas[odometry, 2] += bias_rad_m * np.hypot(deltas[odometry, 0], deltas[odometry, 1])
+    return chain(replace(graph, deltas=deltas))
+
+
+def drop_out(graph: PoseGraph, share: float, rng: np.random.Generator) -> PoseGraph:
+    """Let the wheels fail on some steps; `initial` becomes the chain of what is left.
+
+    Each odometry edge that is hit turns by 20 deg more, to either side, and slips 0.5 m in any direction; its information
+    stays as it was: the wheels do not know.
+
+    Args:
+        graph: with odometry edges.
+        share: of its odometry edges that are hit, 0 <= share <= 1.
+        rng: the only source of chance.
+
+    Raises:
+        GraphError: a share outside [0, 1].
+    """
+    if not 0.0 <= share <= 1.0:
+        raise GraphError(f"graph: cannot drop out a share of {share} of its odometry; expected 0 <= share <= 1")
+    odometry = np.flatnonzero(graph.kinds == EdgeKind.ODOMETRY)
+    hit = np.sort(rng.choice(odometry, round(share * len(odometry)), replace=False))
+    direction = rng.uniform(-np.pi, np.pi, len(hit))
+    turn = _DROP_OUT_RAD * rng.choice([-1.0, 1.0], len(hit))
+    deltas = graph.deltas.copy()
+    slip = np.column_stack([_DROP_OUT_M * np.cos(direction), _DROP_OUT_M * np.sin(direction), turn])
+    deltas[hit] = compose(deltas[hit], slip)
     return chain(replace(graph, deltas=deltas))
 
 

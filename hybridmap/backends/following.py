@@ -14,11 +14,14 @@ from numpy.typing import NDArray
 from hybridmap.backends.base import Solution, SolveReport, SolveStatus, SupportsPoseGraph
 from hybridmap.backends.clusters import rejected_clusters
 from hybridmap.backends.objective import chi2, gate_of, squared_norms, total, unit_variance
+from hybridmap.backends.weak import hanging_nodes, weak_edges
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.connectivity import extend, require_connected
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+
+_ROUNDING = 1e-9  # of chi2: a chain without loops has none, and no solver finds less
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +103,7 @@ class GraphBackend(ABC):
     """What all back-ends share; a solver supplies `_optimise` and may refine `_solve_whole`."""
 
     _descends = False  # whether a solution of higher chi2 than its start is a failure
+    _softens = False  # whether it puts the configured kernel on edges of motion
 
     def __init__(self, name: str, config: BackendsConfig) -> None:
         self._name = name
@@ -153,7 +157,7 @@ class GraphBackend(ABC):
         outcome = self._checked(graph, graph.initial, outcome)
         squared = squared_norms(graph, outcome.poses)
         before = total(squared) if outcome.poses is graph.initial else chi2(graph, graph.initial)
-        if self._descends and total(squared) > before:
+        if self._descends and total(squared) > before + _ROUNDING:
             message = f"{outcome.message}; ended worse than it began, kept the start"
             outcome = Outcome(graph.initial, SolveStatus.DIVERGED, message, outcome.iterations)
             squared = squared_norms(graph, graph.initial)
@@ -230,10 +234,14 @@ class GraphBackend(ABC):
         """The outcome with the referee's figures: squared residuals (E,) at its poses, chi2 before."""
         meant = graph if outcome.calibrated is None else outcome.calibrated
         strain = squared if outcome.calibrated is None else squared_norms(meant, outcome.poses)
+        weak = weak_edges(meant, strain, self._config.robust) if self._softens else {}
+        without = (*outcome.rejected, *weak)
+        hanging = hanging_nodes(graph, without) if weak else 0
+        note = f"; {len(weak)} edges of motion of little weight, {hanging} nodes hang on them alone" if weak else ""
         report = SolveReport(
             backend=self._name,
             status=outcome.status,
-            message=outcome.message,
+            message=outcome.message + note,
             iterations=outcome.iterations,
             chi2_initial=before,
             chi2=total(squared),
@@ -241,7 +249,9 @@ class GraphBackend(ABC):
             rejected_edge_ids=outcome.rejected,
             weights=outcome.weights,
             chi2_odometry=total(strain[~graph.is_loop]),
-            unit_variance=unit_variance(meant, strain, outcome.rejected),
+            unit_variance=unit_variance(meant, strain, without),
+            weak_edges=weak,
+            hanging_nodes=hanging,
         )
         return Solution(outcome.poses, report)
 

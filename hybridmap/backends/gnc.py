@@ -13,17 +13,18 @@ from typing import Any
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_law
 
 from hybridmap.backends.base import Solution, SolveStatus
 from hybridmap.backends.batch import run
 from hybridmap.backends.clusters import neighbouring_pairs, rejected_clusters
-from hybridmap.backends.covariance import Covariances
-from hybridmap.backends.factors import NoiseModels, anchor, factor_graph, factors, poses_of, values
+from hybridmap.backends.covariance import expected_loops
+from hybridmap.backends.factors import NoiseModels, factor_graph, factors, poses_of, values
 from hybridmap.backends.following import Change, GraphBackend, Outcome, prefix
 from hybridmap.backends.initial import best_start, trusted_start
-from hybridmap.backends.objective import gate_of, residuals, squared_norms, truncated_cost, unit_variance
+from hybridmap.backends.kernels import noise_models
+from hybridmap.backends.objective import SLACK, gate_of, squared_norms, unit_variance
 from hybridmap.backends.robust import WarmKernel, with_kernel
+from hybridmap.backends.weak import softened, truncated_cost, weak_edges
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.connectivity import extend
@@ -34,8 +35,6 @@ _PATIENT, _NEAR_FIRST = 1e-4, 3e-2  # least weight of a loop that takes part in 
 _ROUGHLY = 10.0  # of the bound, before the first iteration
 _QUICK = (2, 12)  # iterations before each look: where loops agree few are needed, where they do not they are of no use
 _MOSTLY, _ALMOST_ALL = 0.9, 0.97  # share of loops that least squares must agree with, on the way and in the end
-_EXPECTED = 0.999  # quantile of the innovation up to which a lone loop is re-admitted
-_SLACK = 4.0  # of the bound over the unit variance, where files overstate their noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,16 +57,12 @@ class Truncated:
 class _Problem:
     """One graph's factors, made once; a round puts them together with the loops' current weights."""
 
-    def __init__(self, graph: PoseGraph) -> None:
+    def __init__(self, graph: PoseGraph, config: BackendsConfig) -> None:
         self.graph = graph
         self.loops = np.flatnonzero(graph.is_loop)
-        whole = factors(graph, NoiseModels())
-        self._known = gtsam.NonlinearFactorGraph()
-        for edge in np.flatnonzero(~graph.is_loop).tolist():
-            self._known.push_back(whole[edge])
-        self._known.push_back(anchor(graph.initial[0]))
-        self._loop_factors = [whole[edge] for edge in self.loops.tolist()]
-        self._models = NoiseModels()
+        self._models = noise_models(config.robust)
+        self._known = factor_graph(graph.with_edges(~graph.is_loop), self._models)
+        self._loop_factors = factors(graph.with_edges(self.loops), self._models)
 
     def squared(self, poses: Array) -> Array:
         """Squared residual of each loop."""
@@ -83,7 +78,7 @@ class _Problem:
                 out.push_back(self._loop_factors[i])
             elif weight > 0.0:
                 edge = self.loops[i]
-                model = self._models(self.graph.information[edge] * weight, loop=False)
+                model = self._models(self.graph.information[edge] * weight)
                 ends = int(self.graph.sources[edge]), int(self.graph.targets[edge])
                 out.push_back(gtsam.BetweenFactorPose2(*ends, gtsam.Pose2(*self.graph.deltas[edge]), model))
         return out
@@ -106,7 +101,7 @@ def graduate(graph: PoseGraph, start: Array, config: BackendsConfig, negligible:
         negligible: loops of less weight sit a round out. A small value lets far loops pull from the first round, a
             larger one lets those that nearly agree go first: neither is better on every graph.
     """
-    problem = _Problem(graph)
+    problem = _Problem(graph, config)
     bound, poses = gate_of(config), start
     squared = problem.squared(poses)
     largest = float(squared.max(initial=0.0))
@@ -121,7 +116,7 @@ def graduate(graph: PoseGraph, start: Array, config: BackendsConfig, negligible:
             break
         mu *= config.gnc.mu_factor
     settled = _settle(problem, poses, bound, config.max_iterations)
-    honest = min(1.0, _SLACK * _variance(graph, settled)) * bound
+    honest = min(1.0, SLACK * _variance(graph, settled, config)) * bound
     if honest < bound:
         settled = _settle(problem, settled.poses, honest, config.max_iterations)
     return replace(settled, rounds=rounds + settled.rounds)
@@ -141,15 +136,17 @@ def trusting(graph: PoseGraph, config: BackendsConfig) -> Truncated | None:
         if _share(kept) < least:
             return None
     found = Truncated(poses, kept, rounds, bound)
-    return found if kept.all() else _settle(_Problem(graph), poses, bound, config.max_iterations)
+    done = kept.all() and config.robust.odometry == "none"
+    return found if done else _settle(_Problem(graph, config), poses, bound, config.max_iterations)
 
 
 def _share(true: NDArray[np.bool_]) -> float:
     return float(true.mean()) if len(true) else 1.0
 
 
-def _variance(graph: PoseGraph, result: Truncated) -> float:
-    return unit_variance(graph, squared_norms(graph, result.poses), _rejected(graph, result))
+def _variance(graph: PoseGraph, result: Truncated, config: BackendsConfig) -> float:
+    squared = squared_norms(graph, result.poses)
+    return unit_variance(graph, squared, (*_rejected(graph, result), *weak_edges(graph, squared, config.robust)))
 
 
 def _rejected(graph: PoseGraph, result: Truncated) -> tuple[int, ...]:
@@ -169,19 +166,33 @@ def on_probation(graph: PoseGraph, result: Truncated, config: BackendsConfig) ->
     if len(lone) == 0:
         return result
     without = result.kept & ~np.isin(loops, lone)
-    problem = _Problem(graph)
+    problem = _Problem(graph, config)
     outcome = run("lm", problem.weighted(without.astype(np.float64)), result.poses, config.max_iterations)
     bare = replace(result, poses=outcome.poses, kept=without, rounds=result.rounds + outcome.iterations)
-    backbone = graph.with_edges(np.setdiff1d(np.arange(graph.n_edges), loops[~without]))
-    covariance = Covariances(backbone, bare.poses).relative(graph.sources[lone], graph.targets[lone])
-    covariance = (covariance + np.linalg.inv(graph.information[lone])) * min(1.0, _variance(graph, bare))
-    r = residuals(graph.with_edges(lone), bare.poses)
-    innovation = np.einsum("ei,ei->e", r, np.linalg.solve(covariance, r[:, :, None])[:, :, 0])
-    kept = without | np.isin(loops, lone[innovation <= _SLACK * chi2_law.ppf(_EXPECTED, df=3)])
+    variance = _variance(graph, bare, config)
+    others = softened(graph.with_edges(np.setdiff1d(np.arange(graph.n_edges), loops[~result.kept])), bare.poses, config.robust)
+    expected = expected_loops(others, bare.poses, np.flatnonzero(np.isin(others.edge_ids, graph.edge_ids[lone])), variance)
+    kept = without | np.isin(loops, lone[expected])
     if not np.any(kept != without):
         return bare
     outcome = run("lm", problem.weighted(kept.astype(np.float64)), bare.poses, config.max_iterations)
     return replace(bare, poses=outcome.poses, kept=kept, rounds=bare.rounds + outcome.iterations)
+
+
+def _from_kernels(graph: PoseGraph, config: BackendsConfig) -> Truncated:
+    """Settle from the map that Cauchy's kernel on loops and the configured one on odometry lead to."""
+    bound = gate_of(config)
+    outcome = with_kernel("gtsam-cauchy", graph, trusted_start(graph, bound), config)
+    settled = _settle(_Problem(graph, config), outcome.poses, bound, config.max_iterations)
+    return replace(settled, rounds=outcome.iterations + settled.rounds)
+
+
+def _softened_last(graph: PoseGraph, config: BackendsConfig) -> Truncated:
+    """Let the loops compete on odometry without a kernel, which no false loop can tear; then settle with the kernel."""
+    stiff = config.model_copy(update={"robust": config.robust.model_copy(update={"odometry": "none"})})
+    result = grow(graph, stiff, _PATIENT)
+    settled = _settle(_Problem(graph, config), result.poses, result.bound, config.max_iterations)
+    return replace(settled, rounds=result.rounds + settled.rounds)
 
 
 def _settle(problem: _Problem, poses: Array, bound: float, max_iterations: int) -> Truncated:
@@ -220,6 +231,8 @@ def grow(graph: PoseGraph, config: BackendsConfig, negligible: float) -> Truncat
 class GncBackend(GraphBackend):
     """`gtsam-gnc`: Cauchy on the loops while driving, graduated non-convexity on the whole graph at the end."""
 
+    _softens = True
+
     def __init__(self, name: str, config: BackendsConfig) -> None:
         super().__init__(name, config)
         self._warm = WarmKernel("gtsam-cauchy", config)
@@ -242,12 +255,13 @@ class GncBackend(GraphBackend):
     def _best(self, graph: PoseGraph, driven: Array | None) -> Outcome:
         """Run the configured starts until one convinces; if none does, the lowest truncated cost wins.
 
-        A result convinces where no rejected loops agree with each other, or where two different ways came to the same. Costs
-        are compared at the
+        A result convinces where no rejected loops agree with each other, or where two different ways came to the same. With a
+        kernel on odometry none but the first convinces: false loops may have torn the chain. Costs are compared at the
         tightest bound that any start ended with: files that overstate their noise would otherwise prefer a false loop
         that happens to be consistent.
         """
         results: dict[str, Truncated] = {}
+        tearable = self._config.robust.odometry != "none"
         for name, attempt in self._attempts(graph, driven).items():
             found = attempt()
             if found is None:
@@ -255,11 +269,12 @@ class GncBackend(GraphBackend):
             if not found.kept.all():
                 found = on_probation(graph, found, self._config)
             agreed = name == "grown" and any(np.array_equal(found.kept, other.kept) for other in results.values())
-            if agreed or not rejected_clusters(graph, found.poses, _rejected(graph, found), found.bound):
+            alone = agreed or not rejected_clusters(graph, found.poses, _rejected(graph, found), found.bound)
+            if alone and (not tearable or name == "least squares"):
                 return self._verdict(graph, found, name)
             results[name] = found
         bound = min(result.bound for result in results.values())
-        costs = {name: truncated_cost(graph, result.poses, bound) for name, result in results.items()}
+        costs = {name: truncated_cost(graph, result.poses, bound, self._config.robust) for name, result in results.items()}
         best = min(costs, key=costs.__getitem__)
         return self._verdict(graph, results[best], best)
 
@@ -281,12 +296,15 @@ class GncBackend(GraphBackend):
         attempts["grown"] = lambda: grow(graph, config, _PATIENT)
         if config.gnc.start == "auto":
             attempts["grown, near loops first"] = lambda: grow(graph, config, _NEAR_FIRST)
+        if config.gnc.start == "auto" and config.robust.odometry != "none":
+            attempts["kernels"] = lambda: _from_kernels(graph, config)
+            attempts["grown on stiff odometry"] = lambda: _softened_last(graph, config)
         return attempts
 
     def _verdict(self, graph: PoseGraph, result: Truncated, start: str) -> Outcome:
         loops = graph.edge_ids[graph.is_loop].tolist()
         weights = dict(zip(loops, result.kept.astype(np.float64).tolist(), strict=True))
         rejected = tuple(edge for edge, weight in weights.items() if weight == 0.0)
-        variance = _variance(graph, result)
+        variance = _variance(graph, result, self._config)
         message = f"gnc: {len(rejected)} of {len(loops)} loops rejected (start: {start}; unit variance {variance:.3g})"
         return Outcome(result.poses, SolveStatus.CONVERGED, message, result.rounds, weights, rejected)

@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.base import Solution, SolveStatus
-from hybridmap.backends.factors import NoiseModels, anchor, factors, poses_of, values
+from hybridmap.backends.factors import anchor, factors, poses_of, values
 from hybridmap.backends.following import Change, GraphBackend, Outcome, difference, prefix
+from hybridmap.backends.kernels import loop_kernel, noise_models
 from hybridmap.backends.objective import gate_of
-from hybridmap.backends.robust import judged, kernel_models
+from hybridmap.backends.robust import judged
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.connectivity import extend
@@ -26,7 +27,7 @@ class Smoother:
         params.relinearizeSkip = 1
         self._isam = gtsam.ISAM2(params)
         self._settle = config.isam2.settle_updates
-        self._models = kernel_models("gtsam-cauchy", config.robust)[1] if _robust(config) else NoiseModels()
+        self._models = noise_models(config.robust, loop_kernel("gtsam-cauchy", config.robust) if _robust(config) else None)
         self._slots: dict[int, int] = {}
         self.graph: PoseGraph | None = None
 
@@ -74,6 +75,8 @@ def _robust(config: BackendsConfig) -> bool:
 class Isam2Backend(GraphBackend):
     """Follows a growing graph; `solve` grows a frozen one from loop to loop."""
 
+    _softens = True
+
     def __init__(self, name: str, config: BackendsConfig) -> None:
         super().__init__(name, config)
         self._smoother: Smoother | None = None
@@ -110,7 +113,7 @@ class Isam2Backend(GraphBackend):
         outcome = Outcome(poses, SolveStatus.CONVERGED, f"isam2: {updates} updates", updates)
         if not _robust(self._config):
             return outcome
-        return judged(outcome, kernel_models("gtsam-cauchy", self._config.robust)[0], graph, gate_of(self._config))
+        return judged(outcome, loop_kernel("gtsam-cauchy", self._config.robust), graph, gate_of(self._config))
 
 
 def _closing_nodes(graph: PoseGraph) -> list[int]:

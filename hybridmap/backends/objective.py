@@ -9,6 +9,9 @@ from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array, between, compose, inverse, log
 from hybridmap.graph.pose_graph import PoseGraph
 
+SLACK = 4.0
+"""Factor on a unit variance that is estimated, before measurements are refused for it: files mostly overstate their noise."""
+
 
 def residuals(graph: PoseGraph, poses: Array) -> Array:
     """Residuals `(E, 3)`: log(inverse(delta) * between(source, target)) in the target's frame, m, m, rad.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 
 from hybridmap.backends.base import Backend
+from hybridmap.backends.prefilter import ConsistentBackend
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 
@@ -35,7 +36,7 @@ def names() -> tuple[str, ...]:
 
 
 def create(name: str, config: BackendsConfig | None = None) -> Backend:
-    """Make a back-end by its name, in a fresh state.
+    """Make a back-end by its name, in a fresh state; with the pre-filter before it, where that is configured.
 
     Raises:
         BackendError: no such name; the message lists those there are.
@@ -43,5 +44,8 @@ def create(name: str, config: BackendsConfig | None = None) -> Backend:
     if name not in _TABLE:
         raise BackendError(f"unknown back-end {name!r}; there are {', '.join(_TABLE)}")
     module, class_name = _TABLE[name]
-    backend: Backend = getattr(import_module(f"hybridmap.backends.{module}"), class_name)(name, config or BackendsConfig())
+    config = config or BackendsConfig()
+    backend: Backend = getattr(import_module(f"hybridmap.backends.{module}"), class_name)(name, config)
+    if config.consistency.enabled and name != "odometry":
+        return ConsistentBackend(backend, config)
     return backend

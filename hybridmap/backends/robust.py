@@ -1,35 +1,21 @@
-"""Levenberg-Marquardt with a robust kernel on the loop edges; every other edge stays quadratic."""
+"""Levenberg-Marquardt with a robust kernel on the loop edges; other edges stay quadratic unless configured otherwise."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import gtsam
 import numpy as np
 
 from hybridmap.backends.batch import WarmStart, run
-from hybridmap.backends.factors import NoiseModels, factor_graph
+from hybridmap.backends.factors import factor_graph
 from hybridmap.backends.following import Change, GraphBackend, Outcome
 from hybridmap.backends.initial import trusted_start
+from hybridmap.backends.kernels import loop_kernel, noise_models
 from hybridmap.backends.objective import gate_of, squared_norms
-from hybridmap.config.backends import BackendsConfig, RobustConfig
+from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
-
-_KERNELS: dict[str, Callable[[RobustConfig], Any]] = {
-    "gtsam-cauchy": lambda c: gtsam.noiseModel.mEstimator.Cauchy.Create(c.cauchy_scale),
-    "gtsam-huber": lambda c: gtsam.noiseModel.mEstimator.Huber.Create(c.huber_scale),
-    "gtsam-dcs": lambda c: gtsam.noiseModel.mEstimator.DCS.Create(c.dcs_phi),
-    "gtsam-geman-mcclure": lambda c: gtsam.noiseModel.mEstimator.GemanMcClure.Create(c.geman_mcclure_scale),
-}
-
-
-def kernel_models(name: str, config: RobustConfig) -> tuple[Any, NoiseModels]:
-    """The kernel of a back-end's name, and noise models that put it on loop edges."""
-    kernel = _KERNELS[name](config)
-    return kernel, NoiseModels(lambda base: gtsam.noiseModel.Robust.Create(kernel, base))
 
 
 def judged(outcome: Outcome, kernel: Any, graph: PoseGraph, gate: float) -> Outcome:
@@ -42,8 +28,8 @@ def judged(outcome: Outcome, kernel: Any, graph: PoseGraph, gate: float) -> Outc
 
 def with_kernel(name: str, graph: PoseGraph, start: Array, config: BackendsConfig) -> Outcome:
     """Levenberg-Marquardt with a back-end's kernel on loops, from given poses (N, 3)."""
-    kernel, models = kernel_models(name, config.robust)
-    outcome = run("lm", factor_graph(graph, models), start, config.max_iterations)
+    kernel = loop_kernel(name, config.robust)
+    outcome = run("lm", factor_graph(graph, noise_models(config.robust, kernel)), start, config.max_iterations)
     return judged(outcome, kernel, graph, gate_of(config))
 
 
@@ -52,8 +38,8 @@ class WarmKernel:
 
     def __init__(self, name: str, config: BackendsConfig) -> None:
         self._config = config
-        self._kernel, models = kernel_models(name, config.robust)
-        self._warm = WarmStart(models)
+        self._kernel = loop_kernel(name, config.robust)
+        self._warm = WarmStart(noise_models(config.robust, self._kernel))
 
     def __call__(self, graph: PoseGraph, start: Array) -> Outcome:
         """See `WarmStart`; with weights and verdicts."""
@@ -63,6 +49,8 @@ class WarmKernel:
 
 class KernelBackend(GraphBackend):
     """`gtsam-cauchy`, `gtsam-huber`, `gtsam-dcs`, `gtsam-geman-mcclure`."""
+
+    _softens = True
 
     def __init__(self, name: str, config: BackendsConfig) -> None:
         super().__init__(name, config)

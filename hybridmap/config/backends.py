@@ -50,7 +50,7 @@ class GncConfig(Section):
 
 
 class RobustConfig(Section):
-    """Kernels on the loop edges."""
+    """Kernels on the loop edges, and on the edges of motion where wheels have drop-outs."""
 
     cauchy_scale: float = Field(default=1.0, gt=0)
     """Whitened residual at which a Cauchy weight is one half."""
@@ -60,6 +60,22 @@ class RobustConfig(Section):
     """Dynamic covariance scaling: squared whitened residual from which a loop is scaled down."""
     geman_mcclure_scale: float = Field(default=2.0, gt=0)
     """Whitened residual at which a Geman-McClure weight is a quarter."""
+    odometry: Literal["none", "huber", "cauchy", "geman-mcclure"] = "none"
+    """Kernel on odometry and registration edges: in `gtsam-isam2`, `gtsam-gnc`, `gtsam-calibrated` and the back-ends named by
+    a kernel. Edges that it gives a weight below a tenth, and nodes that hang on such edges alone, are in the report."""
+    odometry_scale: float = Field(default=1.0, gt=0)
+    """Whitened residual at which that kernel's weight is a half (Cauchy) or a quarter, or from which its cost is linear."""
+
+
+class ConsistencyConfig(Section):
+    """Pairwise consistency of loops through the chain, judged before a whole graph is solved by any back-end."""
+
+    enabled: bool = False
+    """Leave out loops that are not consistent with the others, and try them again from the solution."""
+    quantile: float = Field(default=0.99, gt=0.5, lt=1)
+    """Two loops agree while their squared Mahalanobis distance is below this quantile of chi2 with 3 degrees of freedom."""
+    neighbours: int = Field(default=1, ge=0)
+    """Loops between the same places, within 10 nodes at both ends, that each must agree with."""
 
 
 class Isam2Config(Section):
@@ -86,5 +102,7 @@ class BackendsConfig(Section):
     """Robust kernels."""
     gnc: GncConfig = GncConfig()
     """Graduated non-convexity."""
+    consistency: ConsistencyConfig = ConsistencyConfig()
+    """Pairwise consistency of the loops."""
     isam2: Isam2Config = Isam2Config()
     """Incremental smoothing."""

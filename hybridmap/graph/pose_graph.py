@@ -64,6 +64,11 @@ class PoseGraph:
         """(E,) which edges are loop closures, i.e. may be false."""
         return np.asarray(self.kinds == EdgeKind.LOOP)
 
+    @property
+    def is_motion(self) -> NDArray[np.bool_]:
+        """(E,) which edges say how the robot itself moved: odometry and registrations to nodes just before."""
+        return np.asarray(self.kinds < EdgeKind.LOOP)
+
     def only(self, *kinds: EdgeKind) -> PoseGraph:
         """The same nodes with only the edges of some kinds."""
         return self.with_edges(np.isin(self.kinds, kinds))

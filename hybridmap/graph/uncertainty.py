@@ -32,6 +32,39 @@ class _Links:
     covariance: Array
 
 
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """The way from node to node, and how uncertain it has become.
+
+    Attributes:
+        poses: (N, 3) m and rad, node 0 at the origin.
+        covariance: (N, 3, 3) of each node relative to node 0, as a perturbation in the frame of node 0. It only grows: the
+            difference of two is that of the way between them.
+    """
+
+    poses: Array
+    covariance: Array
+
+
+def chain_of(graph: PoseGraph) -> Chain:
+    """The chain of consecutive nodes by its edges of motion; those of the same two nodes count together, as independent.
+
+    Raises:
+        GraphError: no edge of motion joins two consecutive nodes; it names them.
+    """
+    links = _links(graph.with_edges(graph.is_motion))
+    steps = np.flatnonzero(links.high == links.low + 1)
+    missing = np.setdiff1d(np.arange(graph.n_nodes - 1), links.low[steps])
+    if len(missing):
+        raise GraphError(f"graph: no edge of motion joins nodes {missing[0]} and {missing[0] + 1}")
+    poses = np.zeros((graph.n_nodes, 3))
+    for node, step in enumerate(links.delta[steps], start=1):
+        poses[node] = compose(poses[node - 1], step)
+    carry = adjoint(poses[1:])
+    grown = np.cumsum(carry @ links.covariance[steps] @ carry.transpose(0, 2, 1), axis=0)
+    return Chain(poses, np.concatenate([np.zeros((1, 3, 3)), grown]))
+
+
 def relative_covariances(graph: PoseGraph, node: int) -> Array:
     """Covariance of every node relative to `node`, right perturbation in each node's own frame.
 

@@ -104,8 +104,10 @@ def report_to_json(report: SolveReport) -> str:
     """A solver's report as one JSON object."""
     fields = asdict(report)
     fields["status"] = str(report.status)
-    fields["rejected_edge_ids"] = [int(number) for number in report.rejected_edge_ids]
-    fields["weights"] = {str(number): float(weight) for number, weight in report.weights.items()}
+    for name in ("rejected_edge_ids", "inconsistent_edge_ids"):
+        fields[name] = [int(number) for number in fields[name]]
+    for name in ("weights", "weak_edges"):
+        fields[name] = {str(number): float(weight) for number, weight in fields[name].items()}
     return json.dumps(_plain(fields))
 
 
@@ -113,7 +115,9 @@ def report_from_json(text: str) -> SolveReport:
     """The report that `report_to_json` wrote."""
     fields = json.loads(text)
     fields["status"] = SolveStatus(fields["status"])
-    fields["rejected_edge_ids"] = tuple(fields["rejected_edge_ids"])
-    fields["weights"] = {int(number): weight for number, weight in fields["weights"].items()}
+    for name in ("rejected_edge_ids", "inconsistent_edge_ids"):
+        fields[name] = tuple(fields.get(name, ()))
+    for name in ("weights", "weak_edges"):
+        fields[name] = {int(number): weight for number, weight in fields.get(name, {}).items()}
     fields["rejected_clusters"] = tuple(tuple(cluster) for cluster in fields.get("rejected_clusters", ()))
     return SolveReport(**fields)

@@ -8,6 +8,7 @@ from graphs_for_tests import laps
 from scipy.optimize import least_squares
 
 from hybridmap import backends
+from hybridmap.backends.base import SolveStatus
 from hybridmap.backends.initial import angular_start
 from hybridmap.backends.objective import chi2, residuals
 from hybridmap.config.backends import BackendsConfig
@@ -188,3 +189,10 @@ def test_a_singular_graph_is_called_so():
     assert outcome.status == "singular"
     assert not outcome.status.has_map
     assert np.array_equal(outcome.poses, graph.initial)
+
+
+def test_a_chain_without_a_loop_is_solved_and_not_called_diverged():
+    graph, _ = laps(np.random.default_rng(0), nodes=200, per_lap=40)
+    chain_only = graph.with_edges(~graph.is_loop)
+    for name in ("gtsam-lm", "gtsam-gn", "gtsam-dogleg"):
+        assert backends.create(name).solve(chain_only).report.status is SolveStatus.CONVERGED, name

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from hybridmap.errors import GraphError
-from hybridmap.geometry import RelativePose, compose_relative, invert_relative
+from hybridmap.geometry import RelativePose, adjoint, compose, compose_relative, inverse, invert_relative
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
-from hybridmap.graph.uncertainty import relative_covariances
+from hybridmap.graph.uncertainty import chain_of, relative_covariances
 
 
 def graph_of(pairs, rng, nodes):
@@ -90,3 +90,19 @@ def test_a_node_out_of_reach_is_infinitely_uncertain():
 def test_an_unknown_node_is_refused():
     with pytest.raises(GraphError, match="node 9"):
         relative_covariances(graph_of([(0, 1)], np.random.default_rng(0), 2), 9)
+
+
+def test_the_way_between_two_nodes_of_a_chain_is_the_difference_of_theirs():
+    graph = graph_of([(0, 1), (2, 1), (2, 3), (3, 4), (2, 3)], np.random.default_rng(0), 5)
+    chain = chain_of(graph)
+    for source, target in ((0, 4), (1, 3), (2, 4)):
+        between_them = chain.covariance[target] - chain.covariance[source]
+        at_target = adjoint(inverse(chain.poses[target])) @ between_them @ adjoint(inverse(chain.poses[target])).T
+        assert np.allclose(at_target, relative_covariances(graph, source)[target])
+    assert np.allclose(compose(chain.poses[3], graph.deltas[3]), chain.poses[4])
+
+
+def test_a_broken_chain_is_refused_with_the_place():
+    graph = graph_of([(0, 1), (1, 2), (1, 3), (3, 4)], np.random.default_rng(0), 5)
+    with pytest.raises(GraphError, match="nodes 2 and 3"):
+        chain_of(graph)

@@ -1,0 +1,142 @@
+"""Any back-end, given only loops that are consistent with each other; the others are tried again from its solution."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.backends.base import Backend, Solution, SupportsPoseGraph
+from hybridmap.backends.clusters import rejected_clusters
+from hybridmap.backends.consistency import Consistent, consistent_loops
+from hybridmap.backends.covariance import expected_loops
+from hybridmap.backends.objective import SLACK, chi2, gate_of
+from hybridmap.backends.weak import softened, truncated_cost
+from hybridmap.config.backends import BackendsConfig
+from hybridmap.errors import GraphError
+from hybridmap.graph.pose_graph import PoseGraph
+
+_TRIES = 2  # of the loops left out
+
+
+@dataclass(frozen=True, slots=True)
+class _Tried:
+    """A solution of some of the loops.
+
+    Attributes:
+        solution: the back-end's own.
+        out: (L,) indices of the edges that it was not given.
+        taken_in: loops that were left out at first and tried again.
+        iterations: of all its solutions.
+    """
+
+    solution: Solution
+    out: NDArray[np.int64]
+    taken_in: int
+    iterations: int
+
+
+class ConsistentBackend:
+    """A back-end with the pre-filter before each whole graph; while driving it sees all loops.
+
+    Loops left out count as rejected; those that the solution expects, given how sure it is, are taken in and it is solved
+    again from there. Where some of the others agree with each other, a back-end that weighs loops itself gets all of them as
+    well, and the better map is kept.
+    """
+
+    def __init__(self, inner: Backend, config: BackendsConfig) -> None:
+        self._inner = inner
+        self._config = config
+
+    @property
+    def name(self) -> str:
+        """See `Backend.name`."""
+        return self._inner.name
+
+    def update(self, graph: PoseGraph) -> Solution:
+        """See `Backend.update`."""
+        return self._inner.update(graph)
+
+    def finish(self, graph: PoseGraph) -> Solution:
+        """See `Backend.finish`."""
+        return self._filtered(graph, self._inner.finish)
+
+    def solve(self, graph: PoseGraph | SupportsPoseGraph) -> Solution:
+        """See `Backend.solve`."""
+        return self._filtered(graph if isinstance(graph, PoseGraph) else graph.pose_graph(), self._inner.solve)
+
+    def _filtered(self, graph: PoseGraph, solve: Callable[[PoseGraph], Solution]) -> Solution:
+        started = time.process_time()
+        graph.validate()
+        try:
+            consistent = consistent_loops(graph, self._config.consistency)
+        except GraphError as broken:
+            solution = solve(graph)
+            message = f"consistency of loops not judged, as {broken}; {solution.report.message}"
+            return replace(solution, report=replace(solution.report, message=message))
+        tried = self._tried(graph, consistent, solve)
+        whole = solve(graph) if self._doubtful(graph, tried) else None
+        if whole is not None and self._cost(graph, whole) < self._cost(graph, tried.solution):
+            message = f"pre-filter set aside, as all loops together fit better; {whole.report.message}"
+            return replace(whole, report=replace(whole.report, message=message, cpu_s=time.process_time() - started))
+        return self._on_whole(graph, tried, time.process_time() - started)
+
+    def _tried(self, graph: PoseGraph, consistent: Consistent, solve: Callable[[PoseGraph], Solution]) -> _Tried:
+        out = np.setdiff1d(np.flatnonzero(graph.is_loop), consistent.loops)
+        first, solution = len(out), solve(_without(graph, out))
+        iterations = solution.report.iterations
+        for _ in range(_TRIES if solution.report.status.has_map else 0):
+            expected = self._expected(graph, solution, out, SLACK * consistent.variance)
+            if len(expected) == 0:
+                break
+            out = np.setdiff1d(out, expected)
+            solution = solve(replace(_without(graph, out), initial=solution.poses))
+            iterations += solution.report.iterations
+        return _Tried(solution, out, first - len(out), iterations)
+
+    def _doubtful(self, graph: PoseGraph, tried: _Tried) -> bool:
+        """Loops that were left out agree with each other, and the back-end could have judged them itself."""
+        report = tried.solution.report
+        left_out = tuple(graph.edge_ids[tried.out].tolist())
+        judges = report.status.has_map and bool(report.weights)
+        return judges and bool(rejected_clusters(graph, tried.solution.poses, left_out, gate_of(self._config)))
+
+    def _cost(self, graph: PoseGraph, solution: Solution) -> float:
+        return truncated_cost(graph, solution.poses, gate_of(self._config), self._config.robust)
+
+    def _expected(self, graph: PoseGraph, solution: Solution, out: NDArray[np.int64], most: float) -> NDArray[np.int64]:
+        """Those of the loops left out that the solution expects; a map more strained than `most` has no wider gate for it."""
+        rejected = np.flatnonzero(np.isin(graph.edge_ids, solution.report.rejected_edge_ids))
+        judged = softened(_without(graph, rejected), solution.poses, self._config.robust)
+        loops = np.flatnonzero(np.isin(judged.edge_ids, graph.edge_ids[out]))
+        variance = solution.report.unit_variance
+        return out[expected_loops(judged, solution.poses, loops, most if variance is None else min(variance, most))]
+
+    def _on_whole(self, graph: PoseGraph, tried: _Tried, cpu_s: float) -> Solution:
+        """The solution with a report about the whole graph."""
+        poses, report = tried.solution.poses, tried.solution.report
+        inconsistent = tuple(graph.edge_ids[tried.out].tolist())
+        rejected = tuple(sorted({*report.rejected_edge_ids, *inconsistent}))
+        loops = graph.edge_ids[graph.is_loop].tolist()
+        weights = {edge: 0.0 if edge in set(inconsistent) else report.weights.get(edge, 1.0) for edge in loops}
+        note = f"{len(inconsistent)} of {len(loops)} loops left out as inconsistent, {tried.taken_in} tried again and taken in"
+        whole = replace(
+            report,
+            message=f"{note}; {report.message}",
+            iterations=tried.iterations,
+            chi2_initial=chi2(graph, graph.initial),
+            chi2=chi2(graph, poses),
+            cpu_s=cpu_s,
+            rejected_edge_ids=rejected,
+            weights=weights,
+            rejected_clusters=rejected_clusters(graph, poses, rejected, gate_of(self._config)) if rejected else (),
+            inconsistent_edge_ids=inconsistent,
+        )
+        return Solution(poses, whole)
+
+
+def _without(graph: PoseGraph, edges: NDArray[np.int64]) -> PoseGraph:
+    return graph.with_edges(np.setdiff1d(np.arange(graph.n_edges), edges))
