@@ -132,4 +132,6 @@ class BatchBackend(GraphBackend):
         return run(method, factor_graph(graph, NoiseModels()), start, self._config.max_iterations)
 
     def _solve_whole(self, graph: PoseGraph) -> Outcome:
-        return self._optimise(graph, best_start(graph))
+        start = best_start(graph)
+        outcome = self._optimise(graph, start)
+        return outcome if start is graph.initial else replace(outcome, message=f"{outcome.message} (start: rotation averaging)")

@@ -32,6 +32,7 @@ CERTIFIED_GAP = 1e-6
 
 _SLACKS = (1e-12, 1e-11, 1e-10, 1e-8, 1e-7, 1e-4, 1e-1)  # tried from the smallest: rounding makes zero eigenvalues negative
 _ITERATIONS = 10
+_FAR, _ROUNDING = 10.0, 1e-6  # of F: the noise as it is stated moves an optimum by less than the factor
 _STATIONARY = 1e-12  # relative decrease of F, promised by a Newton step, that no longer counts
 
 
@@ -60,8 +61,11 @@ class Certificate:
 
     @property
     def word(self) -> str:
-        """`gap <= 1e-11`, or `not certified`."""
-        return f"gap <= {self.gap:.0e}" if self.certified else "not certified"
+        """`gap <= 1e-11`, or `not certified`; and by what factor the poses given are above the point that was certified."""
+        if not self.certified:
+            return "not certified"
+        far = self.objective_given > _FAR * self.objective + _ROUNDING
+        return f"gap <= {self.gap:.0e}" + (f", {self.objective_given / self.objective:.0e} x above" if far else "")
 
 
 def certify(graph: PoseGraph, poses: Array, rejected: tuple[int, ...] = ()) -> Certificate:

@@ -4,21 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from functools import partial
+from itertools import product
 
 import numpy as np
 
 from hybridmap.backends.base import Backend, Solution, SolveStatus
 from hybridmap.backends.certificate import Certificate, certify
+from hybridmap.backends.convergence import convergence
 from hybridmap.backends.objective import chi2
 from hybridmap.backends.registry import create
 from hybridmap.backends.replay import replay
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
+from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.metrics import Metric
 
 Progress = Callable[[int, int], None]
+
+
+class Way(StrEnum):
+    """How a back-end gets the graph: whole, from its initial poses; or node by node as in a drive, to the drive's end."""
+
+    BATCH = "batch"
+    INCREMENTAL = "incremental"
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,12 +41,19 @@ class Row:
         solution: None where the back-end failed.
         failure: why; empty where it did not.
         certificate: what could be proved about its solution on the edges that it kept; None where nobody asked.
+        way: how it got the graph.
+        title: what sets the row apart from all others: the name, with the way where a back-end has two rows.
+        curve: (K, 2) how it came about, empty where that was not traced. Batch: iterations (or sweeps) and chi2 over the
+            edges kept in the end; incremental: nodes and unit variance of what it kept at the time.
     """
 
     backend: str
     solution: Solution | None
     failure: str = ""
     certificate: Certificate | None = None
+    way: Way = Way.BATCH
+    title: str = ""
+    curve: Array | None = None
 
     @property
     def status(self) -> str:
@@ -53,18 +71,20 @@ def compare(
     names: Sequence[str],
     config: BackendsConfig | None = None,
     *,
-    incremental: bool = False,
+    ways: Sequence[Way] = (Way.BATCH,),
     certified: bool = False,
+    traced: bool = False,
     progress: Progress | None = None,
 ) -> list[Row]:
-    """Give one frozen graph to each back-end; one that fails is a row that says so.
+    """Give one frozen graph to each back-end in each way; one that fails is a row that says so.
 
     Args:
         graph: the graph.
         names: back-ends, in the order of the rows.
         config: their settings.
-        incremental: replay the graph node by node (as while driving) instead of solving it whole.
+        ways: how each gets the graph; dead reckoning is the same in every way and gets the first alone.
         certified: try to prove each solution optimal (`backends.certificate`).
+        traced: find out how each solution came about, which takes batch solvers some three times the time.
         progress: called with the units done and their total.
 
     Raises:
@@ -72,19 +92,28 @@ def compare(
         BackendError: a name that there is not.
     """
     graph.validate()
-    backends = [create(name, config) for name in names]
-    steps = graph.n_nodes if incremental else 1
+    config = config or BackendsConfig()
+    plan = [(create(name, config), way) for name, way in product(names, ways) if name != "odometry" or way is ways[0]]
+    steps = [graph.n_nodes if way is Way.INCREMENTAL else 1 for _, way in plan]
     rows = []
-    for before, backend in enumerate(backends):
-        step = partial(_count, progress, before * steps, len(backends) * steps)
+    for number, (backend, way) in enumerate(plan):
+        step = partial(_count, progress, sum(steps[:number]), sum(steps))
+        row = Row(backend.name, None, way=way, title=_title(backend.name, way, ways))
         try:
-            solution = _replayed(backend, graph, step) if incremental else backend.solve(graph)
-            proof = certify(graph, solution.poses, solution.report.rejected_edge_ids) if certified else None
-            rows.append(Row(backend.name, solution, certificate=proof))
+            row = _driven(row, backend, graph, step) if way is Way.INCREMENTAL else replace(row, solution=backend.solve(graph))
         except BackendError as error:
-            rows.append(Row(backend.name, None, str(error)))
-        step(steps)
+            row = replace(row, failure=str(error))
+        if row.solution is not None and certified:
+            row = replace(row, certificate=certify(graph, row.solution.poses, row.solution.report.rejected_edge_ids))
+        if row.solution is not None and traced and way is Way.BATCH:
+            row = replace(row, curve=convergence(graph, backend.name, config, row.solution))
+        rows.append(row)
+        step(steps[number])
     return rows
+
+
+def _title(name: str, way: Way, ways: Sequence[Way]) -> str:
+    return name if len(ways) == 1 or way is Way.BATCH else f"{name}/{way}"
 
 
 def _count(progress: Progress | None, before: int, total: int, done: int) -> None:
@@ -92,35 +121,48 @@ def _count(progress: Progress | None, before: int, total: int, done: int) -> Non
         progress(before + done, total)
 
 
-def _replayed(backend: Backend, graph: PoseGraph, report: Callable[[int], None]) -> Solution:
-    """The last solution of a replay, with the cost of all updates."""
-    cpu_s, iterations, last = 0.0, 0, None
+def _driven(row: Row, backend: Backend, graph: PoseGraph, report: Callable[[int], None]) -> Row:
+    """The row of a whole drive: node by node, then the end; the report has the cost of all updates."""
+    cpu_s, iterations, curve = 0.0, 0, []
     for done, solution in enumerate(replay(backend, graph), start=1):
         cpu_s += solution.report.cpu_s
         iterations += solution.report.iterations
-        last = solution
+        curve.append((done, solution.report.unit_variance))
         report(done)
-    assert last is not None
-    started = chi2(graph, graph.initial)
-    return Solution(last.poses, replace(last.report, cpu_s=cpu_s, iterations=iterations, chi2_initial=started))
+    final = backend.finish(graph)
+    total = replace(
+        final.report,
+        cpu_s=cpu_s + final.report.cpu_s,
+        iterations=iterations + final.report.iterations,
+        chi2_initial=chi2(graph, graph.initial),
+    )
+    curve.append((graph.n_nodes, final.report.unit_variance))
+    return replace(row, solution=Solution(final.poses, total), curve=np.array(curve, dtype=np.float64))
 
 
 def metrics_of(rows: Sequence[Row]) -> list[Metric]:
-    """Figures `<measure>/<back-end>` of the rows that have a solution."""
+    """Figures `<measure>/<title>` of the rows that have a solution."""
     metrics = []
     for row in rows:
         if row.solution is None:
             continue
         report = row.solution.report
-        figures: tuple[tuple[str, float, str, str], ...] = (
+        figures: list[tuple[str, float, str, str]] = [
             ("chi2_initial", report.chi2_initial, "1", "sum of squared Mahalanobis residuals before"),
             ("chi2", report.chi2, "1", "sum of squared Mahalanobis residuals after, over all edges"),
             ("iterations", float(report.iterations), "1", "iterations, sweeps or updates"),
             ("cpu_s", report.cpu_s, "s", "process time"),
             ("rejected_loops", float(len(report.rejected_edge_ids)), "1", "loop edges that the back-end holds for false"),
-        )
+        ]
+        if report.unit_variance is not None:
+            figures.append(("unit_variance", report.unit_variance, "1", "chi2 of the edges kept per degree of freedom"))
+        if report.weak_edges:
+            weak, hanging = float(len(report.weak_edges)), float(report.hanging_nodes)
+            figures.append(("weak_edges", weak, "1", "odometry and registration edges of next to no weight"))
+            figures.append(("hanging_nodes", hanging, "1", "nodes that only such edges and rejected loops hold"))
         if row.certificate is not None and np.isfinite(row.certificate.gap):
             what = "relative gap of the isotropised objective to its lower bound, over the edges kept"
-            figures = (*figures, ("certificate_gap", row.certificate.gap, "1", what))
-        metrics += [Metric(f"{measure}/{row.backend}", value, unit, text) for measure, value, unit, text in figures]
+            figures.append(("certificate_gap", row.certificate.gap, "1", what))
+        title = row.title or row.backend
+        metrics += [Metric(f"{measure}/{title}", value, unit, text) for measure, value, unit, text in figures]
     return metrics

@@ -64,4 +64,6 @@ class KernelBackend(GraphBackend):
         return with_kernel(self._name, graph, start, self._config)
 
     def _solve_whole(self, graph: PoseGraph) -> Outcome:
-        return self._optimise(graph, trusted_start(graph, gate_of(self._config)))
+        start = trusted_start(graph, gate_of(self._config))
+        outcome = self._optimise(graph, start)
+        return outcome if start is graph.initial else replace(outcome, message=f"{outcome.message} (start: consecutive edges)")

@@ -9,35 +9,50 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from hybridmap.backends.comparison import Row
+    from hybridmap.backends.comparison import Row, Way
     from hybridmap.cli.graphs import GraphSource
+    from hybridmap.metrics import Metric
 
 _DEFAULT = "odometry,relaxation-ratslam,gtsam-lm,gtsam-cauchy,gtsam-gnc"
-_WIDTH = 140  # columns of a table that goes into a file
+_WIDTH = 160  # columns of a table that goes into a file
+_ERRORS = {"ate_rmse": "ATE (m)", "relation_trans_mean": "relations (m)", "relation_loop_trans_mean": "of loops (m)"}
 
 
 def compare(
     source: Annotated[Path, typer.Argument(metavar="DIR_OR_GRAPH", help="A session folder, or a planar g2o or TORO file.")],
     backends: Annotated[str, typer.Option(metavar="A,B,...", help="Back-ends, separated by commas.")] = _DEFAULT,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write maps.png and comparison.html here.")] = None,
+    batch: Annotated[
+        bool,
+        typer.Option("--batch", help="Solve the graph whole, from dead reckoning or the poses of the file; files: default."),
+    ] = False,
     incremental: Annotated[
         bool,
-        typer.Option("--incremental", help="Replay the graph node by node, as while driving, instead of solving it whole."),
+        typer.Option(
+            "--incremental", help="Replay the graph node by node, as while driving. Session folders: both, by default."
+        ),
     ] = False,
+    reference: Annotated[
+        Path | None,
+        typer.Option(metavar="GT.tum", help="Session: true trajectory of base_link; default: its own, if it has one."),
+    ] = None,
+    relations: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Session: verified relative poses, `t1 t2 dx dy dyaw` (s, m, rad).")
+    ] = None,
     config: Annotated[str | None, typer.Option(help="Configuration with the back-ends' settings: a name or a file.")] = None,
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
     """Compare back-ends on one frozen graph: chi2, status, iterations, CPU seconds, rejected loops, proof of
-    optimality, ATE (m) if truth is known.
+    optimality; errors against truth (m) and relations (m) if they are known.
 
-    A back-end that fails is a row that says so.
+    A session's graph goes to each back-end whole and node by node. A back-end that fails is a row that says so.
     """
     from hybridmap.backends import comparison
     from hybridmap.cli.graphs import open_graph, settings_of
     from hybridmap.cli.show import emit, progress
-    from hybridmap.errors import BackendError, GraphError
-    from hybridmap.metrics import Metric
+    from hybridmap.errors import BackendError, EvaluationError, GraphError
+    from hybridmap.evaluate.solutions import Judged, judge_solutions
 
     opened = open_graph(source)
     settings = settings_of(opened, config, setting)
@@ -46,61 +61,61 @@ def compare(
         raise BackendError("--backends: found no name, expected back-ends separated by commas")
     if out is not None and out.exists() and not out.is_dir():
         raise GraphError(f"{out}: is a file; --out names a folder")
+    if not opened.is_session and (reference or relations):
+        raise EvaluationError(f"{source}: a graph file has no stamps; --reference and --relations are for session folders")
+    ways = _ways(opened, batch=batch, incremental=incremental)
     with progress(f"comparing on {source}") as advance:
-        rows = comparison.compare(opened.graph, names, settings, incremental=incremental, certified=True, progress=advance)
-    ate = _ate(opened, rows)
-    cells = _table(rows, ate)
+        rows = comparison.compare(
+            opened.graph, names, settings, ways=ways, certified=True, traced=out is not None, progress=advance
+        )
+    judged = Judged((), None)
+    if opened.is_session:
+        maps = {row.title: row.solution.poses for row in rows if row.solution is not None}
+        judged = judge_solutions(source, maps, reference, relations)
+    cells = _table(rows, judged.metrics)
     if out is not None:
-        from hybridmap.report.comparison import write_comparison
+        from hybridmap.report.comparison import Compared, write_comparison
 
-        write_comparison(out, f"Back-ends on {source.name}", opened.head, opened.graph, rows, cells)
+        title = f"Back-ends on {source.name}"
+        write_comparison(out, Compared(title, opened.start, opened.head, opened.graph, rows, cells, settings, judged.truth))
     if not as_json:
-        _show(cells, rows, title=f"{source}: {opened.graph.n_nodes} nodes, {opened.graph.n_edges} edges")
+        _show(cells, rows, f"{source}: {opened.graph.n_nodes} nodes, {opened.graph.n_edges} edges; batch from {opened.start}")
         return
     head = opened.head | {
-        "incremental": incremental,
-        "backends": names,
-        "status": {row.backend: row.status for row in rows},
-        "message": {row.backend: row.message for row in rows},
-        "certificate": {row.backend: row.certificate.message for row in rows if row.certificate is not None},
+        "start": opened.start,
+        "ways": [str(way) for way in ways],
+        "backends": [row.title for row in rows],
+        "status": {row.title: row.status for row in rows},
+        "message": {row.title: row.message for row in rows},
+        "certificate": {row.title: row.certificate.message for row in rows if row.certificate is not None},
     }
-    metrics = comparison.metrics_of(rows)
-    metrics += [Metric(f"ate_rmse/{name}", value, "m", "RMSE of position after SE(2) alignment") for name, value in ate.items()]
-    emit(head, metrics, as_json=True)
+    emit(head, [*comparison.metrics_of(rows), *judged.metrics], as_json=True)
 
 
-def _ate(opened: GraphSource, rows: Sequence[Row]) -> dict[str, float]:
-    """ATE of each solved row against the session's own truth; empty without one."""
-    if not opened.is_session:
-        return {}
-    from hybridmap.evaluate.trajectory import absolute_error
-    from hybridmap.store import MapStore, SessionFolder, trajectory_of
-    from hybridmap.trajectory import read_tum
+def _ways(opened: GraphSource, *, batch: bool, incremental: bool) -> list[Way]:
+    """What was asked for; by default a session is shown in both ways, and a file, which may be large, in one."""
+    from hybridmap.backends.comparison import Way
 
-    truth = SessionFolder(opened.path).groundtruth
-    if not truth.is_file():
-        return {}
-    reference = read_tum(truth)
-    with MapStore.open(opened.path) as store:
-        track = store.track()
-    solved = {row.backend: row.solution.poses for row in rows if row.solution is not None}
-    ways = {name: track.odometry if name == "odometry" else trajectory_of(track, poses) for name, poses in solved.items()}
-    return {name: absolute_error(way, reference).rmse_m for name, way in ways.items()}
+    asked = [way for way, given in ((Way.BATCH, batch), (Way.INCREMENTAL, incremental)) if given]
+    return asked or ([Way.BATCH, Way.INCREMENTAL] if opened.is_session else [Way.BATCH])
 
 
-def _table(rows: Sequence[Row], ate: dict[str, float]) -> list[list[str]]:
+def _table(rows: Sequence[Row], judged: Sequence[Metric]) -> list[list[str]]:
     """Column titles, then a line of text a row."""
-    columns = ["back-end", "chi2 initial", "chi2", *(["ATE (m)"] if ate else []), "status", "iterations", "CPU (s)"]
+    by_name = {metric.name: f"{metric.value:.4f}" for metric in judged}
+    errors = {name: title for name, title in _ERRORS.items() if any(key.startswith(f"{name}/") for key in by_name)}
+    columns = ["back-end", "way", "chi2", "unit variance", *errors.values(), "status", "iterations", "CPU (s)"]
     table = [[*columns, "rejected loops", "certificate"]]
     for row in rows:
         if row.solution is None:
-            table.append([row.backend, "", "", *([""] if ate else []), row.status, "", "", "", ""])
+            table.append([row.backend, str(row.way), "", "", *("" for _ in errors), row.status, "", "", "", ""])
             continue
         report = row.solution.report
-        error = [f"{ate[row.backend]:.3f}"] if ate else []
-        figures = [f"{report.chi2_initial:.7g}", f"{report.chi2:.7g}", *error, row.status, str(report.iterations)]
+        against = [by_name.get(f"{name}/{row.title}", "") for name in errors]
+        variance = "" if report.unit_variance is None else f"{report.unit_variance:.4g}"
+        figures = [f"{report.chi2:.7g}", variance, *against, row.status, str(report.iterations), f"{report.cpu_s:.2f}"]
         proof = row.certificate.word if row.certificate is not None else ""
-        table.append([row.backend, *figures, f"{report.cpu_s:.2f}", str(len(report.rejected_edge_ids)), proof])
+        table.append([row.backend, str(row.way), *figures, str(len(report.rejected_edge_ids)), proof])
     return table
 
 
@@ -114,9 +129,9 @@ def _show(cells: Sequence[Sequence[str]], rows: Sequence[Row], title: str) -> No
         console = Console(width=_WIDTH)
     table = Table(title=title, title_justify="left", box=SIMPLE)
     for i, column in enumerate(cells[0]):
-        table.add_column(column, justify="right" if i else "left")
+        table.add_column(column, justify="right" if i > 1 else "left")
     for line in cells[1:]:
         table.add_row(*line)
     console.print(table)
     for row in rows:
-        typer.echo(f"{row.backend}: {row.message}")
+        typer.echo(f"{row.title}: {row.message}")

@@ -26,12 +26,14 @@ class GraphSource:
         path: the file or session folder.
         graph: its nodes and accepted edges.
         is_session: whether `path` is a session folder.
+        start: what the graph's own poses are.
         head: what a JSON object says about it.
     """
 
     path: Path
     graph: PoseGraph
     is_session: bool
+    start: str
     head: dict[str, Any] = field(default_factory=dict)
 
 
@@ -44,14 +46,15 @@ def open_graph(path: Path) -> GraphSource:
     """
     if not path.is_dir():
         graph = read_graph(path)
-        return GraphSource(path, graph, is_session=False, head=_head(path, graph))
+        return GraphSource(path, graph, is_session=False, start="the poses of the file", head=_head(path, graph))
     SessionFolder(path).require()
     with MapStore.open(path) as store:
         experiences = store.map()
     graph = experiences.pose_graph()
     if graph.n_edges == 0:
         raise GraphError(f"{path}: the map has no accepted edge; there is nothing to optimise")
-    return GraphSource(path, graph, is_session=True, head=_head(path, graph) | {"graph_hash": graph_hash(experiences)})
+    head = _head(path, graph) | {"graph_hash": graph_hash(experiences)}
+    return GraphSource(path, graph, is_session=True, start="dead reckoning", head=head)
 
 
 def settings_of(source: GraphSource, config: str | None, setting: list[str] | None) -> BackendsConfig:

@@ -51,9 +51,9 @@ def evaluate_session(folder: Path, reference: Path | None = None, relations: Pat
     metrics: list[Metric] = []
     for name, trajectory in estimates.items():
         if truth is not None:
-            metrics += _against_truth(name, trajectory, truth)
+            metrics += against_truth(name, trajectory, truth)
         if verified is not None:
-            metrics += _against_relations(name, trajectory, verified)
+            metrics += against_relations(name, trajectory, verified)
     for name, errors in closures.items():
         metrics += _closure_metrics(name, errors)
     metrics += edges
@@ -109,7 +109,12 @@ def _names(estimate: str) -> tuple[str, str, str]:
     return "", estimate, "over the whole recording"
 
 
-def _against_truth(estimate: str, trajectory: Trajectory, truth: Trajectory) -> list[Metric]:
+def against_truth(estimate: str, trajectory: Trajectory, truth: Trajectory) -> list[Metric]:
+    """ATE, RPE and drift of one estimate, named `<measure>/<estimate>`.
+
+    Raises:
+        EvaluationError: too few stamps in common.
+    """
     suffix, backend, when = _names(estimate)
     try:
         pairs = associate(trajectory, truth)
@@ -131,7 +136,8 @@ def _against_truth(estimate: str, trajectory: Trajectory, truth: Trajectory) -> 
     return [Metric(f"{name}{suffix}/{backend}", value, unit, f"{text}; {when}") for name, value, unit, text in rows]
 
 
-def _against_relations(estimate: str, trajectory: Trajectory, relations: Relations) -> list[Metric]:
+def against_relations(estimate: str, trajectory: Trajectory, relations: Relations) -> list[Metric]:
+    """Relation errors of one estimate, over all and over those of more than 60 s, named `<measure>/<estimate>`."""
     suffix, backend, when = _names(estimate)
     errors = relation_errors(trajectory, relations)
     if not suffix and backend == ODOMETRY and errors.all.used < 0.5 * errors.all.total:

@@ -2,82 +2,98 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment
+import numpy as np
+import yaml
 
 from hybridmap.backends.comparison import Row
-from hybridmap.graph.pose_graph import PoseGraph
-from hybridmap.plots import map_panels, residual_curves, save_png
+from hybridmap.backends.objective import squared_norms
+from hybridmap.config.backends import BackendsConfig
+from hybridmap.geometry import Array
+from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.report import comparison_figures as figures
+from hybridmap.report import tables
 from hybridmap.trajectory import write_text_atomic
 
 PICTURE, PAGE = "maps.png", "comparison.html"
-
-_TEMPLATE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>
-body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 68rem; margin: 2rem auto; padding: 0 1rem }
-table { border-collapse: collapse; width: 100% }
-th, td { padding: .3rem .6rem; border-bottom: 1px solid #ddd; text-align: right }
-th:first-child, td:first-child { text-align: left } img { max-width: 100% }
-.bad { color: #b03a00 } small { color: #666 }
-</style></head><body>
-<h1>{{ title }}</h1>
-<p>{{ facts }}</p>
-<table><tr>{% for column in columns %}<th>{{ column }}</th>{% endfor %}</tr>
-{% for row in rows %}<tr{% if row.bad %} class="bad"{% endif %}>{% for cell in row.cells %}<td>{{ cell }}</td>{% endfor %}</tr>
-{% endfor %}</table>
-<ul>{% for line in messages %}<li>{{ line }}</li>{% endfor %}</ul>
-<p><small>chi2: the sum of squared Mahalanobis residuals over <em>all</em> edges (SE(2) logarithm), by one referee for every
-back-end; a robust back-end that rejects false loops has a high chi2 for a good map. CPU: process time.</small></p>
-<h2>Maps</h2>
-<p>Blue: chain of consecutive nodes. Green: loops. Orange: loops that the back-end rejected.</p>
-<img alt="the map of each back-end" src="{{ maps }}">
-<h2>What the edges cost</h2>
-<img alt="distribution of squared residuals" src="{{ residuals }}">
-</body></html>
-"""
+_TEMPLATE = "comparison.html.j2"
+_WORST = 6  # edges a row
 
 
-def write_comparison(
-    folder: Path, title: str, head: Mapping[str, Any], graph: PoseGraph, rows: Sequence[Row], cells: Sequence[Sequence[str]]
-) -> Path:
-    """Write `maps.png` and `comparison.html` into a folder, which is made; returns the page.
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """What was compared.
 
-    Args:
-        folder: where to.
+    Attributes:
         title: headline.
+        start: what the graph's own poses are, from which batch solutions begin.
         head: facts about the graph, shown as `key: value`.
-        graph: the graph that was compared on.
+        graph: the graph.
         rows: the back-ends.
         cells: the table: a line of column titles, then one line a row of `rows`.
+        settings: of the back-ends.
+        truth: (P, 3) the true way in the frame of the maps, m and rad; None where it is not known.
     """
-    solved = {row.backend: row.solution for row in rows if row.solution is not None}
-    maps = {"start": graph.initial} | {name: solution.poses for name, solution in solved.items()}
-    rejected = {name: solution.report.rejected_edge_ids for name, solution in solved.items()}
-    panels = map_panels(graph, maps, rejected)
-    save_png(panels, folder / PICTURE)
-    page = (
-        Environment(autoescape=True)
-        .from_string(_TEMPLATE)
-        .render(
-            title=title,
-            facts=", ".join(f"{key}: {value}" for key, value in head.items()),
-            columns=cells[0],
-            rows=[{"cells": line, "bad": row.solution is None} for row, line in zip(rows, cells[1:], strict=True)],
-            messages=[f"{row.backend}: {row.message}" for row in rows],
-            maps=_data_uri(panels),
-            residuals=_data_uri(residual_curves(graph, maps)),
-        )
+
+    title: str
+    start: str
+    head: Mapping[str, Any]
+    graph: PoseGraph
+    rows: Sequence[Row]
+    cells: Sequence[Sequence[str]]
+    settings: BackendsConfig
+    truth: Array | None = None
+
+
+def write_comparison(folder: Path, compared: Compared) -> Path:
+    """Write `maps.png` and `comparison.html` into a folder, which is made; returns the page."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("hybridmap", "report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    graph, rows = compared.graph, compared.rows
+    page = environment.get_template(_TEMPLATE).render(
+        title=compared.title,
+        start=compared.start,
+        chi2_start=tables.number(float(squared_norms(graph, graph.initial).sum())),
+        facts=[(key, value) for key, value in compared.head.items() if key not in ("nodes", "edges", "loops")],
+        tiles=[(compared.head[key], key) for key in ("nodes", "edges", "loops")],
+        columns=compared.cells[0],
+        rows=[{"cells": line, "bad": row.solution is None} for row, line in zip(rows, compared.cells[1:], strict=True)],
+        messages=[(row.title, row.message) for row in rows],
+        ways={str(row.way) for row in rows},
+        of_truth=compared.truth is not None,
+        overlay=figures.overlay(rows, compared.truth),
+        panels=figures.save_panels(folder / PICTURE, graph, rows, compared.start),
+        convergence=figures.convergence(rows),
+        weights=figures.weights(graph, rows),
+        residuals=figures.residuals(graph, rows),
+        worst=[(row.title, worst_edges(graph, row)) for row in rows if row.solution is not None],
+        settings=yaml.safe_dump(compared.settings.model_dump(mode="json", exclude={"names"}), sort_keys=False),
+        version=version("hybridmap"),
     )
     write_text_atomic(folder / PAGE, page)
     return folder / PAGE
 
 
-def _data_uri(figure: Any) -> str:
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=110, metadata={"Software": None})
-    return "data:image/png;base64," + base64.b64encode(data.getvalue()).decode("ascii")
+def worst_edges(graph: PoseGraph, row: Row) -> list[str]:
+    """The edges that a solution kept and that cost it most, the worst first: number, ends, kind, squared residual."""
+    assert row.solution is not None
+    squared = squared_norms(graph, row.solution.poses)
+    squared[np.isin(graph.edge_ids, row.solution.report.rejected_edge_ids)] = -1.0
+    return [
+        f"{graph.edge_ids[e]} ({graph.sources[e]} → {graph.targets[e]}, {EdgeKind(graph.kinds[e]).name.lower()}): "
+        f"{tables.number(float(squared[e]))}"
+        for e in np.argsort(-squared, kind="stable")[:_WORST].tolist()
+        if squared[e] >= 0.0
+    ]

@@ -16,7 +16,7 @@ SCHEMA = 1
 """Raised when the meaning of a figure changes."""
 
 _LIBRARIES = ("gtsam", "numba", "numpy", "scipy", "opencv-python-headless")
-_SHOWING = ("cli", "evaluate", "export", "plots.py", "report", "session.py", "study")
+_SHOWING = ("cli", "evaluate", "export", "report", "session.py", "study")
 _SOLVING = ("backends", "config/backends.py", "geometry.py", "graph", "study/cell.py", "study/disturb.py", "study/sources.py")
 
 

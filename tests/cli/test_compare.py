@@ -3,12 +3,20 @@
 import json
 import sys
 
+import numpy as np
 import pytest
 
 from hybridmap.backends import comparison, odometry
+from hybridmap.backends.comparison import Way
+from hybridmap.backends.false_loops import inject
+from hybridmap.backends.objective import chi2
 from hybridmap.cli import main
 from hybridmap.errors import BackendError
+from hybridmap.geometry import between
 from hybridmap.graph.io import read_graph
+from hybridmap.trajectory import Trajectory
+from tests.backends.graphs_for_tests import laps
+from tests.store.sessions import ring_map, truth_at, write_session
 
 SQUARE = """VERTEX_SE2 0 0 0 0
 VERTEX_SE2 1 1.1 0 1.6
@@ -36,7 +44,7 @@ def square(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("way", [(), ("--incremental",)])
+@pytest.mark.parametrize("way", [(), ("--batch",), ("--incremental",)])
 def test_json_has_a_figure_and_a_status_of_each_back_end(monkeypatch, capsys, square, way):
     names = ["odometry", "relaxation-ratslam", "gtsam-lm", "gtsam-isam2", "gtsam-gnc"]
     code, printed, _ = run(monkeypatch, capsys, "compare", square, "--backends", ",".join(names), "--json", *way)
@@ -44,6 +52,8 @@ def test_json_has_a_figure_and_a_status_of_each_back_end(monkeypatch, capsys, sq
     told = json.loads(printed)
     figures = {row["name"]: row["value"] for row in told["metrics"]}
     assert told["backends"] == names
+    assert told["ways"] == (["incremental"] if "--incremental" in way else ["batch"])
+    assert told["start"] == "the poses of the file"
     assert set(told["status"]) == set(told["certificate"]) == set(names)
     assert figures["certificate_gap/gtsam-lm"] <= 1e-6
     for name in names:
@@ -59,9 +69,10 @@ def test_a_folder_gets_a_picture_and_a_page_that_needs_nothing_else(monkeypatch,
     assert "gtsam-lm" in printed
     assert (out / "maps.png").read_bytes()[:4] == b"\x89PNG"
     page = (out / "comparison.html").read_text()
-    assert page.count("data:image/png;base64") == 2
+    assert page.count("data:image/") == 4  # over one another, side by side, convergence, residuals; no loop has a weight
     assert "http" not in page
     assert "gtsam-lm" in page
+    assert "<details><summary>Settings" in page
 
 
 def test_a_back_end_that_fails_is_a_row_that_says_so(monkeypatch, capsys, square, tmp_path):
@@ -86,8 +97,70 @@ def test_rows_come_in_the_order_asked_for_and_progress_reaches_its_end(square):
     seen = []
     graph = read_graph(square)
     rows = comparison.compare(
-        graph, ["gtsam-lm", "odometry"], incremental=True, progress=lambda done, total: seen.append((done, total))
+        graph, ["gtsam-lm", "odometry"], ways=[Way.INCREMENTAL], progress=lambda done, total: seen.append((done, total))
     )
-    assert [row.backend for row in rows] == ["gtsam-lm", "odometry"]
+    assert [row.title for row in rows] == ["gtsam-lm", "odometry"]
     assert seen[-1] == (8, 8)
     assert seen == sorted(seen)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """A session with closures, and its truth."""
+    folder = write_session(tmp_path_factory.mktemp("compared") / "session", ring_map(2.2))
+    stamps = np.arange(0, 60 * 10**9, 10**8)
+    folder.write_groundtruth(Trajectory(stamps, truth_at(stamps)))
+    return folder
+
+
+def test_a_session_is_shown_in_both_ways_with_its_errors(monkeypatch, capsys, session, tmp_path):
+    stamps = np.array([0, 30 * 10**9])
+    relations = tmp_path / "session.relations"
+    first, second = truth_at(stamps)
+    relations.write_text("0.0 30.0 " + " ".join(f"{value:.9f}" for value in between(first, second)) + "\n")
+    words = ("compare", session.path, "--backends", "odometry,relaxation-ratslam,gtsam-gnc", "--relations", relations)
+    code, printed, _ = run(monkeypatch, capsys, *words, "--json", "--out", tmp_path / "page")
+    assert code == 0
+    told = json.loads(printed)
+    both = [f"{name}{way}" for name in ("relaxation-ratslam", "gtsam-gnc") for way in ("", "/incremental")]
+    assert told["backends"] == ["odometry", *both]
+    assert told["start"] == "dead reckoning"
+    figures = {row["name"]: row["value"] for row in told["metrics"]}
+    for name in both:
+        assert figures[f"ate_rmse/{name}"] <= figures["ate_rmse/odometry"]
+        assert f"relation_trans_mean/{name}" in figures
+    page = (tmp_path / "page" / "comparison.html").read_text()
+    assert "beginning with dead reckoning" in page
+    assert "The true way is laid onto" in page
+    assert "relations (m)" in page
+
+
+def test_what_only_a_session_has_is_refused_for_a_file(monkeypatch, capsys, square, tmp_path):
+    code, printed, error = run(monkeypatch, capsys, "compare", square, "--reference", tmp_path / "truth.tum")
+    assert code == 2
+    assert printed == ""
+    assert "--reference and --relations are for session folders" in error
+
+
+def test_a_drive_ends_where_a_session_ends():
+    graph, _ = laps(np.random.default_rng(0), nodes=80, per_lap=30)
+    false = inject(graph, 0.1, "random", np.random.default_rng(1))
+    batch, driven = comparison.compare(false, ["gtsam-gnc"], ways=list(Way), traced=True)
+    assert (batch.title, driven.title) == ("gtsam-gnc", "gtsam-gnc/incremental")
+    assert batch.solution.report.rejected_edge_ids == driven.solution.report.rejected_edge_ids
+    assert driven.solution.report.iterations > batch.solution.report.iterations
+    assert driven.curve.shape == (81, 2)
+    assert driven.curve[-1, 1] == pytest.approx(driven.solution.report.unit_variance)
+
+
+def test_a_curve_leads_from_the_start_to_the_solution():
+    graph, _ = laps(np.random.default_rng(0), nodes=80, per_lap=30)
+    for name in ("gtsam-lm", "relaxation-ratslam"):
+        (row,) = comparison.compare(graph, [name], traced=True)
+        effort, cost = row.curve.T
+        assert cost[0] == pytest.approx(chi2(graph, graph.initial))
+        assert cost[-1] == pytest.approx(row.solution.report.chi2)
+        assert effort[-1] == row.solution.report.iterations
+        assert np.all(np.diff(effort) > 0)
+        assert np.all(np.diff(cost) <= 2e-3 * cost[:-1])  # relaxation's own objective is another one
+        assert len(cost) >= 3

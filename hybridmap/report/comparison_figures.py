@@ -1,0 +1,186 @@
+"""The pictures of a comparison: the maps over one another and side by side, how they came about, what became of loops."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hybridmap.backends.comparison import Row, Way
+from hybridmap.backends.objective import squared_norms
+from hybridmap.geometry import Array
+from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.report import style
+
+_CHAIN, _LOOP, _REJECTED = style.PRIMARY, style.ACCEPTED, style.REJECTED
+_COLUMNS = 3
+_MARGIN = 0.05  # round a map, of its size
+_SHARP = 24  # lines of an image for each bar: smoothing along the loops must not run from bar to bar
+_BAR_IN = 0.34  # height of a back-end's bar of weights
+
+
+def solved(rows: Sequence[Row]) -> dict[str, Array]:
+    """Title -> poses (N, 3) of the rows that have a map."""
+    return {row.title: row.solution.poses for row in rows if row.solution is not None}
+
+
+def overlay(rows: Sequence[Row], truth: Array | None) -> str:
+    """The chain of nodes of every row in one frame, over the truth (P, 3) where it is known; a `data:` URI."""
+    maps = solved(rows)
+    framed = [poses for title, poses in maps.items() if title != "odometry"] or list(maps.values())
+    low, high = _box(framed if truth is None else [*framed, truth])
+    with style.figure(*style.fitted_size(high - low)) as picture:
+        axes = picture.subplots()
+        if truth is not None:
+            axes.plot(*truth[:, :2].T, color=style.TRUTH, linewidth=3.2, alpha=0.28, label="ground truth", zorder=3)
+        looks = _looks(rows)
+        for title, poses in maps.items():
+            axes.plot(*poses[:, :2].T, label=title, **looks[title])
+        style.metric_axes(axes, "box")
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(low[1], high[1])
+        picture.legend(loc="outside upper left", ncols=4)
+        return style.svg_uri(picture)
+
+
+def save_panels(path: Path, graph: PoseGraph, rows: Sequence[Row], start: str) -> str:
+    """Each map with its loops and its rejected loops, side by side, as a PNG file and as a `data:` URI of it.
+
+    Args:
+        path: the file; the same figure gives the same bytes.
+        graph: the edges.
+        rows: the maps.
+        start: what the graph's own poses are.
+    """
+    maps = solved(rows)
+    if not any(np.allclose(poses, graph.initial) for poses in maps.values()):
+        maps = {start: graph.initial} | maps
+    rejected = {row.title: row.solution.report.rejected_edge_ids for row in rows if row.solution is not None}
+    columns = max(1, min(_COLUMNS, len(maps)))
+    lines = -(-len(maps) // columns)
+    with style.figure(style.PAGE_WIDTH_IN, 0.4 + 3.1 * lines) as picture:
+        panels = picture.subplots(lines, columns, squeeze=False).ravel()
+        for axes, (title, poses) in zip(panels, maps.items(), strict=False):
+            _draw_map(axes, graph, poses, rejected.get(title, ()))
+            axes.set_title(title)
+        for axes in panels[len(maps) :]:
+            axes.set_axis_off()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        picture.savefig(path, dpi=160, metadata={"Software": None})
+    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+
+
+def convergence(rows: Sequence[Row]) -> str:
+    """Batch: chi2 over iterations; incremental: unit variance over nodes; a `data:` URI, empty where nothing was traced."""
+    traced = [row for row in rows if row.curve is not None and row.backend != "odometry"]
+    ways = [way for way in Way if any(row.way is way for row in traced)]
+    if not ways:
+        return ""
+    looks = _looks(rows)
+    with style.figure(style.PAGE_WIDTH_IN, 4.0) as picture:
+        panels = picture.subplots(1, len(ways), squeeze=False).ravel()
+        for axes, way in zip(panels, ways, strict=True):
+            for row in traced:
+                if row.way is way:
+                    _draw_curve(axes, row, looks[row.title])
+            axes.grid(True, linewidth=0.5)
+            axes.set_title(str(way))
+        picture.legend(loc="outside upper left", ncols=4)
+        return style.svg_uri(picture)
+
+
+def weights(graph: PoseGraph, rows: Sequence[Row]) -> str:
+    """Weight of every loop in the order of the log, a bar a row that weighs or rejects loops; a `data:` URI or empty."""
+    ids = graph.edge_ids[graph.is_loop].tolist()
+    bars: dict[str, list[float]] = {}
+    for row in rows:
+        report = row.solution.report if row.solution is not None else None
+        if report is not None and (report.weights or report.rejected_edge_ids):
+            out = set(report.rejected_edge_ids)
+            bars[row.title] = [0.0 if edge in out else report.weights.get(edge, 1.0) for edge in ids]
+    if not bars or not ids:
+        return ""
+    with style.figure(style.PAGE_WIDTH_IN, 1.1 + _BAR_IN * len(bars)) as picture:
+        axes = picture.subplots()
+        looks = {"aspect": "auto", "interpolation": "antialiased", "cmap": "cividis", "vmin": 0.0, "vmax": 1.0}
+        drawn = axes.imshow(np.repeat(list(bars.values()), _SHARP, axis=0), extent=(0, len(ids), len(bars), 0), **looks)
+        axes.set_yticks(np.arange(len(bars)) + 0.5, list(bars))
+        axes.set_xlabel("loops, in the order of the log")
+        for line in range(1, len(bars)):
+            axes.axhline(line, color="white", linewidth=1.5)
+        picture.colorbar(drawn, ax=axes, label="weight (1)")
+        return style.svg_uri(picture)
+
+
+def residuals(graph: PoseGraph, rows: Sequence[Row]) -> str:
+    """Share of edges (%) whose squared Mahalanobis residual is below a value, a line a row; a `data:` URI."""
+    share = 100.0 * (np.arange(graph.n_edges) + 1) / max(graph.n_edges, 1)
+    looks = _looks(rows)
+    with style.figure(style.PAGE_WIDTH_IN, 3.6) as picture:
+        axes = picture.subplots()
+        for title, poses in solved(rows).items():
+            axes.plot(np.maximum(np.sort(squared_norms(graph, poses)), 1e-6), share, label=title, **looks[title])
+        axes.set_xscale("log")
+        axes.set_xlabel("squared Mahalanobis residual of an edge (1)")
+        axes.set_ylabel("share of edges below (%)")
+        axes.grid(True, linewidth=0.5)
+        axes.legend()
+        return style.svg_uri(picture)
+
+
+def _looks(rows: Sequence[Row]) -> Mapping[str, dict[str, Any]]:
+    """Title -> how its line is drawn: a colour a back-end, dashes for the incremental way."""
+    colors = (style.PRIMARY, *style.OTHERS)
+    names = [name for name in dict.fromkeys(row.backend for row in rows) if name != "odometry"]
+    color_of = {"odometry": style.ODOMETRY} | {name: colors[i % len(colors)] for i, name in enumerate(names)}
+    plain: dict[str, Any] = {"linewidth": 1.4, "zorder": 5}
+    dashed = {"linewidth": 1.4, "zorder": 6, "linestyle": (0, (4, 1.6))}
+    dotted = {"linewidth": 1.2, "zorder": 4, "linestyle": (0, (1, 1))}
+    return {
+        row.title: {
+            "color": color_of[row.backend],
+            **(dotted if row.backend == "odometry" else dashed if row.way is Way.INCREMENTAL else plain),
+        }
+        for row in rows
+    }
+
+
+def _box(maps: Sequence[Array]) -> tuple[Array, Array]:
+    """Lower left and upper right corner (2,) of some maps, with a margin."""
+    points = np.concatenate([poses[:, :2] for poses in maps])
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = _MARGIN * max(float((high - low).max()), 1.0)
+    return low - margin, high + margin
+
+
+def _draw_map(axes: Any, graph: PoseGraph, poses: Array, rejected: tuple[int, ...]) -> None:
+    lost, loops = np.isin(graph.edge_ids, np.array(rejected, dtype=np.int64)), graph.is_loop
+    _draw_edges(axes, graph, poses, loops & ~lost, color=_LOOP, linewidths=0.5, label="loops")
+    _draw_edges(axes, graph, poses, ~loops, color=_CHAIN, linewidths=0.9)
+    _draw_edges(axes, graph, poses, lost, color=_REJECTED, linewidths=0.8)
+    style.metric_axes(axes)
+
+
+def _draw_edges(axes: Any, graph: PoseGraph, poses: Array, which: Any, **looks: Any) -> None:
+    from matplotlib.collections import LineCollection
+
+    segments = np.stack([poses[graph.sources[which], :2], poses[graph.targets[which], :2]], axis=1)
+    axes.add_collection(LineCollection(list(segments), **looks))
+    axes.autoscale_view()
+
+
+def _draw_curve(axes: Any, row: Row, looks: dict[str, Any]) -> None:
+    assert row.curve is not None
+    effort, value = row.curve.T
+    axes.plot(effort, np.maximum(value, 1e-12), label=row.title, **looks)
+    axes.set_yscale("log")
+    if row.way is Way.BATCH:
+        axes.set_xscale("symlog", linthresh=1.0)
+        axes.set_xlabel("iterations or sweeps")
+        axes.set_ylabel("chi2 of the edges kept in the end (1)")
+    else:
+        axes.set_xlabel("nodes")
+        axes.set_ylabel("unit variance of what it keeps (1)")
