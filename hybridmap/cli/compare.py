@@ -11,6 +11,7 @@ import typer
 if TYPE_CHECKING:
     from hybridmap.backends.comparison import Row, Way
     from hybridmap.cli.graphs import GraphSource
+    from hybridmap.evaluate.solutions import Judged
     from hybridmap.metrics import Metric
 
 _DEFAULT = "odometry,relaxation-ratslam,gtsam-lm,gtsam-cauchy,gtsam-gnc"
@@ -50,9 +51,8 @@ def compare(
     """
     from hybridmap.backends import comparison
     from hybridmap.cli.graphs import open_graph, settings_of
-    from hybridmap.cli.show import emit, progress
+    from hybridmap.cli.show import progress
     from hybridmap.errors import BackendError, EvaluationError, GraphError
-    from hybridmap.evaluate.solutions import Judged, judge_solutions
 
     opened = open_graph(source)
     settings = settings_of(opened, config, setting)
@@ -68,19 +68,33 @@ def compare(
         rows = comparison.compare(
             opened.graph, names, settings, ways=ways, certified=True, traced=out is not None, progress=advance
         )
-    judged = Judged((), None)
-    if opened.is_session:
-        maps = {row.title: row.solution.poses for row in rows if row.solution is not None}
-        judged = judge_solutions(source, maps, reference, relations)
+    judged = _judged(opened, rows, reference, relations)
     cells = _table(rows, judged.metrics)
     if out is not None:
         from hybridmap.report.comparison import Compared, write_comparison
 
-        title = f"Back-ends on {source.name}"
-        write_comparison(out, Compared(title, opened.start, opened.head, opened.graph, rows, cells, settings, judged.truth))
-    if not as_json:
+        facts = (f"Back-ends on {source.name}", opened.start, opened.head, opened.graph)
+        write_comparison(out, Compared(*facts, rows, cells, settings, judged.truth))
+    if as_json:
+        _emit(opened, ways, rows, judged.metrics)
+    else:
         _show(cells, rows, f"{source}: {opened.graph.n_nodes} nodes, {opened.graph.n_edges} edges; batch from {opened.start}")
-        return
+
+
+def _judged(opened: GraphSource, rows: Sequence[Row], reference: Path | None, relations: Path | None) -> Judged:
+    """Errors of the rows that have a map; none of a graph file."""
+    from hybridmap.evaluate.solutions import Judged, judge_solutions
+
+    if not opened.is_session:
+        return Judged((), None)
+    maps = {row.title: row.solution.poses for row in rows if row.solution is not None}
+    return judge_solutions(opened.path, maps, reference, relations)
+
+
+def _emit(opened: GraphSource, ways: Sequence[Way], rows: Sequence[Row], judged: Sequence[Metric]) -> None:
+    from hybridmap.backends.comparison import metrics_of
+    from hybridmap.cli.show import emit
+
     head = opened.head | {
         "start": opened.start,
         "ways": [str(way) for way in ways],
@@ -89,7 +103,7 @@ def compare(
         "message": {row.title: row.message for row in rows},
         "certificate": {row.title: row.certificate.message for row in rows if row.certificate is not None},
     }
-    emit(head, [*comparison.metrics_of(rows), *judged.metrics], as_json=True)
+    emit(head, [*metrics_of(rows), *judged], as_json=True)
 
 
 def _ways(opened: GraphSource, *, batch: bool, incremental: bool) -> list[Way]:
