@@ -255,8 +255,8 @@ class GncBackend(GraphBackend):
     def _best(self, graph: PoseGraph, driven: Array | None) -> Outcome:
         """Run the configured starts until one convinces; if none does, the lowest truncated cost wins.
 
-        A result convinces where no rejected loops agree with each other, or where two different ways came to the same. With a
-        kernel on odometry none but the first convinces: false loops may have torn the chain. Costs are compared at the
+        A result convinces where no rejected loops agree with each other, or where two different ways came to the same; with a
+        kernel on odometry, which false loops may tear, only where every loop fits without strain. Costs are compared at the
         tightest bound that any start ended with: files that overstate their noise would otherwise prefer a false loop
         that happens to be consistent.
         """
@@ -269,8 +269,11 @@ class GncBackend(GraphBackend):
             if not found.kept.all():
                 found = on_probation(graph, found, self._config)
             agreed = name == "grown" and any(np.array_equal(found.kept, other.kept) for other in results.values())
-            alone = agreed or not rejected_clusters(graph, found.poses, _rejected(graph, found), found.bound)
-            if alone and (not tearable or name == "least squares"):
+            if tearable:
+                convincing = found.kept.all() and unit_variance(graph, squared_norms(graph, found.poses)) <= SLACK
+            else:
+                convincing = agreed or not rejected_clusters(graph, found.poses, _rejected(graph, found), found.bound)
+            if convincing:
                 return self._verdict(graph, found, name)
             results[name] = found
         bound = min(result.bound for result in results.values())

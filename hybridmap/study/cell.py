@@ -109,7 +109,7 @@ def key_of(
             "code": provenance.solving(),
             "source": source_key,
             "drift": None if drift.idle else drift.model_dump(),
-            "drift_seed": seed if drift.noise > 0.0 else None,
+            "drift_seed": seed if drift.by_chance else None,
             "false_loops": [kind, rate, seed] if rate > 0.0 else None,
             "backend": [variant.backend, variant.start, variant.way],
             "settings": settings.model_dump(mode="json", exclude={"names"}),

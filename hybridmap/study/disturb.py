@@ -7,13 +7,13 @@ from typing import Literal
 
 import numpy as np
 
-from hybridmap.backends.false_loops import inject
+from hybridmap.backends.false_loops import drop_out, inject
 from hybridmap.geometry import Array, between, compose, exp
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 from hybridmap.study.model import DriftConfig
 
 Kind = Literal["random", "aliased"]
-_STREAMS = ("drift", "random", "aliased")  # each draws from a stream of its own
+_STREAMS = ("drift", "random", "aliased", "dropouts")  # each draws from a stream of its own
 
 
 def with_drift(graph: PoseGraph, drift: DriftConfig, seed: int) -> PoseGraph:
@@ -31,6 +31,8 @@ def with_drift(graph: PoseGraph, drift: DriftConfig, seed: int) -> PoseGraph:
         white = generator("drift", 0.0, seed).standard_normal((len(odometry), 3, 1))
         twist = drift.noise * (np.linalg.cholesky(covariance) @ white)[:, :, 0]
         deltas[odometry] = compose(deltas[odometry], exp(twist))
+    if drift.dropouts > 0.0:
+        deltas = drop_out(replace(graph, deltas=deltas), drift.dropouts, generator("dropouts", drift.dropouts, seed)).deltas
     return replace(graph, deltas=deltas, initial=_moved(graph, deltas))
 
 

@@ -116,5 +116,5 @@ def _false_loops(study: StudyConfig) -> list[tuple[str, float]]:
 
 def _seeds(study: StudyConfig, source: SourceConfig, setting: SettingConfig, rate: float) -> Sequence[int | None]:
     """Every seed where chance plays a part; a single None where every seed would give the same."""
-    by_chance = rate > 0.0 or setting.drift.noise > 0.0 or depends_on_seed(source)
+    by_chance = rate > 0.0 or setting.drift.by_chance or depends_on_seed(source)
     return study.seeds if by_chance else (None,)

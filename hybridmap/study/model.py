@@ -78,6 +78,13 @@ class DriftConfig(Section):
     """Relative error of each odometry edge's length."""
     noise: float = Field(default=0.0, ge=0)
     """Further white noise by the seed, in standard deviations of what the edge's information says."""
+    dropouts: float = Field(default=0.0, ge=0, le=1)
+    """Share of the odometry edges, by the seed, that turn by 20 deg more and slip by 0.5 m."""
+
+    @property
+    def by_chance(self) -> bool:
+        """Whether the seed plays a part."""
+        return self.noise > 0.0 or self.dropouts > 0.0
 
     @property
     def idle(self) -> bool:

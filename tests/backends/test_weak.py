@@ -116,3 +116,12 @@ def test_drop_outs_hit_the_share_asked_for_and_only_odometry():
     assert np.array_equal(again.deltas, dropped.deltas)
     with pytest.raises(GraphError, match="share"):
         drop_out(graph, 1.5, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_where_no_wheel_fails_false_loops_do_not_tear_the_chain_either(seed):
+    graph, truth = laps(np.random.default_rng(seed), nodes=240, per_lap=60)
+    false = inject(graph, 0.1, "random", np.random.default_rng(seed))
+    solution = backends.create("gtsam-gnc", CAUCHY).solve(false)
+    assert ate(solution.poses, truth) < 0.15
+    assert set(false.edge_ids[graph.n_edges :].tolist()) <= set(solution.report.rejected_edge_ids)

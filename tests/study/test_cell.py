@@ -6,7 +6,7 @@ import pytest
 from hybridmap.backends import batch
 from hybridmap.backends.base import SolveStatus
 from hybridmap.errors import BackendError
-from hybridmap.geometry import compose
+from hybridmap.geometry import between, compose
 from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.study import cell as cells
 from hybridmap.study.disturb import with_drift, with_false_loops
@@ -108,6 +108,20 @@ def test_drift_bends_the_odometry_and_nothing_else(frozen):
     assert np.array_equal(noisy[0], noisy[1])
     assert not np.array_equal(noisy[0], noisy[2])
     assert np.std(noisy[0][odometry] - graph.deltas[odometry], axis=0) == pytest.approx([0.03, 0.03, 0.01], rel=0.4)
+
+
+def test_drop_outs_are_of_the_seed_and_move_the_way_after_them(frozen):
+    graph = frozen.graph
+    once, again, other = (with_drift(graph, DriftConfig(dropouts=0.1), seed) for seed in (1, 1, 2))
+    assert np.array_equal(once.deltas, again.deltas)
+    assert not np.array_equal(once.deltas, other.deltas)
+    hit = (once.deltas != graph.deltas).any(axis=1)
+    odometry = graph.kinds == EdgeKind.ODOMETRY
+    assert hit.sum() == round(0.1 * odometry.sum())
+    assert not (hit & ~odometry).any()
+    first = int(graph.targets[hit].min())
+    assert np.allclose(once.initial[:first], graph.initial[:first])
+    assert np.allclose(between(once.initial[first - 1], once.initial[first]), once.deltas[hit][0])
 
 
 def test_the_same_seed_gives_every_back_end_the_same_false_loops(frozen):

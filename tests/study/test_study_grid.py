@@ -41,8 +41,9 @@ def test_cells_come_in_order_and_without_false_loops_there_is_no_kind():
 def test_where_nothing_is_left_to_chance_there_is_one_cell_for_all_seeds(graph_file):
     cells = lay_out(small(sources=[{"graph": str(graph_file)}])).cells
     assert [cell.seed for cell in cells] == [None] * 3 + ([3] * 3 + [5] * 3) * 2
-    noisy = [{"name": "noisy", "drift": {"noise": 1.0}}]
-    assert lay_out(small(sources=[{"graph": str(graph_file)}], settings=noisy)).cells[0].seed == 3
+    for drift in ({"noise": 1.0}, {"dropouts": 0.1}):
+        settings = [{"name": "by chance", "drift": drift}]
+        assert lay_out(small(sources=[{"graph": str(graph_file)}], settings=settings)).cells[0].seed == 3
 
 
 def test_names_are_no_part_of_a_key_and_everything_else_is():
@@ -54,6 +55,8 @@ def test_names_are_no_part_of_a_key_and_everything_else_is():
         {"sources": [{"synthetic": {"nodes": 40, "per_lap": 16}, "first_nodes": 39}]},
         {"seeds": [4, 6]},
         {"settings": [{"name": "default", "drift": {"heading_bias_deg_per_m": 0.1}}]},
+        {"settings": [{"name": "default", "drift": {"dropouts": 0.1}}]},
+        {"backends": [{"backend": "gtsam-lm", "settings": {"consistency.enabled": True}}]},
         {"backends": [{"backend": "gtsam-lm", "settings": {"max_iterations": 7}}]},
         {"backends": [{"backend": "gtsam-lm", "start": "angular"}]},
         {"backends": [{"backend": "gtsam-lm", "way": "replay"}]},
