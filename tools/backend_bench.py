@@ -6,7 +6,8 @@
 `sweep`     relaxation-ratslam against loops in plain Python over the same links in the same order: 1,000 nodes, 1,500 edges
 `overhead`  gtsam-lm against tools/bare_gtsam.py on the same file, from the parsed file in memory to the optimised poses
 `gnc`       gtsam-gnc against gtsam.GncLMOptimizer with odometry as known inliers: intel, random false loops
-`isam2`     one update of a replay against one batch optimisation from the odometry chain: Manhattan
+`isam2`     updates of a replay against one batch optimisation from the odometry chain, and false edges taken out again:
+            Manhattan and city10000, some minutes
 """
 
 from __future__ import annotations
@@ -14,19 +15,18 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import bare_gtsam
 import gtsam
 import numpy as np
+import replay_bench
 from numpy.typing import NDArray
 
 from hybridmap import backends
-from hybridmap.backends.batch import run
 from hybridmap.backends.factors import NoiseModels, factor_graph, values
 from hybridmap.backends.false_loops import inject
-from hybridmap.backends.following import prefix
 from hybridmap.backends.sweeps import relax_links
 from hybridmap.config.backends import RelaxationConfig
 from hybridmap.geometry import Array, between, compose, exp, wrap_angle
@@ -197,20 +197,10 @@ def gtsams_gnc(graph: PoseGraph) -> NDArray[np.int64]:
     return graph.edge_ids[graph.is_loop & (weights < 0.5)]
 
 
-def isam2_study(data: Path | None) -> list[str]:
-    """A replay's updates against one batch optimisation."""
-    graph = chain(read_graph(posegraph(data, "manhattanOlson3500.g2o")))
-    batch = cpu_s(lambda: run("lm", factor_graph(graph, NoiseModels()), graph.initial, 100))
-    best = backends.create("gtsam-lm").solve(graph).report.chi2
-    backend, spent, updates = backends.create("gtsam-isam2"), [], [prefix(graph, n + 1) for n in range(graph.n_nodes)]
-    for part in updates:
-        started = time.process_time()
-        solution = backend.update(part)
-        spent.append(time.process_time() - started)
-    median, p99 = np.quantile(spent, [0.5, 0.99])
-    figures = f"median {median * 1e3:.2f} ms, 99 % {p99 * 1e3:.0f} ms, {sum(spent):.1f} s in all"
-    cost = f"chi2 {solution.report.chi2:.6g} = {solution.report.chi2 / best:.5f} x batch"
-    return [f"isam2 on Manhattan: batch from the chain {batch:.3f} s; updates {figures}: 1/{batch / median:.0f}; {cost}"]
+def isam2_study(data: Path | None) -> Iterator[str]:
+    """A replay's updates against one batch optimisation, with false edges put in and taken out."""
+    for name in replay_bench.GRAPHS:
+        yield from replay_bench.study(posegraph(data, name))
 
 
 def posegraph(data: Path | None, name: str) -> Path:
@@ -220,7 +210,7 @@ def posegraph(data: Path | None, name: str) -> Path:
     return data / "posegraphs" / name
 
 
-STUDIES: dict[str, Callable[[Path | None], list[str]]] = {
+STUDIES: dict[str, Callable[[Path | None], Iterable[str]]] = {
     "sweep": sweep_study,
     "overhead": overhead_study,
     "gnc": gnc_study,

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from hybridmap.backends.base import SolveStatus
-from hybridmap.backends.factors import NoiseModels, anchor, factor_graph, factors, poses_of, values
+from hybridmap.backends.factors import NoiseModels, anchor, collected, factor_graph, factors, poses_of, values
 from hybridmap.backends.following import Change, GraphBackend, Outcome, difference
 from hybridmap.backends.initial import best_start
 from hybridmap.config.backends import BackendsConfig
@@ -79,6 +79,8 @@ def _attempt(method: str, graph: Any, start: Array, initial: Any, max_iterations
     poses, iterations = poses_of(result), int(optimizer.iterations())
     if not np.isfinite(poses).all():
         return Outcome(start, SolveStatus.DIVERGED, f"{method}: poses were not finite", iterations)
+    if method == "gn" and graph.error(result) > graph.error(initial):
+        return Outcome(start, SolveStatus.DIVERGED, "gn: the cost rose, kept the start", iterations)
     status, message = SolveStatus.CONVERGED, f"{method}: converged"
     if iterations >= max_iterations:
         status, message = SolveStatus.MAX_ITERATIONS, f"{method}: stopped at {iterations} iterations"
@@ -105,10 +107,7 @@ class WarmStart:
         initial = values(start[known:], known)
         if self._values is not None:
             initial.insert(self._values)
-        whole = gtsam.NonlinearFactorGraph()
-        for edge in graph.edge_ids.tolist():
-            whole.push_back(self._factors[edge])
-        whole.push_back(anchor(graph.initial[0]))
+        whole = collected([*(self._factors[edge] for edge in graph.edge_ids.tolist()), anchor(graph.initial[0])])
         outcome = run(method, whole, start, max_iterations, initial=initial, tolerance=_ON_THE_WAY)
         self._graph, self._values = graph, initial if outcome.values is None else outcome.values
         return outcome
@@ -117,7 +116,7 @@ class WarmStart:
 class BatchBackend(GraphBackend):
     """`gtsam-lm` (with a start of its own and Dogleg to fall back on), `gtsam-gn`, `gtsam-dogleg`."""
 
-    _descends = True
+    _rise = 1e-9
 
     def __init__(self, name: str, config: BackendsConfig) -> None:
         super().__init__(name, config)

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_law
 
 from hybridmap.backends.clusters import neighbouring_pairs
-from hybridmap.backends.objective import SLACK
+from hybridmap.backends.objective import SLACK, chi2_quantile
 from hybridmap.config.backends import ConsistencyConfig
 from hybridmap.geometry import Array, adjoint, compose, inverse, log
 from hybridmap.graph.pose_graph import PoseGraph
@@ -98,11 +97,11 @@ def consistent_loops(graph: PoseGraph, config: ConsistencyConfig) -> Consistent:
     """
     loops = np.flatnonzero(graph.is_loop)
     asked = _Asked.by(graph, loops)
-    bound = float(chi2_law.ppf(config.quantile, df=3))
+    bound = chi2_quantile(config.quantile)
     near = neighbouring_pairs(graph, loops)
     apart = asked.apart(near[:, 0], near[:, 1])
     agreeing = apart[apart <= bound]
-    variance = float(np.median(agreeing) / chi2_law.median(df=3)) if len(agreeing) else 1.0
+    variance = float(np.median(agreeing) / chi2_quantile(0.5)) if len(agreeing) else 1.0
     chosen = largest_clique(_pairwise(asked, bound * min(1.0, SLACK * variance)))
     backed = np.bincount(near[chosen[near].all(axis=1)].ravel(), minlength=len(loops))
     return Consistent(loops[chosen & (backed >= config.neighbours)], variance)

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import splu
-from scipy.stats import chi2 as chi2_law
 
-from hybridmap.backends.objective import SLACK, residuals
+from hybridmap.backends.objective import SLACK, chi2_quantile, residuals
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, adjoint, between
 from hybridmap.graph.pose_graph import PoseGraph
@@ -36,7 +35,7 @@ def expected_loops(graph: PoseGraph, poses: Array, loops: NDArray[np.int64], var
     covariance = (covariance + np.linalg.inv(graph.information[loops])) * min(1.0, variance)
     r = residuals(graph.with_edges(loops), poses)
     innovation = np.einsum("ei,ei->e", r, np.linalg.solve(covariance, r[:, :, None])[:, :, 0])
-    return np.asarray(innovation <= SLACK * chi2_law.ppf(_EXPECTED, df=3))
+    return np.asarray(innovation <= SLACK * chi2_quantile(_EXPECTED))
 
 
 class Covariances:

@@ -23,6 +23,8 @@ from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 
 _ROUNDING = 1e-9  # of chi2: a chain without loops has none, and no solver finds less
 
+_Rows = slice | NDArray[np.int64]
+
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
@@ -77,32 +79,55 @@ def difference(old: PoseGraph | None, new: PoseGraph) -> Change:
     """What happened between two states of one graph."""
     if old is None:
         return Change(np.arange(new.n_edges), np.arange(0), closes=True)
-    place = np.searchsorted(new.edge_ids, old.edge_ids)  # both strictly increase
-    found = new.edge_ids[np.minimum(place, max(new.n_edges - 1, 0))] == old.edge_ids if new.n_edges else place < 0
-    i_old, i_new = np.flatnonzero(found), place[found]
-    same = _unchanged(old.with_edges(i_old) if len(i_old) < old.n_edges else old, new.with_edges(i_new))
-    kept_old, kept_new = np.zeros(old.n_edges, dtype=bool), np.zeros(new.n_edges, dtype=bool)
-    kept_old[i_old[same]], kept_new[i_new[same]] = True, True
-    added, removed = np.flatnonzero(~kept_new), np.flatnonzero(~kept_old)
+    head = _common_head(old.edge_ids, new.edge_ids)
+    came, went = np.ones(new.n_edges, dtype=bool), np.ones(old.n_edges, dtype=bool)
+    came[:head] = went[:head] = ~_unchanged(old, slice(head), new, slice(head))
+    if head < old.n_edges:
+        i_old, i_new = _pairs(old.edge_ids, new.edge_ids, head)
+        came[i_new] = went[i_old] = ~_unchanged(old, i_old, new, i_new)
+    added, removed = np.flatnonzero(came), np.flatnonzero(went)
     newest = np.maximum(new.sources[added], new.targets[added])
     closes = bool(len(removed) or np.any(newest < old.n_nodes) or np.any(new.kinds[added] >= EdgeKind.LOOP))
     return Change(added, removed, closes)
 
 
-def _unchanged(old: PoseGraph, new: PoseGraph) -> NDArray[np.bool_]:
-    """Which edges (E,) of two graphs with the same edges have the same measurement."""
-    rows = ((old.deltas, new.deltas), (old.information, new.information), (old.kinds, new.kinds))
-    same = np.ones(old.n_edges, dtype=bool)
-    for before, after in rows:
-        if not np.array_equal(before, after):  # nearly always they are: this is the quick way to see it
-            same &= (before == after).reshape(old.n_edges, -1).all(axis=1)
+def _common_head(old: NDArray[np.int64], new: NDArray[np.int64]) -> int:
+    """How many numbers two lists have in common before they first differ."""
+    both = min(len(old), len(new))
+    differ = old[:both] != new[:both]
+    return int(differ.argmax()) if differ.any() else both
+
+
+def _pairs(old: NDArray[np.int64], new: NDArray[np.int64], head: int) -> tuple[_Rows, _Rows]:
+    """Rows of the numbers from `head` on that are in both of two increasing lists."""
+    in_old = np.flatnonzero(np.isin(old[head:], new[head:], assume_unique=True))
+    in_new = np.flatnonzero(np.isin(new[head:], old[head:], assume_unique=True))
+    return _sliced(head + in_old), _sliced(head + in_new)
+
+
+def _sliced(rows: NDArray[np.int64]) -> _Rows:
+    """Increasing row numbers, without gaps as a slice: that takes a view where numbers take a copy."""
+    gapless = len(rows) and rows[-1] - rows[0] == len(rows) - 1
+    return slice(int(rows[0]), int(rows[-1]) + 1) if gapless else rows
+
+
+def _unchanged(old: PoseGraph, i_old: _Rows, new: PoseGraph, i_new: _Rows) -> NDArray[np.bool_]:
+    """Which of some edges of one graph are the same as those of another: ends, kind and measurement."""
+    same = np.asarray(old.kinds[i_old] == new.kinds[i_new])
+    for name in ("sources", "targets", "deltas", "information"):
+        equal = getattr(old, name)[i_old] == getattr(new, name)[i_new]
+        if not equal.all():  # nearly always they are: this is the quick way to see it
+            same &= equal.reshape(len(same), -1).all(axis=1)
     return same
+
+
+Work = Callable[[PoseGraph, Array, Change], Outcome]
 
 
 class GraphBackend(ABC):
     """What all back-ends share; a solver supplies `_optimise` and may refine `_solve_whole`."""
 
-    _descends = False  # whether a solution of higher chi2 than its start is a failure
+    _rise = np.inf  # relative, of chi2 over that of the start, from which a solution is none
     _softens = False  # whether it puts the configured kernel on edges of motion
 
     def __init__(self, name: str, config: BackendsConfig) -> None:
@@ -121,20 +146,29 @@ class GraphBackend(ABC):
 
     def update(self, graph: PoseGraph) -> Solution:
         """See `Backend.update`."""
+        return self._advance(graph, None)
+
+    def _advance(self, graph: PoseGraph, always: Work | None) -> Solution:
+        """Follow the graph: by `always` if given, else by `_follow` where the graph asks for work."""
         started = time.process_time()
         change = difference(self._graph, graph)
-        placed = self._admit(graph, change)
-        start = self._extend(graph, placed)
-        at_start = self._carried(graph, change, start)
-        if self._must_work(change):
-            outcome = self._guarded(graph, start, change)
+        new = graph.with_edges(change.added)
+        placed = self._admit(graph, new, change)
+        start = self._extend(new, placed)
+        at_start = self._carried(new, change, start)
+        if always is not None or self._must_work(change):
+            outcome = self._guarded(graph, start, change, always or self._follow)
         else:
             message = "extended by odometry"
             outcome = Outcome(start, SolveStatus.CONVERGED, message, 0, self._weights, self._rejected)
         squared = at_start if outcome.poses is start else squared_norms(graph, outcome.poses)
+        before = total(at_start)
+        if self._rose(before, total(squared)):
+            message = f"{outcome.message}; chi2 rose, the next updates go on from there"
+            outcome = replace(outcome, status=SolveStatus.STALLED, message=message)
         self._graph, self._poses, self._squared = graph, outcome.poses, squared
         self._weights, self._rejected = outcome.weights, outcome.rejected
-        return self._solution(graph, outcome, squared, total(at_start), started)
+        return self._solution(graph, outcome, squared, before, started)
 
     def finish(self, graph: PoseGraph) -> Solution:
         """See `Backend.finish`: a fresh solve; back-ends whose state is their merit go on from it instead."""
@@ -157,7 +191,7 @@ class GraphBackend(ABC):
         outcome = self._checked(graph, graph.initial, outcome)
         squared = squared_norms(graph, outcome.poses)
         before = total(squared) if outcome.poses is graph.initial else chi2(graph, graph.initial)
-        if self._descends and total(squared) > before + _ROUNDING:
+        if self._rose(before, total(squared)):
             message = f"{outcome.message}; ended worse than it began, kept the start"
             outcome = Outcome(graph.initial, SolveStatus.DIVERGED, message, outcome.iterations)
             squared = squared_norms(graph, graph.initial)
@@ -167,6 +201,10 @@ class GraphBackend(ABC):
         meant = graph if outcome.calibrated is None else outcome.calibrated
         clusters = rejected_clusters(meant, outcome.poses, outcome.rejected, gate_of(self._config))
         return replace(solution, report=replace(solution.report, rejected_clusters=clusters))
+
+    def _rose(self, before: float, after: float) -> bool:
+        """Whether chi2 after is above that before by more than what an optimum leaves open."""
+        return np.isfinite(self._rise) and after > before * (1.0 + self._rise) + _ROUNDING
 
     @abstractmethod
     def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
@@ -187,22 +225,21 @@ class GraphBackend(ABC):
     def _must_work(self, change: Change) -> bool:
         return change.closes
 
-    def _admit(self, graph: PoseGraph, change: Change) -> Array:
-        """Validate what is new; the poses to extend from."""
+    def _admit(self, graph: PoseGraph, new: PoseGraph, change: Change) -> Array:
+        """Validate what is new, i.e. the edges of `new`; the poses to extend from."""
+        new.validate()
         old = self._graph
         if old is None:
-            graph.validate()
             return graph.initial[:1]
         if graph.n_nodes < old.n_nodes:
             raise BackendError(f"{self._name}: the graph shrank from {old.n_nodes} to {graph.n_nodes} nodes between updates")
-        graph.with_edges(change.added).validate()
         if len(change.removed):
             require_connected(graph)
         return self._poses
 
-    def _guarded(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
+    def _guarded(self, graph: PoseGraph, start: Array, change: Change, work: Work) -> Outcome:
         try:
-            outcome = self._follow(graph, start, change)
+            outcome = work(graph, start, change)
         except RuntimeError as error:
             raise BackendError(f"{self._name}: the solver gave up: {_first_line(error)}") from error
         return self._checked(graph, start, outcome)
@@ -218,16 +255,14 @@ class GraphBackend(ABC):
         poses[0] = graph.initial[0]
         return replace(outcome, poses=poses)
 
-    def _carried(self, graph: PoseGraph, change: Change, start: Array) -> Array:
-        """Squared residuals (E,) at the start of an update; those of edges that were there before are known."""
-        old = self._graph
-        if old is None or len(change.removed):
-            return squared_norms(graph, start)
-        squared = np.empty(graph.n_edges)
-        known = np.ones(graph.n_edges, dtype=bool)
+    def _carried(self, new: PoseGraph, change: Change, start: Array) -> Array:
+        """Squared residuals (E,) at the start of an update: those of the edges of `new`; the others are known."""
+        kept = np.delete(self._squared, change.removed) if len(change.removed) else self._squared
+        squared = np.empty(len(kept) + new.n_edges)
+        known = np.ones(len(squared), dtype=bool)
         known[change.added] = False
-        squared[known] = self._squared
-        squared[change.added] = squared_norms(graph.with_edges(change.added), start)
+        squared[known] = kept
+        squared[change.added] = squared_norms(new, start)
         return squared
 
     def _solution(self, graph: PoseGraph, outcome: Outcome, squared: Array, before: float, started: float) -> Solution:

@@ -2,118 +2,135 @@
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridmap.backends.base import Solution, SolveStatus
-from hybridmap.backends.factors import anchor, factors, poses_of, values
-from hybridmap.backends.following import Change, GraphBackend, Outcome, difference, prefix
+from hybridmap.backends.following import Change, GraphBackend, Outcome, prefix
+from hybridmap.backends.initial import angular_start
 from hybridmap.backends.kernels import loop_kernel, noise_models
-from hybridmap.backends.objective import gate_of
+from hybridmap.backends.objective import gate_of, squared_norms, total
 from hybridmap.backends.robust import judged
+from hybridmap.backends.smoother import Smoother
+from hybridmap.backends.weak import truncated_cost
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
-from hybridmap.graph.connectivity import extend
 from hybridmap.graph.pose_graph import PoseGraph
 
-
-class Smoother:
-    """One ISAM2 and what it was given."""
-
-    def __init__(self, config: BackendsConfig) -> None:
-        params = gtsam.ISAM2Params()
-        params.setRelinearizeThreshold(config.isam2.relinearize_threshold)
-        params.relinearizeSkip = 1
-        self._isam = gtsam.ISAM2(params)
-        self._settle = config.isam2.settle_updates
-        self._models = noise_models(config.robust, loop_kernel("gtsam-cauchy", config.robust) if _robust(config) else None)
-        self._slots: dict[int, int] = {}
-        self.graph: PoseGraph | None = None
-
-    def follow(self, graph: PoseGraph, start: Array) -> int:
-        """Bring ISAM2 up to the graph; `start` (N, 3) places the nodes that it does not know. Returns the updates done."""
-        change = difference(self.graph, graph)
-        known = self.graph.n_nodes if self.graph is not None else 0
-        fresh = gtsam.NonlinearFactorGraph()
-        if known == 0:
-            fresh.push_back(anchor(graph.initial[0]))
-        new = graph.with_edges(change.added)
-        for factor in factors(new, self._models):
-            fresh.push_back(factor)
-        gone = self._forget(change.removed)
-        result = self._isam.update(fresh, values(start[known:], known), gone)
-        slots = list(result.getNewFactorsIndices())[-new.n_edges :] if new.n_edges else []
-        self._slots.update(zip(new.edge_ids.tolist(), slots, strict=True))
-        self.graph = graph
-        extra = self._settle if known == 0 or len(change.removed) else 0
-        for _ in range(extra):
-            self._isam.update()
-        return 1 + extra
-
-    def settle(self, most: int) -> int:
-        """Empty updates until nothing is linearised anew; returns how many."""
-        for done in range(1, most + 1):
-            if self._isam.update().getVariablesRelinearized() == 0:
-                return done
-        return most
-
-    def poses(self) -> Array:
-        """Current estimate (N, 3)."""
-        return poses_of(self._isam.calculateEstimate())
-
-    def _forget(self, removed: NDArray[np.int64]) -> list[int]:
-        if self.graph is None:
-            return []
-        return [self._slots.pop(int(edge)) for edge in self.graph.edge_ids[removed]]
-
-
-def _robust(config: BackendsConfig) -> bool:
-    return config.isam2.loop_kernel == "cauchy"
+_RISE = 1e-3  # relative, of chi2: what the thresholds of linearisation leave open
 
 
 class Isam2Backend(GraphBackend):
-    """Follows a growing graph; `solve` grows a frozen one from loop to loop."""
+    """Follows a growing graph; `solve` grows a frozen one from loop to loop.
+
+    Closures that agree with the map wait. Measurements with residuals r, added to a least-squares map, move to first order no
+    pose by more than sqrt(sum of r' information r) of its standard deviations (Cauchy-Schwarz on the Kalman gain), and
+    without them chi2 is above its minimum by that sum at the most. ISAM2 works once the root is beyond the configured
+    patience.
+    """
 
     _softens = True
 
     def __init__(self, name: str, config: BackendsConfig) -> None:
         super().__init__(name, config)
         self._smoother: Smoother | None = None
+        self._kernel = loop_kernel("gtsam-cauchy", config.robust) if config.isam2.loop_kernel == "cauchy" else None
+        quadratic = self._kernel is None and config.robust.odometry == "none"
+        self._rise = _RISE if quadratic else np.inf
 
     def finish(self, graph: PoseGraph) -> Solution:
-        """See `Backend.finish`: goes on from where the drive ended."""
-        return self.update(graph)
+        """See `Backend.finish`: goes on from where the drive ended, with every node linearised anew."""
+        return self._advance(graph, self._conclude)
 
     def _follow(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
         del change
-        smoother = self._smoother or Smoother(self._config)
-        self._smoother = None  # a failure leaves ISAM2 half changed: the next call makes one from the poses kept
-        updates = smoother.follow(graph, start)
-        outcome = self._outcome(smoother, graph, updates)
+        if self._smoother is not None:
+            shift = _largest_shift(graph, self._smoother.lacks(graph), start)
+            if shift <= self._config.isam2.patience:
+                message = f"isam2: closures wait; they could move no pose by more than {shift:.2g} of its standard deviations"
+                return Outcome(start, SolveStatus.CONVERGED, message, 0, self._weights, self._rejected)
+        return self._kept(*self._brought_up(graph, start), graph)
+
+    def _conclude(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
+        """As `_follow`, with nothing waiting and every node linearised anew."""
+        del change
+        smoother, updates = self._brought_up(graph, start)
+        onward, more = self._anew(graph, smoother.poses())
+        better = self._cost(graph, onward.poses()) <= self._cost(graph, smoother.poses())
+        return self._kept(onward if better else smoother, updates + more, graph)
+
+    def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
+        return self._outcome(*self._anew(graph, start), graph)
+
+    def _solve_whole(self, graph: PoseGraph) -> Outcome:
+        drive = Isam2Backend(self._name, self._config)
+        *grown, _ = _closing_nodes(graph)
+        updates = sum(drive.update(prefix(graph, nodes)).report.iterations for nodes in grown)
+        end = drive.finish(graph)
+        report, updates = end.report, updates + end.report.iterations
+        message = f"isam2: {updates} updates"
+        return Outcome(end.poses, report.status, message, updates, report.weights, report.rejected_edge_ids)
+
+    def _brought_up(self, graph: PoseGraph, start: Array) -> tuple[Smoother, int]:
+        """The smoother with what is new in the graph, and the updates done.
+
+        It is not kept while it works: a failure leaves it half changed, and then another is made from the start.
+        """
+        smoother, self._smoother = self._smoother, None
+        if smoother is None:
+            return self._anew(graph, start)
+        try:
+            return self._told(smoother, graph, start)
+        except RuntimeError:
+            return self._anew(graph, start)
+
+    def _told(self, smoother: Smoother, graph: PoseGraph, start: Array) -> tuple[Smoother, int]:
+        """A smoother that knows the graph, settled if it is new or if edges went, and the updates done.
+
+        The map that false edges have bent may be in another valley when they are gone: then it is left for a fresh start.
+        """
+        new, lacks = smoother.is_empty, smoother.lacks(graph)
+        smoother.follow(graph, start, lacks)
+        went = len(lacks.removed) > 0
+        updates = 1 + (smoother.settle(self._config.isam2.settle_updates) if new or went else 0)
+        straight = angular_start(graph) if went else None
+        if straight is None or self._cost(graph, smoother.poses()) <= self._cost(graph, straight):
+            return smoother, updates
+        smoother, more = self._anew(graph, straight)
+        return smoother, updates + more
+
+    def _anew(self, graph: PoseGraph, start: Array) -> tuple[Smoother, int]:
+        """A smoother that is told a whole graph from poses (N, 3), and the updates done."""
+        try:
+            return self._told(self._empty(), graph, start)
+        except RuntimeError:  # Cholesky factors square the condition of the graph, orthogonal ones do not
+            return self._told(self._empty(orthogonal=True), graph, start)
+
+    def _empty(self, *, orthogonal: bool = False) -> Smoother:
+        return Smoother(self._config.isam2, noise_models(self._config.robust, self._kernel), orthogonal=orthogonal)
+
+    def _cost(self, graph: PoseGraph, poses: Array) -> float:
+        """What it is out to lower, as the referee sees it."""
+        bound = np.inf if self._kernel is None else gate_of(self._config)
+        return truncated_cost(graph, poses, bound, self._config.robust)
+
+    def _kept(self, smoother: Smoother, updates: int, graph: PoseGraph) -> Outcome:
+        """The outcome; the smoother goes on from it if it is finite."""
+        outcome = self._outcome(smoother, updates, graph)
         if np.isfinite(outcome.poses).all():
             self._smoother = smoother
         return outcome
 
-    def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
-        smoother = Smoother(self._config)
-        updates = smoother.follow(graph, start)
-        return self._outcome(smoother, graph, updates + smoother.settle(self._config.max_iterations))
-
-    def _solve_whole(self, graph: PoseGraph) -> Outcome:
-        smoother, poses, updates = Smoother(self._config), graph.initial[:1], 0
-        for nodes in _closing_nodes(graph):
-            part = prefix(graph, nodes)
-            updates += smoother.follow(part, extend(part, poses))
-            poses = smoother.poses()
-        return self._outcome(smoother, graph, updates + smoother.settle(self._config.max_iterations))
-
-    def _outcome(self, smoother: Smoother, graph: PoseGraph, updates: int) -> Outcome:
+    def _outcome(self, smoother: Smoother, updates: int, graph: PoseGraph) -> Outcome:
         poses = smoother.poses()
         outcome = Outcome(poses, SolveStatus.CONVERGED, f"isam2: {updates} updates", updates)
-        if not _robust(self._config):
-            return outcome
-        return judged(outcome, loop_kernel("gtsam-cauchy", self._config.robust), graph, gate_of(self._config))
+        return outcome if self._kernel is None else judged(outcome, self._kernel, graph, gate_of(self._config))
+
+
+def _largest_shift(graph: PoseGraph, lacks: Change, start: Array) -> float:
+    """By how many of its standard deviations what a smoother lacks could move a pose; infinite if it is to forget."""
+    if len(lacks.removed):
+        return np.inf
+    return float(np.sqrt(total(squared_norms(graph.with_edges(lacks.added), start))))
 
 
 def _closing_nodes(graph: PoseGraph) -> list[int]:

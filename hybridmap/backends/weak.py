@@ -48,6 +48,8 @@ def truncated_cost(graph: PoseGraph, poses: Array, bound: float, config: RobustC
 
 def weak_edges(graph: PoseGraph, squared: Array, config: RobustConfig) -> dict[int, float]:
     """`edge_ids` -> weight of the edges of motion that hold next to nothing."""
+    if config.odometry == "none":
+        return {}
     weights = motion_weights(graph, squared, config)
     return {int(graph.edge_ids[edge]): float(weights[edge]) for edge in np.flatnonzero(weights < WEAK)}
 

@@ -83,10 +83,14 @@ class Isam2Config(Section):
 
     loop_kernel: Literal["none", "cauchy"] = "none"
     """Kernel on the loop edges."""
-    relinearize_threshold: float = Field(default=0.01, gt=0)
-    """Largest step of a variable (m, rad) before it is linearised anew."""
-    settle_updates: int = Field(default=3, ge=0)
-    """Empty updates after the first one and after an edge was removed."""
+    patience: float = Field(default=0.5, ge=0)
+    """Closures wait while together they could move no pose by more than this many of its standard deviations."""
+    relinearize_m: float = Field(default=0.1, gt=0)
+    """Largest step of a variable's position (m) before it is linearised anew; edges bend with headings, not with positions."""
+    relinearize_rad: float = Field(default=0.01, gt=0)
+    """The same of its heading (rad)."""
+    settle_updates: int = Field(default=10, ge=0)
+    """Most empty updates after the first one and after an edge was removed; they end when nothing is linearised anew."""
 
 
 class BackendsConfig(Section):

@@ -11,6 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from hybridmap.errors import GraphError
 from hybridmap.geometry import Array
 
+_UPPER, _LOWER = ([0, 0, 1], [1, 2, 2]), ([1, 2, 2], [0, 0, 1])
+_CLEAR = 1e-6  # determinant of correlations from which rounding cannot make it positive
+
 
 class EdgeKind(IntEnum):
     """Where an edge comes from."""
@@ -98,20 +101,35 @@ class PoseGraph:
         if not np.isfinite(self.initial).all():
             node = int(np.flatnonzero(~np.isfinite(self.initial).all(axis=1))[0])
             raise GraphError(f"graph: node {node} has a pose with NaN or Inf, expected finite numbers")
-        ends = np.stack([self.sources, self.targets], axis=1)
-        self._refuse((ends < 0).any(axis=1) | (ends >= self.n_nodes).any(axis=1), "names a node that does not exist")
+        lowest, highest = np.minimum(self.sources, self.targets), np.maximum(self.sources, self.targets)
+        self._refuse((lowest < 0) | (highest >= self.n_nodes), "names a node that does not exist")
         self._refuse(self.sources == self.targets, "leads from a node to itself")
         self._refuse(~np.isfinite(self.deltas).all(axis=1), "has a measurement with NaN or Inf")
         self._refuse(~np.isfinite(self.information).all(axis=(1, 2)), "has an information matrix with NaN or Inf")
-        transposed = self.information.transpose(0, 2, 1)
-        scale = np.abs(self.information).max(axis=(1, 2), initial=0.0)
-        asymmetry = np.abs(self.information - transposed).max(axis=(1, 2), initial=0.0)
-        self._refuse(asymmetry > 1e-9 * scale, "has an information matrix that is not symmetric")
-        if self.n_edges:
-            smallest = np.linalg.eigvalsh(self.information)[:, 0]
-            self._refuse(smallest <= 0.0, "has an information matrix that is not positive definite")
+        upper, lower = self.information[:, *_UPPER], self.information[:, *_LOWER]
+        scale = np.abs(self.information).reshape(self.n_edges, 9).max(axis=1)
+        self._refuse(
+            (np.abs(upper - lower) > 1e-9 * scale[:, None]).any(axis=1), "has an information matrix that is not symmetric"
+        )
+        self._refuse(~_positive_definite(self.information), "has an information matrix that is not positive definite")
 
     def _refuse(self, bad: ArrayLike, what: str) -> None:
         if np.any(bad):
             e = int(np.flatnonzero(bad)[0])
             raise GraphError(f"graph: edge {int(self.edge_ids[e])} ({self.sources[e]} -> {self.targets[e]}) {what}")
+
+
+def _positive_definite(matrices: Array) -> NDArray[np.bool_]:
+    """Which (E,) of finite symmetric matrices (E, 3, 3) are positive definite.
+
+    Eigenvalues are taken of those only in whose correlations the determinant is not clearly positive.
+    """
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        scale = np.sqrt(matrices[:, [0, 1, 2], [0, 1, 2]])
+        xy, xt, yt = (matrices[:, *_UPPER] / (scale[:, _UPPER[0]] * scale[:, _UPPER[1]])).T
+        clear = (1.0 - xy**2 > _CLEAR) & (1.0 + 2.0 * xy * xt * yt - xy**2 - xt**2 - yt**2 > _CLEAR)
+    positive = np.asarray(clear)
+    unclear = np.flatnonzero(~clear)
+    if len(unclear):
+        positive[unclear] = np.linalg.eigvalsh(matrices[unclear])[:, 0] > 0.0
+    return positive

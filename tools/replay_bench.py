@@ -1,0 +1,97 @@
+"""An incremental replay against one batch optimisation, and what false edges leave behind when they are taken out again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hybridmap import backends
+from hybridmap.backends.base import Backend, Solution
+from hybridmap.backends.batch import run
+from hybridmap.backends.factors import NoiseModels, factor_graph
+from hybridmap.backends.false_loops import inject
+from hybridmap.backends.following import prefix
+from hybridmap.geometry import Array, between
+from hybridmap.graph.connectivity import chain
+from hybridmap.graph.io import read_graph
+from hybridmap.graph.pose_graph import PoseGraph
+
+GRAPHS = {"manhattanOlson3500.g2o": None, "city10000.g2o": 4000}
+"""Files, and how many nodes of each are replayed with false edges (all of them: minutes of least squares on a ruined map)."""
+
+_SHARE, _SEED = 0.05, 0
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """A replay node by node.
+
+    Attributes:
+        spent_s: process time of each update; making the state of the graph at that node is not in it.
+        works: how many updates called the solver.
+        last: solution of the last update.
+    """
+
+    spent_s: Array
+    works: int
+    last: Solution
+
+
+def study(path: Path) -> Iterator[str]:
+    """Lines on `gtsam-isam2` over one graph: the cost of its updates, then false edges put in and taken out."""
+    graph = chain(read_graph(path))
+    batch_s = min(_batch_s(graph) for _ in range(3))
+    best = backends.create("gtsam-lm").solve(graph).report.chi2
+    backend = backends.create("gtsam-isam2")
+    replay = replayed(backend, graph)
+    end = backend.finish(graph).report
+    median, p99 = np.quantile(replay.spent_s, [0.5, 0.99])
+    yield f"isam2, {path.name}: one batch optimisation from the chain {batch_s:.3f} s"
+    yield (
+        f"  updates: median {median * 1e3:.2f} ms = 1/{batch_s / median:.0f} of it, 99 % {p99 * 1e3:.0f} ms, "
+        f"{replay.spent_s.sum():.1f} s in all; ISAM2 worked at {replay.works} of {graph.n_nodes} nodes"
+    )
+    yield (
+        f"  chi2: last update {replay.last.report.chi2 / best:.5f} x batch, "
+        f"end of the drive {end.chi2:.6g} = {end.chi2 / best:.6f} x batch ({end.cpu_s:.2f} s)"
+    )
+    yield _false_edges(prefix(graph, GRAPHS.get(path.name) or graph.n_nodes))
+
+
+def replayed(backend: Backend, graph: PoseGraph) -> Replay:
+    """Grow a graph node by node, with the clock running in the updates only."""
+    spent, works, last = [], 0, None
+    for nodes in range(1, graph.n_nodes + 1):
+        part = prefix(graph, nodes)
+        started = time.process_time()
+        last = backend.update(part)
+        spent.append(time.process_time() - started)
+        works += last.report.iterations > 0
+    assert last is not None
+    return Replay(np.array(spent), works, last)
+
+
+def _batch_s(graph: PoseGraph) -> float:
+    started = time.process_time()
+    run("lm", factor_graph(graph, NoiseModels()), graph.initial, 100)
+    return time.process_time() - started
+
+
+def _false_edges(clean: PoseGraph) -> str:
+    """Replay with false edges, take them all out at once, and compare with the optimum that never saw them."""
+    best = backends.create("gtsam-lm").solve(clean)
+    false = inject(clean, _SHARE, "random", np.random.default_rng(_SEED))
+    backend = backends.create("gtsam-isam2")
+    ruined = replayed(backend, false)
+    back = backend.update(clean)
+    off = np.abs(between(best.poses, back.poses))
+    return (
+        f"  {false.n_edges - clean.n_edges} false edges ({_SHARE:.0%}) over {clean.n_nodes} nodes: replay "
+        f"{ruined.spent_s.sum():.0f} s, chi2 {ruined.last.report.chi2:.6g}; taken out in {back.report.cpu_s:.2f} s: "
+        f"chi2 {back.report.chi2 / best.report.chi2 - 1.0:+.1e} relative to the clean optimum, "
+        f"largest difference {off[:, :2].max():.1e} m, {off[:, 2].max():.1e} rad"
+    )
