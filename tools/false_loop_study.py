@@ -70,7 +70,7 @@ def main() -> None:
     print(f"{chosen.graph.name}: {graph.n_nodes} nodes, {int(graph.is_loop.sum())} true loops; ATE in m, CPU in s")
     print(
         f"{'back-end':20}{'kind':9}{'share':>6}{'ATE median':>12}{'max':>9}{'<= 0.05':>9}"
-        f"{'lost max':>10}{'kept max':>10}{'CPU':>8}"
+        f"{'lost max':>12}{'kept max':>10}{'CPU':>8}"
     )
     for name in chosen.backends:
         for share in chosen.shares:
@@ -108,7 +108,7 @@ def line(name: str, mode: str, share: float, cells: list[Cell], true_loops: int)
     errors = np.array([c.ate_m for c in cells])
     lost = max(c.lost for c in cells)
     figures = f"{np.median(errors):12.4f}{errors.max():9.4f}{f'{(errors <= 0.05).sum()}/{len(cells)}':>9}"
-    counts = f"{f'{lost} {lost / true_loops:.2%}':>10}{max(c.kept for c in cells):10d}"
+    counts = f"{f'{lost} {lost / true_loops:.2%}':>12}{max(c.kept for c in cells):10d}"
     return f"{name:20}{mode:9}{share:6.0%}{figures}{counts}{np.median([c.cpu_s for c in cells]):8.2f}"
 
 
