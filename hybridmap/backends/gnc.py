@@ -256,11 +256,11 @@ class GncBackend(GraphBackend):
         """Run the configured starts until one convinces; if none does, the lowest truncated cost wins.
 
         A result convinces where no rejected loops agree with each other, or where two different ways came to the same; with a
-        kernel on odometry, which false loops may tear, only where every loop fits without strain. Costs are compared at the
-        tightest bound that any start ended with: files that overstate their noise would otherwise prefer a false loop
-        that happens to be consistent.
+        kernel on odometry, which false loops may tear, only where every loop fits without strain. The map of the drive may be
+        bent by loops that were false: what begins there and rejects some is held against the next result that convinces.
         """
         results: dict[str, Truncated] = {}
+        unconfirmed: dict[str, Truncated] = {}
         tearable = self._config.robust.odometry != "none"
         for name, attempt in self._attempts(graph, driven).items():
             found = attempt()
@@ -273,9 +273,18 @@ class GncBackend(GraphBackend):
                 convincing = found.kept.all() and unit_variance(graph, squared_norms(graph, found.poses)) <= SLACK
             else:
                 convincing = agreed or not rejected_clusters(graph, found.poses, _rejected(graph, found), found.bound)
-            if convincing:
-                return self._verdict(graph, found, name)
+            if convincing and name == "drive" and not found.kept.all():
+                unconfirmed[name] = found
+            elif convincing:
+                return self._cheapest(graph, {**unconfirmed, name: found})
             results[name] = found
+        return self._cheapest(graph, results)
+
+    def _cheapest(self, graph: PoseGraph, results: dict[str, Truncated]) -> Outcome:
+        """The result of the lowest truncated cost, at the tightest bound that any of them ended with.
+
+        Files that overstate their noise would otherwise prefer a false loop that happens to be consistent.
+        """
         bound = min(result.bound for result in results.values())
         costs = {name: truncated_cost(graph, result.poses, bound, self._config.robust) for name, result in results.items()}
         best = min(costs, key=costs.__getitem__)

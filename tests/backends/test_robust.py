@@ -1,13 +1,17 @@
 """False loops: what survives them, and what does not."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from graphs_for_tests import laps
 
 from hybridmap import backends
+from hybridmap.backends import gnc
 from hybridmap.backends.false_loops import inject
+from hybridmap.backends.gnc import GncBackend, Truncated
+from hybridmap.backends.objective import gate_of
 from hybridmap.config.backends import BackendsConfig, GncConfig
 from hybridmap.errors import GraphError
 from hybridmap.geometry import align, transform_points
@@ -66,6 +70,25 @@ def test_gnc_follows_with_a_kernel_and_ends_with_a_verdict(disturbed):
     assert f"{len(final.report.rejected_edge_ids)} of {int(false.is_loop.sum())} loops rejected" in final.report.message
 
 
+@pytest.mark.parametrize("wrong", [True, False])
+def test_what_begins_at_the_map_of_the_drive_is_held_against_another_result(disturbed, monkeypatch, wrong):
+    graph, _, clean = disturbed
+    bent = clean + np.linspace(0.0, 3.0, len(clean))[:, None] * [1.0, 1.0, 0.1]
+    lone = np.ones(int(graph.is_loop.sum()), dtype=bool)
+    lone[[10, 60]] = False  # too far from each other to be a cluster
+    bound = gate_of(BackendsConfig())
+    starts = {
+        "drive": Truncated(bent if wrong else clean, lone, 1, bound),
+        "other": Truncated(clean if wrong else bent, lone, 1, bound),
+    }
+    backend = GncBackend("gtsam-gnc", BackendsConfig())
+    monkeypatch.setattr(gnc, "on_probation", lambda _graph, result, _config: result)
+    monkeypatch.setattr(backend, "_attempts", lambda *_: {name: partial(starts.get, name) for name in starts})
+    final = backend.finish(graph)
+    assert np.array_equal(final.poses, clean)
+    assert f"start: {'other' if wrong else 'drive'}" in final.report.message
+
+
 def test_odometry_is_never_rejected(disturbed):
     _, false, _ = disturbed
     for name in ("gtsam-cauchy", "gtsam-dcs", "gtsam-huber", "gtsam-gnc"):
@@ -102,6 +125,18 @@ def test_gnc_on_intel_with_false_loops(data_dir, share, mode):
         assert ate(solution.poses, clean) < 0.05
         rejected = np.array(report.rejected_edge_ids)
         assert np.sum(rejected <= graph.edge_ids[-1]) <= 0.005 * graph.is_loop.sum()
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_a_drive_that_false_loops_have_ruined_ends_well(data_dir):
+    graph = read_graph(data_dir / "posegraphs" / "intel.g2o")
+    clean = backends.create("gtsam-lm").solve(graph).poses
+    false = inject(graph, 0.1, "random", np.random.default_rng(0))
+    backend = backends.create("gtsam-gnc")
+    *_, driven = backends.replay(backend, false)
+    assert ate(driven.poses, clean) > 5.0
+    assert ate(backend.finish(false).poses, clean) < 0.05
 
 
 def test_a_back_end_that_trusts_no_loop_still_trusts_registrations():
