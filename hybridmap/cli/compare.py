@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from hybridmap.metrics import Metric
 
 _DEFAULT = "odometry,relaxation-ratslam,gtsam-lm,gtsam-cauchy,gtsam-gnc"
-_WIDTH = 160  # columns of a table that goes into a file
+_WIDTH = 180  # columns of a table that goes into a file
 _ERRORS = {"ate_rmse": "ATE (m)", "relation_trans_mean": "relations (m)", "relation_loop_trans_mean": "of loops (m)"}
 
 
@@ -143,7 +143,7 @@ def _show(cells: Sequence[Sequence[str]], rows: Sequence[Row], title: str) -> No
         console = Console(width=_WIDTH)
     table = Table(title=title, title_justify="left", box=SIMPLE)
     for i, column in enumerate(cells[0]):
-        table.add_column(column, justify="right" if i > 1 else "left")
+        table.add_column(column, justify="right" if i > 1 else "left", no_wrap=i < 2)
     for line in cells[1:]:
         table.add_row(*line)
     console.print(table)
