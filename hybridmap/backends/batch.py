@@ -67,6 +67,7 @@ def _attempt(method: str, graph: Any, start: Array, initial: Any, max_iterations
     params = make_params()
     params.setMaxIterations(max_iterations)
     params.setRelativeErrorTol(tolerance)
+    params.setAbsoluteErrorTol(0.0)  # GTSAM's own takes a graph of little information for solved before the first step
     if method.endswith("-qr"):
         params.setLinearSolverType("MULTIFRONTAL_QR")
     try:

@@ -18,6 +18,8 @@ from hybridmap.graph.pose_graph import PoseGraph
 
 _RISE = 1e-3  # relative, of chi2: what the thresholds of linearisation leave open
 
+_SETTLED = 1e-5  # relative decrease of the cost that no longer counts: the batch optimisers' tolerance
+
 
 class Isam2Backend(GraphBackend):
     """Follows a growing graph; `solve` grows a frozen one from loop to loop.
@@ -51,12 +53,9 @@ class Isam2Backend(GraphBackend):
         return self._kept(*self._brought_up(graph, start), graph)
 
     def _conclude(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
-        """As `_follow`, with nothing waiting and every node linearised anew."""
+        """As `_follow`, with nothing waiting and everything polished."""
         del change
-        smoother, updates = self._brought_up(graph, start)
-        onward, more = self._anew(graph, smoother.poses())
-        better = self._cost(graph, onward.poses()) <= self._cost(graph, smoother.poses())
-        return self._kept(onward if better else smoother, updates + more, graph)
+        return self._kept(*self._polished(*self._brought_up(graph, start), graph), graph)
 
     def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
         return self._outcome(*self._anew(graph, start), graph)
@@ -90,13 +89,29 @@ class Isam2Backend(GraphBackend):
         """
         new, lacks = smoother.is_empty, smoother.lacks(graph)
         smoother.follow(graph, start, lacks)
-        went = len(lacks.removed) > 0
-        updates = 1 + (smoother.settle(self._config.isam2.settle_updates) if new or went else 0)
-        straight = angular_start(graph) if went else None
-        if straight is None or self._cost(graph, smoother.poses()) <= self._cost(graph, straight):
+        if not new and len(lacks.removed) == 0:
+            return smoother, 1
+        updates = 1 + smoother.settle(self._config.isam2.settle_updates)
+        if new:
             return smoother, updates
-        smoother, more = self._anew(graph, straight)
-        return smoother, updates + more
+        straight = angular_start(graph)
+        if straight is not None and self._cost(graph, straight) < self._cost(graph, smoother.poses()):
+            smoother, more = self._anew(graph, straight)
+            updates += more
+        return self._polished(smoother, updates, graph)
+
+    def _polished(self, smoother: Smoother, updates: int, graph: PoseGraph) -> tuple[Smoother, int]:
+        """The smoother with every node linearised anew as long as that lowers the cost, and the updates done so far."""
+        cost = self._cost(graph, smoother.poses())
+        for _ in range(self._config.max_iterations):
+            onward, more = self._anew(graph, smoother.poses())
+            before, cost, updates = cost, self._cost(graph, onward.poses()), updates + more
+            if not cost < before:
+                break
+            smoother = onward
+            if before - cost <= _SETTLED * before:
+                break
+        return smoother, updates
 
     def _anew(self, graph: PoseGraph, start: Array) -> tuple[Smoother, int]:
         """A smoother that is told a whole graph from poses (N, 3), and the updates done."""

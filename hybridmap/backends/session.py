@@ -17,26 +17,34 @@ from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, 
 from hybridmap.graph.connectivity import extend, require_connected
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 
-
-@dataclass(frozen=True, slots=True)
-class _Edge:
-    source: int
-    target: int
-    delta: Array
-    information: Array
-    kind: EdgeKind
+_EMPTY = PoseGraph(
+    initial=np.zeros((0, 3)),
+    sources=np.zeros(0, dtype=np.int64),
+    targets=np.zeros(0, dtype=np.int64),
+    deltas=np.zeros((0, 3)),
+    information=np.zeros((0, 3, 3)),
+    kinds=np.zeros(0, dtype=np.int8),
+    edge_ids=np.zeros(0, dtype=np.int64),
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A state to return to; arrays in it are never written to."""
+    """A state to return to; arrays in it are never written to.
 
-    nodes: tuple[int, ...]
-    edges: dict[int, _Edge]
-    poses: dict[int, Array]
-    fixed: int | None
-    next_edge: int
-    solution: Solution | None = field(repr=False)
+    Attributes:
+        rows: node -> its row in `graph`, in the order in which they were added.
+        graph: `initial` (N, 3) holds the latest poses, m and rad; NaN where a node has none yet.
+        fixed: the node that stays where it is.
+        next_edge: least number that a new edge may have.
+        solution: the latest one.
+    """
+
+    rows: dict[int, int] = field(default_factory=dict)
+    graph: PoseGraph = field(default=_EMPTY, repr=False)
+    fixed: int | None = None
+    next_edge: int = 0
+    solution: Solution | None = field(default=None, repr=False)
 
 
 class GraphSession:
@@ -54,22 +62,29 @@ class GraphSession:
         """
         self._name, self._config = backend, config
         self._backend = create(backend, config)
-        self._state = Snapshot((), {}, {}, None, 0, None)
+        self._state = Snapshot()
 
     def add_node(self, node: int, pose: ArrayLike | None = None) -> None:
         """Add a node; the first one stays at its `pose` (3,), m and rad (default: the origin), others are placed by edges.
 
         Raises:
             BackendError: the node is there already.
+            GraphError: the pose is not three finite numbers.
         """
         state = self._state
-        if node in state.nodes:
+        if node in state.rows:
             raise BackendError(f"node {node} is there already")
-        poses = dict(state.poses)
-        if pose is not None or not state.nodes:
-            poses[node] = np.array(IDENTITY if pose is None else pose, dtype=np.float64)
+        given = _numbers(IDENTITY if pose is None else pose, (3,), f"pose of node {node}")
+        if not np.isfinite(given).all():
+            raise GraphError(f"pose of node {node}: found NaN or Inf, expected finite numbers")
+        if pose is None and state.rows:
+            given = np.full(3, np.nan)
+        initial = np.concatenate([state.graph.initial, given[None]])
         self._state = replace(
-            state, nodes=(*state.nodes, node), poses=poses, fixed=node if state.fixed is None else state.fixed
+            state,
+            rows={**state.rows, node: len(state.rows)},
+            graph=replace(state.graph, initial=initial),
+            fixed=node if state.fixed is None else state.fixed,
         )
 
     def add_edge(
@@ -84,12 +99,13 @@ class GraphSession:
         state = self._state
         if edge < state.next_edge:
             raise BackendError(f"edge {edge}: numbers must increase, expected {state.next_edge} or more")
-        new = _Edge(source, target, np.array(delta, dtype=np.float64), np.array(information, dtype=np.float64), kind)
-        unknown = [node for node in (source, target) if node not in state.nodes]
+        unknown = [node for node in (source, target) if node not in state.rows]
         if unknown:
             raise GraphError(f"edge {edge} ({source} -> {target}): there is no node {unknown[0]}")
-        _arrays(np.zeros((2, 3)), {edge: new}, [0], [int(target != source)]).validate()
-        self._state = replace(state, edges={**state.edges, edge: new}, next_edge=edge + 1)
+        new = _one_edge(edge, source, target, delta, information, kind)
+        replace(new, sources=np.array([0]), targets=np.array([int(target != source)]), initial=np.zeros((2, 3))).validate()
+        rows = replace(new, sources=np.array([state.rows[source]]), targets=np.array([state.rows[target]]))
+        self._state = replace(state, graph=_joined(state.graph, rows), next_edge=edge + 1)
 
     def remove_edge(self, edge: int) -> None:
         """Take an edge out again.
@@ -98,11 +114,12 @@ class GraphSession:
             BackendError: there is no such edge.
             GraphError: a node would hang on nothing.
         """
-        if edge not in self._state.edges:
+        graph = self._state.graph
+        kept = graph.edge_ids != edge
+        if kept.all():
             raise BackendError(f"there is no edge {edge}")
-        candidate = replace(self._state, edges={e: one for e, one in self._state.edges.items() if e != edge})
-        require_connected(_graph(candidate))
-        self._state = candidate
+        require_connected(graph.with_edges(kept))
+        self._state = replace(self._state, graph=graph.with_edges(kept))
 
     def remove_node(self, node: int, mode: Literal["drop", "bridge"] = "drop") -> None:
         """Take a node and its edges out; `bridge` joins its neighbours in the chain by the composition of their edges.
@@ -112,16 +129,21 @@ class GraphSession:
             GraphError: another node would hang on nothing.
         """
         state = self._state
-        if node not in state.nodes or node == state.fixed:
-            raise BackendError(f"node {node}: {'is the fixed one' if node in state.nodes else 'there is no such node'}")
-        edges = {e: one for e, one in state.edges.items() if node not in (one.source, one.target)}
-        poses = {other: pose for other, pose in state.poses.items() if other != node}
-        candidate = replace(state, nodes=tuple(n for n in state.nodes if n != node), edges=edges, poses=poses)
+        if node not in state.rows or node == state.fixed:
+            raise BackendError(f"node {node}: {'is the fixed one' if node in state.rows else 'there is no such node'}")
+        row, graph = state.rows[node], state.graph
         if mode == "bridge":
-            edges[state.next_edge] = _bridge(state, node)
-            candidate = replace(candidate, next_edge=state.next_edge + 1)
-        require_connected(_graph(candidate))
-        self._state = candidate
+            graph = _joined(graph, _bridge(state, node))
+        graph = graph.with_edges((graph.sources != row) & (graph.targets != row))
+        graph = replace(
+            graph,
+            initial=np.delete(graph.initial, row, axis=0),
+            sources=graph.sources - (graph.sources > row),
+            targets=graph.targets - (graph.targets > row),
+        )
+        require_connected(graph)
+        rows = {other: i for i, other in enumerate(other for other in state.rows if other != node)}
+        self._state = replace(state, rows=rows, graph=graph, next_edge=state.next_edge + (mode == "bridge"))
         self._backend = create(self._name, self._config)
 
     def fix(self, node: int) -> None:
@@ -130,7 +152,8 @@ class GraphSession:
         Raises:
             BackendError: there is no such node, or it has no pose yet.
         """
-        if node not in self._state.poses:
+        state = self._state
+        if node not in state.rows or not np.isfinite(state.graph.initial[state.rows[node]]).all():
             raise BackendError(f"node {node}: has no pose to be fixed at")
         self._state = replace(self._state, fixed=node)
 
@@ -159,8 +182,7 @@ class GraphSession:
 
     def poses(self) -> Array:
         """(N, 3) latest poses in the order of the nodes; nodes newer than the last solution are placed by their edges."""
-        graph = _graph(self._state)
-        return graph.initial
+        return _graph(self._state).initial.copy()
 
     def edge_weights(self) -> dict[int, float]:
         """Final weight of each loop in the latest solution; empty without a robust kernel."""
@@ -173,12 +195,12 @@ class GraphSession:
         Raises:
             BackendError: there is no such node, or the graph is singular.
         """
-        nodes = self._state.nodes
-        if node not in nodes:
+        rows = self._state.rows
+        if node not in rows:
             raise BackendError(f"there is no node {node}")
-        graph, fixed = _graph(self._state), nodes.index(_fixed(self._state))
+        graph, fixed = _graph(self._state), rows[_fixed(self._state)]
         covariances = Covariances(graph, graph.initial)
-        return np.asarray(covariances.relative(np.array([fixed]), np.array([nodes.index(node)]))[0])
+        return np.asarray(covariances.relative(np.array([fixed]), np.array([rows[node]]))[0])
 
     def snapshot(self) -> Snapshot:
         """The state as it is."""
@@ -192,14 +214,13 @@ class GraphSession:
     def _adopt(self, solution: Solution) -> Solution:
         """Bring the fixed node back to where it is, and keep the poses."""
         state = self._state
-        fixed = state.nodes.index(_fixed(state))
-        poses = solution.poses
-        if not np.array_equal(poses[fixed], state.poses[_fixed(state)]):
-            poses = compose(state.poses[_fixed(state)], between(poses[fixed], poses))
-            poses[fixed] = state.poses[_fixed(state)]
+        row, poses = state.rows[_fixed(state)], solution.poses.copy()
+        where = state.graph.initial[row]
+        if not np.array_equal(poses[row], where):
+            poses = compose(where, between(poses[row], poses))
+            poses[row] = where
         solution = replace(solution, poses=poses)
-        by_node = {node: pose.copy() for node, pose in zip(state.nodes, poses, strict=True)}
-        self._state = replace(state, poses=by_node, solution=solution)
+        self._state = replace(state, graph=replace(state.graph, initial=poses.copy()), solution=solution)
         return solution
 
 
@@ -210,46 +231,66 @@ def _fixed(state: Snapshot) -> int:
 
 
 def _graph(state: Snapshot) -> PoseGraph:
-    """The state as arrays; nodes without a pose are placed by their edges."""
+    """The state's graph; nodes from the first one without a pose on are placed by their edges."""
     _fixed(state)
-    index = {node: i for i, node in enumerate(state.nodes)}
-    placed = 0
-    while placed < len(state.nodes) and state.nodes[placed] in state.poses:
-        placed += 1
-    known = np.array([state.poses[node] for node in state.nodes[:placed]]).reshape(-1, 3)
-    initial = np.concatenate([known, np.zeros((len(state.nodes) - placed, 3))])
-    edges = state.edges.values()
-    graph = _arrays(initial, state.edges, [index[edge.source] for edge in edges], [index[edge.target] for edge in edges])
-    return graph if placed == len(state.nodes) else replace(graph, initial=extend(graph, known))
+    unplaced = np.isnan(state.graph.initial).any(axis=1)
+    if not unplaced.any():
+        return state.graph
+    return replace(state.graph, initial=extend(state.graph, state.graph.initial[: int(unplaced.argmax())]))
 
 
-def _arrays(initial: Array, edges: dict[int, _Edge], sources: list[int], targets: list[int]) -> PoseGraph:
+def _one_edge(edge: int, source: int, target: int, delta: ArrayLike, information: ArrayLike, kind: EdgeKind) -> PoseGraph:
+    """A graph of one edge without its nodes."""
     return PoseGraph(
-        initial=initial,
-        sources=np.array(sources, dtype=np.int64),
-        targets=np.array(targets, dtype=np.int64),
-        deltas=np.array([edge.delta for edge in edges.values()], dtype=np.float64).reshape(-1, 3),
-        information=np.array([edge.information for edge in edges.values()], dtype=np.float64).reshape(-1, 3, 3),
-        kinds=np.array([edge.kind for edge in edges.values()], dtype=np.int8),
-        edge_ids=np.array(list(edges), dtype=np.int64),
+        initial=np.zeros((0, 3)),
+        sources=np.array([source]),
+        targets=np.array([target]),
+        deltas=_numbers(delta, (3,), f"measurement of edge {edge}")[None],
+        information=_numbers(information, (3, 3), f"information of edge {edge}")[None],
+        kinds=np.array([kind], dtype=np.int8),
+        edge_ids=np.array([edge]),
     )
 
 
-def _bridge(state: Snapshot, node: int) -> _Edge:
-    """One edge between the neighbours of a node in the chain."""
-    place = state.nodes.index(node)
-    if not 0 < place < len(state.nodes) - 1:
+def _numbers(given: ArrayLike, shape: tuple[int, ...], what: str) -> Array:
+    """A copy as floats of a known shape."""
+    try:
+        numbers = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise GraphError(f"{what}: expected numbers, found {str(given)[:60]}") from None
+    if numbers.shape != shape:
+        raise GraphError(f"{what}: expected the shape {shape}, found {numbers.shape}")
+    return numbers
+
+
+def _joined(graph: PoseGraph, more: PoseGraph) -> PoseGraph:
+    """The nodes of the first with the edges of both."""
+    names = ("sources", "targets", "deltas", "information", "kinds", "edge_ids")
+    both = {name: np.concatenate([getattr(graph, name), getattr(more, name)]) for name in names}
+    return PoseGraph(initial=graph.initial, **both)
+
+
+def _bridge(state: Snapshot, node: int) -> PoseGraph:
+    """One edge between the neighbours of a node in the chain, by rows."""
+    row = state.rows[node]
+    if not 0 < row < len(state.rows) - 1:
         raise BackendError(f"node {node}: is at an end of the chain, there is nothing to bridge")
-    before, after = state.nodes[place - 1], state.nodes[place + 1]
-    whole = compose_relative(_relative(state, before, node), _relative(state, node, after))
+    whole = compose_relative(_relative(state, row - 1, row), _relative(state, row, row + 1))
     information = np.linalg.inv(whole.covariance)
-    return _Edge(before, after, whole.delta, 0.5 * (information + information.T), EdgeKind.ODOMETRY)
+    information = 0.5 * (information + information.T)
+    return _one_edge(state.next_edge, row - 1, row + 1, whole.delta, information, EdgeKind.ODOMETRY)
 
 
 def _relative(state: Snapshot, source: int, target: int) -> RelativePose:
-    """The first chain edge between two nodes, from the one to the other."""
-    for edge in state.edges.values():
-        if edge.kind < EdgeKind.LOOP and {edge.source, edge.target} == {source, target}:
-            relative = RelativePose(edge.delta, np.asarray(np.linalg.inv(edge.information), dtype=np.float64))
-            return relative if edge.source == source else invert_relative(relative)
-    raise BackendError(f"nodes {source} and {target}: no chain edge joins them, there is nothing to bridge")
+    """The first chain edge between two nodes, given by their rows, from the one to the other."""
+    graph = state.graph
+    forward = (graph.sources == source) & (graph.targets == target)
+    backward = (graph.sources == target) & (graph.targets == source)
+    found = np.flatnonzero((forward | backward) & (graph.kinds < EdgeKind.LOOP))
+    if len(found) == 0:
+        names = list(state.rows)
+        raise BackendError(f"nodes {names[source]} and {names[target]}: no chain edge joins them, there is nothing to bridge")
+    edge = int(found[0])
+    covariance = np.asarray(np.linalg.inv(graph.information[edge]), dtype=np.float64)
+    relative = RelativePose(graph.deltas[edge], covariance)
+    return relative if forward[edge] else invert_relative(relative)

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from hybridmap.errors import GraphError
 from hybridmap.geometry import Array
 
+_FARTHEST = 1e9  # m and rad: beyond it metres have no millionths left
+_LOOSEST, _TIGHTEST = 1e-9, 1e15  # information of standard deviations of some 30 km and 30 nm: beyond, solvers stand still
 _UPPER, _LOWER = ([0, 0, 1], [1, 2, 2]), ([1, 2, 2], [0, 0, 1])
 _CLEAR = 1e-6  # determinant of correlations from which rounding cannot make it positive
 
@@ -93,18 +95,20 @@ class PoseGraph:
         """Refuse a graph that no solver could take.
 
         Raises:
-            GraphError: NaN, unknown node, edge onto itself, information not symmetric positive definite, no node. The
-                message names the edge, what was found and what was expected.
+            GraphError: NaN, unknown node, edge onto itself, information not symmetric positive definite, no node, numbers so
+                large or small that their squares are lost. The message names the edge, what was found and what was expected.
         """
         if self.n_nodes == 0:
             raise GraphError("graph: holds no node")
-        if not np.isfinite(self.initial).all():
-            node = int(np.flatnonzero(~np.isfinite(self.initial).all(axis=1))[0])
-            raise GraphError(f"graph: node {node} has a pose with NaN or Inf, expected finite numbers")
+        near = (np.abs(self.initial) <= _FARTHEST).all(axis=1)  # which NaN is not
+        if not near.all():
+            node = int(np.flatnonzero(~near)[0])
+            raise GraphError(f"graph: node {node} has a pose with NaN, Inf or a number beyond {_FARTHEST:g}")
         lowest, highest = np.minimum(self.sources, self.targets), np.maximum(self.sources, self.targets)
         self._refuse((lowest < 0) | (highest >= self.n_nodes), "names a node that does not exist")
         self._refuse(self.sources == self.targets, "leads from a node to itself")
-        self._refuse(~np.isfinite(self.deltas).all(axis=1), "has a measurement with NaN or Inf")
+        near = (np.abs(self.deltas) <= _FARTHEST).all(axis=1)
+        self._refuse(~near, f"has a measurement with NaN, Inf or a number beyond {_FARTHEST:g}")
         self._refuse(~np.isfinite(self.information).all(axis=(1, 2)), "has an information matrix with NaN or Inf")
         upper, lower = self.information[:, *_UPPER], self.information[:, *_LOWER]
         scale = np.abs(self.information).reshape(self.n_edges, 9).max(axis=1)
@@ -112,6 +116,9 @@ class PoseGraph:
             (np.abs(upper - lower) > 1e-9 * scale[:, None]).any(axis=1), "has an information matrix that is not symmetric"
         )
         self._refuse(~_positive_definite(self.information), "has an information matrix that is not positive definite")
+        own = self.information[:, [0, 1, 2], [0, 1, 2]]
+        extreme = ((own < _LOOSEST) | (own > _TIGHTEST)).any(axis=1)
+        self._refuse(extreme, f"has information outside {_LOOSEST:g} to {_TIGHTEST:g} (1/m^2, 1/rad^2): in which unit is it?")
 
     def _refuse(self, bad: ArrayLike, what: str) -> None:
         if np.any(bad):

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from graphs_for_tests import laps
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from hybridmap import backends
-from hybridmap.backends.false_loops import inject
 from hybridmap.backends.following import difference, prefix
 from hybridmap.backends.objective import chi2
 from hybridmap.config.backends import BackendsConfig, Isam2Config
 from hybridmap.errors import BackendError, GraphError
 from hybridmap.geometry import between, compose
-from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import EdgeKind
 
 FOLLOWERS = ["gtsam-lm", "gtsam-cauchy", "gtsam-gnc", "gtsam-isam2", "relaxation-ratslam", "odometry"]
@@ -110,6 +110,38 @@ def test_what_is_new_and_what_is_gone_is_found_by_number_and_content():
     assert (changed.added.tolist(), changed.removed.tolist(), changed.closes) == ([7], [7], True)
 
 
+@given(st.integers(0, 10_000), st.integers(1, 6), st.booleans())
+@settings(max_examples=60, deadline=None)
+def test_the_difference_of_two_states_is_that_of_their_sets_of_edges(seed, changes, reordered):
+    rng = np.random.default_rng(seed)
+    whole, _ = laps(np.random.default_rng(0), nodes=40)
+    if reordered:  # all of the chain before all loops, as in many files: new edges then come in the middle
+        whole = replace(whole, edge_ids=np.arange(whole.n_edges))
+        order = np.argsort(whole.is_loop, kind="stable")
+        whole = replace(whole.with_edges(order), edge_ids=np.arange(whole.n_edges))
+    old = prefix(whole, 30).with_edges(rng.random(prefix(whole, 30).n_edges) < rng.choice([0.9, 1.0]))
+    new = prefix(whole, 30 + int(rng.integers(0, 8)))
+    new = new.with_edges(rng.random(new.n_edges) < rng.choice([0.9, 1.0]))
+    deltas, sources = new.deltas.copy(), new.sources.copy()
+    for edge in rng.integers(0, new.n_edges, changes).tolist():
+        if rng.random() < 0.5:
+            deltas[edge, int(rng.integers(3))] += 0.1
+        else:
+            sources[edge] = (sources[edge] + 1) % 30
+    new = replace(new, deltas=deltas, sources=sources)
+
+    def rows(graph):
+        return [(int(i), int(s), int(t), d.tobytes(), int(k)) for i, s, t, d, k in fields(graph)]
+
+    def fields(graph):
+        return zip(graph.edge_ids, graph.sources, graph.targets, graph.deltas, graph.kinds, strict=True)
+
+    before, after = rows(old), rows(new)
+    change = difference(old, new)
+    assert [after[i] for i in change.added] == [row for row in after if row not in set(before)]
+    assert [before[i] for i in change.removed] == [row for row in before if row not in set(after)]
+
+
 def test_a_second_chain_edge_of_a_new_node_waits_for_the_next_closure():
     graph, _ = laps(np.random.default_rng(0), nodes=21)
     chain_only = prefix(graph, 18)
@@ -169,25 +201,3 @@ def test_odometry_stays_odometry_where_registrations_know_better():
     assert np.allclose(backends.create("odometry").solve(refined).poses, graph.initial)
     *_, last = backends.replay(backends.create("odometry"), refined)
     assert np.allclose(last.poses, graph.initial)
-
-
-@pytest.mark.data
-@pytest.mark.slow
-def test_isam2_returns_to_the_clean_optimum_when_false_edges_are_taken_out(data_dir):
-    graph = read_graph(data_dir / "posegraphs" / "intel.g2o")
-    false = inject(graph, 0.01, "random", np.random.default_rng(0))
-    backend = backends.create("gtsam-isam2")
-    clean = backend.solve(graph).report.chi2
-    backend.update(graph)
-    assert backend.update(false).report.chi2 > 10.0 * clean
-    for _ in range(3):
-        back = backend.update(graph)
-    assert back.report.chi2 <= 1.001 * clean
-
-
-@pytest.mark.data
-@pytest.mark.slow
-def test_a_replay_of_manhattan_by_isam2_ends_at_the_batch_optimum(data_dir):
-    graph = read_graph(data_dir / "posegraphs" / "manhattanOlson3500.g2o")
-    *_, last = backends.replay(backends.create("gtsam-isam2"), graph)
-    assert last.report.chi2 <= 1.001 * backends.create("gtsam-lm").solve(graph).report.chi2

@@ -87,6 +87,62 @@ def test_whatever_raises_leaves_all_as_it_was(graph):
     assert session.poses().tobytes() == poses
 
 
+BAD_EDGES = {
+    "NaN": ((135, 105), [np.nan, 0.0, 0.0], np.eye(3)),
+    "infinite": ((135, 105), [0.0, np.inf, 0.0], np.eye(3)),
+    "of no length that metres can hold": ((135, 105), [1e200, 0.0, 0.0], np.eye(3)),
+    "information NaN": ((135, 105), [0.0, 0.0, 0.0], np.diag([1.0, np.nan, 1.0])),
+    "asymmetric": ((135, 105), [0.0, 0.0, 0.0], np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])),
+    "indefinite": ((135, 105), [0.0, 0.0, 0.0], np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])),
+    "singular": ((135, 105), [0.0, 0.0, 0.0], np.diag([1.0, 1.0, 0.0])),
+    "nearly singular": ((135, 105), [0.0, 0.0, 0.0], np.diag([1.0, 1.0, 1e-300])),
+    "of the wrong shape": ((135, 105), [0.0, 0.0], np.eye(3)),
+    "information of the wrong shape": ((135, 105), [0.0, 0.0, 0.0], np.ones(6)),
+    "words": ((135, 105), ["a", "b", "c"], np.eye(3)),
+    "from an unknown node": ((999, 105), [0.0, 0.0, 0.0], np.eye(3)),
+    "to an unknown node": ((135, -1), [0.0, 0.0, 0.0], np.eye(3)),
+    "onto itself": ((135, 135), [0.0, 0.0, 0.0], np.eye(3)),
+}
+
+
+@pytest.mark.parametrize("name", [name for name in backends.names() if "gtsam" in name])
+def test_no_bad_edge_and_no_loose_node_gets_past_the_door_or_leaves_a_trace(graph, name):
+    disturbed, undisturbed = fill(GraphSession(name), graph), fill(GraphSession(name), graph)
+    assert disturbed.step().poses.tobytes() == undisturbed.step().poses.tobytes()
+    before = disturbed.snapshot()
+    for what, (ends, delta, information) in BAD_EDGES.items():
+        with pytest.raises(GraphError):
+            disturbed.add_edge(900, *ends, delta, information)
+        assert disturbed.snapshot() is before, what
+    for pose in ([np.nan, 0.0, 0.0], [0.0, 0.0], "abc"):
+        with pytest.raises(GraphError, match="pose of node 777"):
+            disturbed.add_node(777, pose)
+        assert disturbed.snapshot() is before
+    disturbed.add_node(777)
+    disturbed.add_node(778)
+    disturbed.add_edge(900, 777, 778, [1.0, 0.0, 0.0], np.eye(3))
+    loose = disturbed.snapshot()
+    for attempt in (disturbed.step, disturbed.solve, disturbed.poses, lambda: disturbed.marginal(120)):
+        with pytest.raises(GraphError, match="node 40 is not connected"):
+            attempt()
+        assert disturbed.snapshot() is loose
+    for session, state in ((disturbed, before), (undisturbed, undisturbed.snapshot())):
+        session.restore(state)
+        session.add_edge(901, 135, 105, graph.deltas[-1], graph.information[-1])
+    assert disturbed.step().poses.tobytes() == undisturbed.step().poses.tobytes()
+    assert disturbed.solve().poses.tobytes() == undisturbed.solve().poses.tobytes()
+
+
+def test_what_a_session_hands_out_is_the_callers_to_write_to(graph):
+    session = fill(GraphSession("gtsam-isam2"), graph)
+    first = session.step()
+    kept = first.poses.tobytes()
+    first.poses[:] = 7.0
+    session.poses()[:] = 7.0
+    assert session.poses().tobytes() == kept
+    assert session.step().poses.tobytes() == kept
+
+
 def test_a_snapshot_brings_everything_back_bit_for_bit(graph):
     session = fill(GraphSession("gtsam-isam2"), graph)
     session.step()

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hybridmap.backends import names
 from hybridmap.backends.objective import chi2
 from hybridmap.cli import main
 from hybridmap.graph.io import read_graph
@@ -99,6 +100,41 @@ def test_bad_input_is_one_line_and_exit_code_2(monkeypatch, capsys, square, tmp_
     assert errors.count("\n") == 1
     assert errors.startswith("hybridmap: error: ")
     assert says in errors
+
+
+BAD_LINES = {
+    "found NaN or Inf": ["EDGE_SE2 3 0 nan 0 1.57 100 0 0 100 0 400"],
+    "not positive definite": ["EDGE_SE2 3 0 1 0 1.57 100 200 0 100 0 400"],
+    "edge 4 (3 -> 0) has an information matrix that is not positive definite": ["EDGE_SE2 3 0 1 0 1.57 100 0 0 100 0 0"],
+    "outside 1e-09 to 1e+15": ["EDGE_SE2 3 0 1 0 1.57 100 0 0 100 0 1e-300"],
+    "beyond 1e+09": ["EDGE_SE2 3 0 1e200 0 1.57 100 0 0 100 0 400"],
+    "node 4 is not connected to node 0": ["VERTEX_SE2 7 0 0 0", "VERTEX_SE2 8 1 0 0", "EDGE_SE2 7 8 1 0 0 1 0 0 1 0 1"],
+    "names vertex 99, which the file does not give": ["EDGE_SE2 3 99 1 0 0 100 0 0 100 0 400"],
+    "vertex 0 is given twice": ["VERTEX_SE2 0 0 0 0"],
+    "leads from a node to itself": ["EDGE_SE2 3 3 1 0 0 100 0 0 100 0 400"],
+}
+
+
+@pytest.mark.parametrize("name", [name for name in names() if name.startswith(("gtsam", "relaxation"))])
+def test_a_graph_that_no_solver_can_take_is_one_line_for_every_back_end(monkeypatch, capsys, square, tmp_path, name):
+    for says, lines in BAD_LINES.items():
+        bad, out = tmp_path / "bad.g2o", tmp_path / "out.g2o"
+        bad.write_text(square.read_text() + "\n".join(lines) + "\n")
+        code, printed, errors = run(monkeypatch, capsys, "optimize", bad, "--backend", name, "--out", out, "--json")
+        assert (code, printed, errors.count("\n")) == (2, "", 1), says
+        assert errors.startswith("hybridmap: error: ")
+        assert says in errors
+        assert not out.exists()
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["gtsam-gn", "gtsam-dogleg"])
+def test_a_solver_that_found_the_graph_singular_is_exit_code_1_and_no_file(monkeypatch, capsys, data_dir, tmp_path, name):
+    path, out = data_dir / "posegraphs" / "input_INTEL_g2o.g2o", tmp_path / "out.g2o"
+    code, printed, _ = run(monkeypatch, capsys, "optimize", path, "--backend", name, "--out", out, "--json")
+    assert code == 1
+    assert json.loads(printed)["status"] == "singular"
+    assert not out.exists()
 
 
 @pytest.mark.data
