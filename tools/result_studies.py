@@ -203,13 +203,6 @@ STUDIES = (
         needs="real/fr079/fr079.mcap",
     ),
     Study(
-        "backends",
-        "The back-ends: cost against plain Python and against GTSAM alone",
-        "Process time, as ratios within one run.",
-        (Step("python tools/backend_bench.py sweep overhead gnc isam2 --data $HYBRIDMAP_DATA", own_bars=True),),
-        needs="posegraphs/city10000.g2o",
-    ),
-    Study(
         "manhattan",
         "manhattanOlson3500, one referee",
         "A standard pose graph through several back-ends. Its best known chi2 is 146.08.",
