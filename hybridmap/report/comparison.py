@@ -18,6 +18,7 @@ from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 from hybridmap.report import comparison_figures as figures
 from hybridmap.report import tables
+from hybridmap.report.template import rendered
 from hybridmap.trajectory import write_text_atomic
 
 PICTURE, PAGE = "maps.png", "comparison.html"
@@ -52,17 +53,9 @@ class Compared:
 
 def write_comparison(folder: Path, compared: Compared) -> Path:
     """Write `maps.png` and `comparison.html` into a folder, which is made; returns the page."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("hybridmap", "report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     graph, rows = compared.graph, compared.rows
-    page = environment.get_template(_TEMPLATE).render(
+    page = rendered(
+        _TEMPLATE,
         title=compared.title,
         start=compared.start,
         chi2_start=tables.number(float(squared_norms(graph, graph.initial).sum())),

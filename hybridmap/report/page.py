@@ -15,6 +15,7 @@ from hybridmap.report.error_figure import error_figure
 from hybridmap.report.map_figure import graph_figure, trajectories_figure
 from hybridmap.report.outline import outlines, raster
 from hybridmap.report.scene import ODOMETRY, Scene, load_scene
+from hybridmap.report.template import rendered
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.trajectory import NS_PER_S, write_text_atomic
 
@@ -40,7 +41,7 @@ def write_report(folder: SessionFolder) -> Path:
     folder.require()
     with MapStore.open(folder.path) as store:
         scene = load_scene(folder, store)
-        text = _render(_content(scene, store))
+        text = rendered(_TEMPLATE, **_content(scene, store))
     write_text_atomic(folder.report, text)
     return folder.report
 
@@ -72,19 +73,6 @@ def _content(scene: Scene, store: MapStore) -> dict[str, Any]:
         "graph_hash": scene.head.get("graph_hash", ""),
         "version": version("hybridmap"),
     }
-
-
-def _render(content: dict[str, Any]) -> str:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("hybridmap", "report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template(_TEMPLATE).render(content)
 
 
 def tiles(scene: Scene) -> list[Tile]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from hybridmap.errors import StudyError
 from hybridmap.report import study_figures, tables
 from hybridmap.report.study_figures import FLOOR_M, MOST_PANELS
+from hybridmap.report.template import rendered
 from hybridmap.study.cell import MEASURES, CellResult
 from hybridmap.study.folder import PAGE
 from hybridmap.study.statistics import Interval, Summary
@@ -63,19 +64,11 @@ def write_study_page(study: Study) -> Path:
 
 
 def _render(study: Study) -> str:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("hybridmap", "report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     config = study.grid.study
     plan = study_figures.layout(study)
     by_false_loops = any(cell.rate > 0.0 for cell in study.grid.cells)
-    return environment.get_template(_TEMPLATE).render(
+    return rendered(
+        _TEMPLATE,
         head=study.head,
         description=config.description,
         tiles=_tiles(study),

@@ -13,6 +13,7 @@ from hybridmap.evaluate.cells import Verification
 from hybridmap.evaluate.cells.rows import recurrence_verdict
 from hybridmap.metrics import Metric, to_json
 from hybridmap.report import tables, verify_figures, verify_maps
+from hybridmap.report.template import rendered
 from hybridmap.trajectory import write_text_atomic
 
 PAGE, METRICS = "verify.html", "metrics.json"
@@ -80,18 +81,10 @@ def _scale_of(result: Verification) -> dict[str, str]:
 
 
 def _render(head: dict[str, Any], rows: Sequence[Metric], result: Verification) -> str:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("hybridmap", "report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     named = {row.name.removeprefix("verify/"): row for row in rows}
     first = next(iter(result.room.values()))
-    return environment.get_template(_TEMPLATE).render(
+    return rendered(
+        _TEMPLATE,
         head=head,
         rows=[(row.name.removeprefix("verify/"), tables.number(row.value), tables.unit(row), row) for row in rows],
         value={name: tables.number(row.value) for name, row in named.items()},
