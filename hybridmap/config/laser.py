@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from hybridmap.config.agreement import AgreementConfig
 from hybridmap.config.section import Section
 
 
@@ -201,6 +202,36 @@ class RetraceConfig(Section):
     """The same, degrees."""
 
 
+class LaserRelocalisingConfig(AgreementConfig):
+    """A robot that was carried away, or recognises nothing where it should, is looked for on the whole map."""
+
+    span_m: float = Field(default=1.5, ge=0)
+    """Travel that sightings must cover, m; more where they fit badly (`mismatch_max`)."""
+    contradiction_sigmas: float = Field(default=4.0, gt=0)
+    """A registration this far from the odometry, in deviations of the odometry, does not show that the robot drove there."""
+    violation: float = Field(default=0.13, gt=0, le=1)
+    """Nor does the odometry alone: the chain is broken where beside that two consecutive scans see each other's walls, this
+    share of them, in free space. 1: it never is."""
+    unrecognised_probes: int = Field(default=2, ge=0)
+    """Probes that recognise nothing while the map contradicts what is seen, with none that does between them, after which the
+    robot is lost too; 0: never."""
+    map_violation: float = Field(default=0.4, gt=0, le=1)
+    """The map contradicts the last scans if more of either's walls than this share lie in the other's free space,"""
+    sure_m: float = Field(default=0.3, gt=0)
+    """and if it is this sure of where they lie (standard deviation of the position), m."""
+    from_m: float = Field(default=0.9, gt=0)
+    """Travel since the break from which on the scans since then are held against the whole map, m."""
+    often_m: float = Field(default=6.0, gt=0)
+    """As far after the break it is done at each node, then as often as `probes.every_m`, m."""
+    submaps: int = Field(default=100, ge=1)
+    """Old submaps that are searched, at most; where there are more, those whose views are likest."""
+    modes: int = Field(default=8, ge=1)
+    """Modes that are verified."""
+    misfit: float = Field(default=0.015, gt=0, lt=1)
+    """Where the scans of the drive fit one another better than so (the share that does not), a sighting that fits as badly
+    as elsewhere is a worse one: its mismatch counts for more, in proportion."""
+
+
 class LaserConfig(Section):
     """Submap registration and commitment by cluster."""
 
@@ -214,6 +245,8 @@ class LaserConfig(Section):
     """Hypotheses of loop closure."""
     commitment: CommitmentConfig = CommitmentConfig()
     """When hypotheses become edges."""
+    relocalising: LaserRelocalisingConfig = LaserRelocalisingConfig()
+    """What a lost robot does."""
     revisits: RevisitConfig = RevisitConfig()
     """Re-proposal at the end."""
     retrace: RetraceConfig = RetraceConfig()

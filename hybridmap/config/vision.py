@@ -6,6 +6,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from hybridmap.config.agreement import AgreementConfig
 from hybridmap.config.laser import LaserConfig
 from hybridmap.config.rgbd import RgbdConfig
 from hybridmap.config.section import Section
@@ -50,21 +51,13 @@ class TemplatesConfig(Section):
     """Largest shift tried against the templates, columns."""
 
 
-class RelocalisingConfig(Section):
+class RelocalisingConfig(AgreementConfig):
     """A robot that has lost its place (it was carried, or its view fits no node before) is looked for on the whole map."""
 
     candidates: int = Field(default=5, ge=0)
     """Views of the whole map that are verified for a node, the best first; 0: never look outside the gate."""
     separation: int = Field(default=4, ge=0)
     """They lie at least this many nodes apart."""
-    support: int = Field(default=4, ge=2)
-    """Nodes whose closures must put the robot at one and the same place."""
-    span_m: float = Field(default=0.75, ge=0)
-    """Travel that they must cover, m."""
-    agree_m: float = Field(default=0.3, gt=0)
-    """They agree if they put the robot within this of each other, m (plus 5 % of the travel between them)."""
-    agree_deg: float = Field(default=5.0, gt=0)
-    """The same for its heading, degrees (plus 1 per metre)."""
     doubtful_m: float = Field(default=0.1, gt=0)
     """A node whose view fits those before it but may slide by more than this (one standard deviation) may be elsewhere, m."""
     doubt_nodes: int = Field(default=40, ge=1)

@@ -80,6 +80,7 @@ _STEP_OF_CAMERA = (Rule("inliers", True, "vision.rgbd.registration.min_inliers")
 _STEP_OF_LASER = (Rule("inliers", True, f"{_TRACKING}.inliers_weak"),)
 
 _CLOSING, _COMMIT = "vision.rgbd.closing", "vision.laser.commitment"
+_LOST = "vision.laser.relocalising"
 _OTHERWISE = (
     (
         "no other edge supports it",
@@ -97,6 +98,11 @@ _OTHERWISE = (
     ),
     ("waits for a cluster", f"{{{_COMMIT}.probes}} probes that agree with one another, and no rival cluster as good"),
     ("contradicts the cluster", "a cluster of its own that is better than the one it contradicts"),
+    (
+        "other submaps",
+        f"submaps of {{{_LOST}.support}} nodes over {{{_LOST}.span_m}} m of travel, or more where they fit badly, that put the "
+        "robot at one place, and those at others counting for less than half as much",
+    ),
     (
         "lost: waits for others",
         "closures of {vision.relocalising.support} nodes over {vision.relocalising.span_m} m of travel that put the robot "

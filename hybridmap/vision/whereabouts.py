@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from hybridmap.config.vision import RelocalisingConfig
+from enum import Enum
+
+
+class Chain(Enum):
+    """How a new node hangs on the nodes before it, by what it sees."""
+
+    HOLDS = "holds"
+    DOUBTFUL = "doubtful"
+    BROKEN = "broken"
 
 
 class Whereabouts:
@@ -12,18 +20,22 @@ class Whereabouts:
     looked at a bare wall. It is doubtful at a node whose view fits, but slides: one wall fits any other. And a robot that is
     where its map has it recognises what it drives past. In all three cases it is lost until a closure tells where it is;
     only a doubt is forgotten in the end, as most bare walls are just that.
+
+    Args:
+        unrecognised: times in a row that the robot must fail to recognise what it should know to be lost; 0: it never is.
+        doubt_nodes: nodes after which a doubt is forgotten.
     """
 
-    def __init__(self, config: RelocalisingConfig) -> None:
-        self._config = config
-        self._breaks: dict[int, bool] = {}
+    def __init__(self, unrecognised: int, doubt_nodes: int = 1) -> None:
+        self._wanted = unrecognised
+        self._doubt_nodes = doubt_nodes
+        self._breaks: dict[int, Chain] = {}
         self._unrecognised = 0
 
     @property
     def lost(self) -> bool:
         """The map's own pose is not to be trusted."""
-        wanted = self._config.unrecognised_nodes
-        return bool(self._breaks) or (wanted > 0 and self._unrecognised >= wanted)
+        return bool(self._breaks) or (self._wanted > 0 and self._unrecognised >= self._wanted)
 
     @property
     def first_break(self) -> int | None:
@@ -33,21 +45,17 @@ class Whereabouts:
     def break_before(self, node: int) -> int | None:
         """Where the chain broke, if the robot is elsewhere at a node: the last break up to it, else the last doubt."""
         before = [at for at in self._breaks if at <= node]
-        certain = [at for at in before if self._breaks[at]]
+        certain = [at for at in before if self._breaks[at] is Chain.BROKEN]
         return max(certain or before, default=None)
 
-    def tracked(self, node: int, sigma_m: float | None) -> None:
-        """The view of a new node was compared with those before it.
-
-        Args:
-            node: the new node.
-            sigma_m: standard deviation of the best registration in its loosest direction, m; None where nothing fitted.
-        """
-        forgotten = [at for at, certain in self._breaks.items() if not certain and node - at > self._config.doubt_nodes]
-        for at in forgotten:
-            del self._breaks[at]
-        if self._config.candidates > 0 and (sigma_m is None or sigma_m > self._config.doubtful_m):
-            self._breaks[node] = sigma_m is None
+    def tracked(self, node: int, chain: Chain) -> None:
+        """The view of a new node was compared with those before it."""
+        doubts = [at for at, how in self._breaks.items() if how is Chain.DOUBTFUL]
+        for at in doubts:
+            if node - at > self._doubt_nodes:
+                del self._breaks[at]
+        if chain is not Chain.HOLDS:
+            self._breaks[node] = chain
 
     def recognised(self) -> None:
         """A closure says where the robot is."""
@@ -55,5 +63,5 @@ class Whereabouts:
         self._unrecognised = 0
 
     def unrecognised(self) -> None:
-        """At this node the robot should have seen a place that it knows, and did not recognise it."""
+        """Here the robot should have seen a place that it knows, and did not recognise it."""
         self._unrecognised += 1

@@ -58,10 +58,13 @@ class Cluster:
 class Commitment:
     """The queue of waiting hypotheses."""
 
-    def __init__(self, config: CommitmentConfig, travel_of: Callable[[int], float], chain_of: Callable[[int], Array]) -> None:
+    def __init__(
+        self, config: CommitmentConfig, travel_of: Callable[[int], float], motion_of: Callable[[int, int, Array], Array]
+    ) -> None:
+        """Start empty; `motion_of` gives node b in the frame of node a, of a, b and the poses (N, 3) of all on the map."""
         self._config = config
         self._travel = travel_of
-        self._chain = chain_of
+        self._motion = motion_of
         self._queue: list[Waiting] = []
         self._given_up: list[Waiting] = []
         self._consistent: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
@@ -193,7 +196,7 @@ class Commitment:
 
     def _agree(self, a: Hypothesis, b: Hypothesis, belief: Belief) -> bool:
         """Close the ring probe a, anchor a, anchor b, probe b and hold what is left against its uncertainty."""
-        probes = between(self._chain(a.probe), self._chain(b.probe))
+        probes = self._motion(a.probe, b.probe, belief.poses_map_node)
         old = between(belief.poses_map_node[a.anchor], belief.poses_map_node[b.anchor])
         via = compose(compose(inverse(a.relative.delta), probes), b.relative.delta)
         error = between(old, via)

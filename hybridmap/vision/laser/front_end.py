@@ -14,11 +14,13 @@ from hybridmap.streams.base import Laser, LaserScan, Observation
 from hybridmap.vision.base import Belief, Doubted, Proposal, Retraced, Verdict, View
 from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan
 from hybridmap.vision.laser.clusters import Commitment, Settled
+from hybridmap.vision.laser.continuity import Continuity
 from hybridmap.vision.laser.hypotheses import Hypothesis, Prober
 from hybridmap.vision.laser.retrace import Retracer, SeenScan
 from hybridmap.vision.laser.revisits import Reviser
 from hybridmap.vision.laser.submap import Atlas
 from hybridmap.vision.laser.tracking import Step, Tracker
+from hybridmap.vision.laser.whole_map import WholeMap
 from hybridmap.vision.profile import laser_profile
 from hybridmap.vision.templates import ViewTemplates
 
@@ -41,10 +43,12 @@ class LaserFrontEnd:
         self._tracker = Tracker(self._config, self._atlas)
         self._prober = Prober(self._config, self._atlas, laser)
         self._reviser = Reviser(self._config, self._atlas, laser)
-        self._commitment = Commitment(self._config.commitment, self._atlas.travel_m.__getitem__, self._atlas.chain.__getitem__)
+        self._commitment = Commitment(self._config.commitment, self._atlas.travel_m.__getitem__, self._atlas.motion)
         t, m = config.templates, config.matching
         self._templates = ViewTemplates(t.threshold, t.stable_frames, t.max_shift, m.mu_r, m.mu_d)
         self._profiles: list[NDArray[np.float32]] = []
+        self._continuity = Continuity(self._config, self._atlas, laser, self._tracker)
+        self._whole_map = WholeMap(self._config, self._atlas, self._prober, self._continuity, self._profiles, self._next_key)
         self._retracer = Retracer(self._config, self._atlas, laser)
         self._scans: list[SeenScan] = []
         self._steps: list[Array] = []
@@ -93,20 +97,24 @@ class LaserFrontEnd:
             return []
         step = self._tracker.step(cloud, odometry, self._clouds_between)
         self._atlas.add(cloud, scan.ranges_m, compose(self._atlas.chain[-1], step.relative.delta), step.scatter)
-        return [self._registration(node, step)]
+        broken = self._continuity.broken(node, step, odometry, [(seen.motion, seen.scan) for seen in self._between])
+        return [self._whole_map.tracked(self._registration(node, step), broken)]
 
     def close(self, node: int, belief: Belief) -> list[Proposal]:
-        """Probe the old submaps every few metres; settle what has waited."""
+        """Look for a lost robot on the whole map; probe the old submaps every few metres; settle what has waited."""
+        sought = self._whole_map.search(node, belief)
         travel_m = self._atlas.travel_m[node]
-        if travel_m - self._last_probe_m < self._config.probes.every_m:
-            return []
-        out = self._probe(node, belief)
-        return out + [_settled(s) for s in self._commitment.settle(travel_m, belief)]
+        if sought.friends or travel_m - self._last_probe_m < self._config.probes.every_m:
+            return sought.proposals
+        out = sought.proposals + self._probe(node, belief)
+        settled = [_settled(s) for s in self._commitment.settle(travel_m, belief)]
+        return out + settled + (self._whole_map.closed() if any(p.verdict is Verdict.ACCEPTED for p in settled) else [])
 
     def _probe(self, node: int, belief: Belief) -> list[Proposal]:
         self._last_probe_m = self._atlas.travel_m[node]
-        out = []
-        for hypothesis in self._prober.probe(node, belief):
+        hypotheses, out = self._prober.probe(node, belief, self._whole_map.since), []
+        self._whole_map.probed(node, hypotheses, belief)
+        for hypothesis in hypotheses:
             key = self._next_key()
             if hypothesis.refusal:
                 out.append(_loop(key, hypothesis, Verdict.REJECTED, hypothesis.refusal))
@@ -121,10 +129,10 @@ class LaserFrontEnd:
         if last >= 0 and self._atlas.travel_m[last] - self._last_probe_m > LAST_PROBE_M:
             out = self._probe(last, belief)
         settled = self._commitment.flush(belief)
-        out += [_settled(s) for s in settled]
+        out += self._whole_map.finish() + [_settled(s) for s in settled]
         if any(s.accepted for s in settled):
             return out
-        for hypothesis in self._reviser.round(belief):
+        for hypothesis in self._reviser.round(belief, self._whole_map.since):
             verdict = Verdict.REJECTED if hypothesis.refusal else Verdict.ACCEPTED
             out.append(_loop(self._next_key(), hypothesis, verdict, hypothesis.refusal or "near on the optimised map"))
         return out

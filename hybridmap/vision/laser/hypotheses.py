@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hybridmap.config.laser import LaserConfig
-from hybridmap.geometry import Array, RelativePose, between, inverse, invert_relative, wrap_angle
+from hybridmap.geometry import IDENTITY, Array, RelativePose, between, inverse, invert_relative, wrap_angle
 from hybridmap.streams.base import Laser
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.registration import Alignment, align, second_mode
@@ -81,20 +82,44 @@ class Prober:
         self._laser = laser
         self._anchors: list[int] = []
 
-    def probe(self, node: int, belief: Belief) -> list[Hypothesis]:
-        """Search the old submaps for the last metres before a node; those refused carry the reason."""
+    def probe(self, node: int, belief: Belief, since: int = 0) -> list[Hypothesis]:
+        """Search the old submaps inside the gate for the last metres before a node; those refused carry the reason.
+
+        Args:
+            node: the newest node of the probe.
+            belief: gives the gate.
+            since: only submaps about this node and later ones are searched.
+        """
         c, atlas = self._config.probes, self._atlas
-        recent = atlas.along(atlas.travel_m[node] - c.length_m, atlas.travel_m[node])
+        recent = atlas.along(node, c.length_m, 0.0)
         recent = recent[recent <= node]
         middle = 0.5 * (atlas.travel_m[int(recent[0])] + atlas.travel_m[node])
         probe = atlas.submap(int(recent[np.searchsorted(np.asarray(atlas.travel_m)[recent], middle)]), recent)
-        candidates = [self._candidate(gate, probe) for gate in self._gates(probe.anchor, int(recent[0]), belief)]
-        candidates = sorted((k for k in candidates if k.starts), key=lambda k: -k.starts[0].score)
-        modes = [mode for candidate in candidates[: c.targets] for mode in self._modes(candidate, probe)]
-        modes.sort(key=lambda m: -m.score)
+        gates = self._gates(probe.anchor, int(recent[0]), since, belief)
+        modes = self._search(gates, probe)
         sure = all(mode.gate.sigma_m < self._config.commitment.sure_sigma_m for mode in modes)
-        found = [self._verify(mode, probe) for mode in modes[: c.modes_sure if sure else c.modes]]
-        return _distinct(found)
+        return _distinct([self._verify(mode, probe) for mode in modes[: c.modes_sure if sure else c.modes]])
+
+    def probe_anywhere(self, probe: Submap, anchors: Sequence[int]) -> list[Hypothesis]:
+        """Hold a submap against those about some anchors, wherever the map has it and whatever its heading."""
+        gates = [_Gate(anchor, IDENTITY, UNKNOWN, np.pi, UNKNOWN) for anchor in anchors]
+        modes = self._search(gates, probe)[: self._config.relocalising.modes]
+        return _distinct([self._verify(mode, probe) for mode in modes])
+
+    def anchors_before(self, node: int) -> list[int]:
+        """Anchors of old submaps that lie wholly before a node."""
+        self._extend_anchors()
+        atlas, half_m = self._atlas, self._config.probes.target_half_m
+        limit = atlas.travel_m[node] - half_m
+        first = atlas.piece(node).start
+        return [a for a in self._anchors if a < first or (a < node and atlas.travel_m[a] < limit)]
+
+    def _search(self, gates: list[_Gate], probe: Submap) -> list[_Mode]:
+        """Promising starts on the likeliest targets, the best first."""
+        candidates = [self._candidate(gate, probe) for gate in gates]
+        candidates = sorted((k for k in candidates if k.starts), key=lambda k: -k.starts[0].score)
+        chosen = candidates[: self._config.probes.targets]
+        return sorted((mode for k in chosen for mode in self._modes(k, probe)), key=lambda m: -m.score)
 
     def _extend_anchors(self) -> None:
         travel = self._atlas.travel_m
@@ -105,12 +130,10 @@ class Prober:
                 return
             self._anchors.append(after)
 
-    def _gates(self, center: int, oldest: int, belief: Belief) -> list[_Gate]:
+    def _gates(self, center: int, oldest: int, since: int, belief: Belief) -> list[_Gate]:
         """Targets that lie wholly before the probe and inside the gate; the gate follows the covariance and has no cap."""
-        c, atlas = self._config.probes, self._atlas
-        self._extend_anchors()
-        limit = atlas.travel_m[oldest] - c.target_half_m
-        anchors = [a for a in self._anchors if atlas.travel_m[a] < limit]
+        c = self._config.probes
+        anchors = [a for a in self.anchors_before(oldest) if a >= since]
         if not anchors:
             return []
         covariance = c.gate_inflation**2 * np.nan_to_num(belief.covariance_from(center)[anchors], posinf=UNKNOWN)

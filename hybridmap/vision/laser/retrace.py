@@ -41,6 +41,8 @@ class Retracer:
     def retrace(self, scans: Sequence[SeenScan], steps: Array, poses: Array) -> Retraced:
         """Pose of the robot at every scan that could be registered, seen from the node it had made last.
 
+        Scans about a break of the chain are left out: the wheels do not tell on which side of it they were taken.
+
         Args:
             scans: every scan since the first node, in order; that of a node has no motion.
             steps: (N - 1, 3) the integrator's motion from each node to the next.
@@ -50,14 +52,20 @@ class Retracer:
         motions = np.array([s.motion for s in scans]).reshape(-1, 3)
         expected = _expected(nodes, motions, steps.reshape(-1, 3), poses)
         found, good = expected.copy(), np.zeros(len(scans), dtype=bool)
-        size = self._config.retrace.block_nodes
-        for first in range(0, len(poses), size):
-            block = np.flatnonzero((nodes >= first) & (nodes < first + size))
+        for first, stop in self._blocks():
+            block = np.flatnonzero((nodes >= first) & (nodes < stop))
             if len(block):
                 clouds = clouds_of_scans([scans[i].scan.ranges_m for i in block.tolist()], self._laser, self._config.scan)
-                found[block], good[block] = self._register(clouds, expected[block], poses[first : first + size], poses)
+                found[block], good[block] = self._register(clouds, expected[block], poses[first:stop], poses)
+        for piece in self._atlas.pieces[1:]:
+            good[(nodes == piece.start - 1) & (_way(motions) > 0.0)] = False
         stamps = np.array([s.scan.stamp_ns for s in scans], dtype=np.int64)
         return Retraced(stamps[good], nodes[good], between(poses[nodes[good]], found[good]))
+
+    def _blocks(self) -> list[tuple[int, int]]:
+        """First and one past the last node of each block; none of them goes beyond a piece of the chain."""
+        size = self._config.retrace.block_nodes
+        return [(first, min(first + size, p.stop)) for p in self._atlas.pieces for first in range(p.start, p.stop, size)]
 
     def _register(self, clouds: list[Cloud], expected: Array, block: Array, poses: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Poses (K, 3) of a block's scans, and which of them are to be believed."""

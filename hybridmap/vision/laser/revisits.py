@@ -27,15 +27,21 @@ class Reviser:
         self._rounds = 0
         self._done: set[tuple[int, int]] = set()
 
-    def round(self, belief: Belief) -> list[Hypothesis]:
-        """Register every pair that is due; empty once the configured rounds are over."""
+    def round(self, belief: Belief, since: int = 0) -> list[Hypothesis]:
+        """Register every pair that is due; empty once the configured rounds are over.
+
+        Args:
+            belief: where the nodes lie.
+            since: how the map lies about this node and later ones with that about earlier ones is not known.
+        """
         if self._rounds >= self._config.revisits.rounds or len(self._atlas) == 0:
             return []
         self._rounds += 1
         grid = self._grid()
         found = []
         for node in grid:
-            for other in self._partners(int(node), grid, belief.poses_map_node):
+            beside = grid[(grid < since) == (node < since)]
+            for other in self._partners(int(node), beside, belief.poses_map_node):
                 self._done.add((int(node), other))
                 found.append(self.register(int(node), other, belief.poses_map_node))
         return found

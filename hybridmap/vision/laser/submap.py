@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right, insort
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from itertools import pairwise
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -77,6 +79,8 @@ class _Recent(Generic[Key, Value]):
 class Atlas:
     """The clouds of all nodes with the chain of refined poses; makes submaps and targets of them.
 
+    Where the chain broke a new piece of it begins; no submap holds nodes of two pieces.
+
     Attributes:
         clouds, ranges: of each node's scan, the points in its frame and the ranges (B,) as they came.
         chain: pose (3,) of each node.
@@ -94,6 +98,7 @@ class Atlas:
         self.chain: list[Array] = []
         self.scatter: list[Array] = []
         self.travel_m: list[float] = []
+        self._pieces = [0]
 
     def __len__(self) -> int:
         return len(self.clouds)
@@ -121,11 +126,34 @@ class Atlas:
         edge = compose_relative(RelativePose(IDENTITY, self.scatter[target]), RelativePose(pose, covariance))
         return edge if probe is None else compose_relative(edge, RelativePose(IDENTITY, self.scatter[probe]))
 
-    def along(self, low_m: float, high_m: float) -> NDArray[np.int64]:
-        """Nodes whose travel lies in [low, high], as far as there are any."""
-        first = int(np.searchsorted(self.travel_m, low_m - 1e-9))
-        stop = int(np.searchsorted(self.travel_m, high_m + 1e-9, side="right"))
-        return np.arange(first, stop)
+    def part(self, node: int) -> None:
+        """Let a new piece of the chain begin at a node."""
+        insort(self._pieces, node)
+
+    def join(self, node: int) -> None:
+        """Make one of two pieces again, of which the later begins at a node."""
+        self._pieces.remove(node)
+
+    @property
+    def pieces(self) -> list[range]:
+        """The nodes of each piece of the chain."""
+        return [range(a, b) for a, b in pairwise([*self._pieces, len(self)])]
+
+    def piece(self, node: int) -> range:
+        """The nodes of the piece of the chain that a node, or the next one to come, belongs to."""
+        return self.pieces[bisect_right(self._pieces, node) - 1]
+
+    def motion(self, a: int, b: int, poses_map_node: Array) -> Array:
+        """Pose (3,) of node b in the frame of node a: along the chain within one piece, from one to another on the map."""
+        same = b in self.piece(a)
+        return between(self.chain[a], self.chain[b]) if same else between(poses_map_node[a], poses_map_node[b])
+
+    def along(self, node: int, before_m: float, after_m: float) -> NDArray[np.int64]:
+        """Nodes of a node's piece that lie at most so much travel before and after it."""
+        travel, piece = self.travel_m[node], self.piece(node)
+        first = int(np.searchsorted(self.travel_m, travel - before_m - 1e-9))
+        stop = int(np.searchsorted(self.travel_m, travel + after_m + 1e-9, side="right"))
+        return np.arange(max(first, piece.start), min(stop, piece.stop))
 
     def submap(self, anchor: int, nodes: NDArray[np.int64] | Sequence[int] | range) -> Submap:
         """Merge the clouds of some nodes in the frame of an anchor."""
@@ -136,8 +164,7 @@ class Atlas:
 
     def around(self, anchor: int, half_m: float) -> Submap:
         """The submap of the nodes within so many metres of travel of an anchor; kept for the next time."""
-        travel = self.travel_m[anchor]
-        nodes = self.along(travel - half_m, travel + half_m)
+        nodes = self.along(anchor, half_m, half_m)
         return self._submaps.get(_span(anchor, nodes), lambda: self.submap(anchor, nodes))
 
     def scoring_field(self, target: Submap, kind: Field) -> LikelihoodField:

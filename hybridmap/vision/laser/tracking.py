@@ -65,17 +65,29 @@ class Tracker:
             best = _better(best, self._grid(field, cloud, odometry.delta, c.lost), LOST_GAIN)
         return self._judge(best, odometry)
 
+    def pair(self, cloud: Cloud, following: Cloud, odometry: Array) -> Alignment:
+        """The next scan registered to one scan alone, from where the odometry (3,) has it."""
+        field = self._field_of(cloud)
+        best = self._search(field, following, odometry)
+        if self._doubtful(best, odometry):
+            best = _better(best, self._grid(field, following, odometry, self._config.tracking.lost), LOST_GAIN)
+        return best
+
     def _doubtful(self, alignment: Alignment, expected: Array) -> bool:
         """Whether a registration is weak, or contradicts the odometry without being very good."""
         c, inliers = self._config.tracking, alignment.inliers[0]
         return bool(inliers < c.inliers_min or (inliers < c.inliers_sure and self._contradicts(alignment.poses[0], expected)))
 
     def _field(self, extra: Sequence[Cloud] = ()) -> LikelihoodField:
-        settings, n = self._config.registration, len(self._atlas)
-        nodes = range(max(n - self._config.tracking.submap_nodes, 0), n)
+        n = len(self._atlas)
+        nodes = range(max(n - self._config.tracking.submap_nodes, self._atlas.piece(n - 1).start), n)
         cloud = self._atlas.submap(n - 1, nodes).cloud
         if extra:
             cloud = merged([cloud, *extra], self._config.scan.cell_m)
+        return self._field_of(cloud)
+
+    def _field_of(self, cloud: Cloud) -> LikelihoodField:
+        settings = self._config.registration
         search = self._config.tracking.lost.half_m + 2 * self._config.scan.cell_m
         return build_field(cloud, self._config.scan.cell_m, settings.reach_m, settings.field_sigma_m, search)
 

@@ -15,13 +15,15 @@ from hybridmap.metrics import StageClock
 from hybridmap.vision.base import Belief, Doubted, Proposal, Verdict
 from hybridmap.vision.gating import GATE_FIELDS, nodes_within
 from hybridmap.vision.profile import Profile
+from hybridmap.vision.relocalising import Relocaliser
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp import Verification, Verifier
-from hybridmap.vision.rgbd.relocalising import Relocaliser
 from hybridmap.vision.rgbd.revisits import Revisits
 from hybridmap.vision.rgbd.second_look import SecondLook
 from hybridmap.vision.rgbd.support import Hypothesis, Support
+from hybridmap.vision.rgbd.whole_map import WholeMap, chain_of
 from hybridmap.vision.templates import MODERATE_THRESHOLD, Matcher
+from hybridmap.vision.whereabouts import Whereabouts
 
 Indices = NDArray[np.int64]
 RANKED = 6
@@ -55,7 +57,9 @@ class LoopCloser:
         self._matcher = Matcher(
             config.matching, matching.mu_r, matching.mu_d, matching.max_shift, matching.g_bar, matching.sequence
         )
-        self._relocaliser = Relocaliser(keyframes, self._matcher, verifier, relocalising, new_key)
+        whereabouts = Whereabouts(relocalising.unrecognised_nodes, relocalising.doubt_nodes)
+        self._relocaliser = Relocaliser(relocalising, whereabouts, new_key, "too few others put the robot there")
+        self._whole_map = WholeMap(keyframes, self._matcher, verifier, relocalising, new_key)
         self._relocalising = relocalising
         unverified = config.verify == "none"
         self._c_t = matching.c_t if matching.c_t is not None or not unverified else MODERATE_THRESHOLD[config.matching]
@@ -104,7 +108,7 @@ class LoopCloser:
 
     def tracked(self, node: int, steps: list[Proposal]) -> None:
         """Take notice of how a new node was registered to the ones before it."""
-        self._relocaliser.tracked(node, steps)
+        self._relocaliser.tracked(node, chain_of(steps, self._relocalising), steps)
 
     def note(self, node: int) -> dict[str, Array]:
         """What the map file keeps of the newest node's search: `gate` (see `GATE_FIELDS`), `ranked` (n, 3): node, G, shift."""
@@ -123,13 +127,13 @@ class LoopCloser:
             return []
         self._note["gate"][GATE_FIELDS.index("whole_map")] = 1.0
         old = np.flatnonzero(belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s)
-        found = self._relocaliser.search(node, np.setdiff1d(old, gated).astype(np.int64), belief)
-        closures = {(p.source, p.target) for p in found if p.kind == "loop" and p.verdict is Verdict.ACCEPTED}
-        if closures:
-            for source, target in closures:
-                self._support.join(source, target)
+        seen = self._whole_map.search(node, np.setdiff1d(old, gated).astype(np.int64))
+        found = self._relocaliser.settle(seen, belief)
+        if found.friends:
+            for sighting in found.friends:
+                self._support.join(sighting.source, sighting.target)
             self._travel_at_closure = float(belief.travel_m[node])
-        return found
+        return found.proposals
 
     def finish(self, belief: Belief) -> list[Proposal]:
         """Try pairs that the optimised map puts side by side and that are not joined yet; then settle everything."""
@@ -142,7 +146,7 @@ class LoopCloser:
                     near = self._nearest(node, self._closing.repropose_per_node, belief)
                     placed = first_break is None or node < first_break
                     out += self._try_again(node, near, belief, near if placed else ())
-        out += self._relocaliser.dismiss("too few others put the robot there")
+        out += self._relocaliser.dismiss()
         return [*out, *self._support.give_up(before=len(self._keyframes))]
 
     def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Proposal]:

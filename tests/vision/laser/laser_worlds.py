@@ -6,10 +6,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from hybridmap.geometry import between, compose
-from hybridmap.streams.base import Laser
+from hybridmap.config.vision import VisionConfig
+from hybridmap.geometry import IDENTITY, RelativePose, between, compose
+from hybridmap.streams.base import Laser, LaserScan
+from hybridmap.vision.base import Belief
+from hybridmap.vision.laser.front_end import LaserFrontEnd
 
 LASER = Laser(np.deg2rad(np.arange(-135.0, 136.0, 1.0)), 0.05, 30.0, np.array([0.1, 0.0, 0.0]))
+SIGMAS = np.array([0.03, 0.03, np.deg2rad(0.5)])
 
 
 def box(x0, y0, x1, y1):
@@ -90,3 +94,49 @@ def drifting(poses, rng, bias_deg_per_m=1.0, noise_deg=0.05, gain=1.01):
         step[2] += np.deg2rad(bias_deg_per_m) * np.hypot(step[0], step[1]) + rng.normal(0.0, np.deg2rad(noise_deg))
         out.append(compose(out[-1], step))
     return np.array(out)
+
+
+class Run:
+    """A drive through a world; the belief is the chain itself: proposals need no solver."""
+
+    def __init__(self, world, truth, odometry, every=5, config=None, seed=0):
+        rng = np.random.default_rng(seed)
+        self.front_end = LaserFrontEnd(config or VisionConfig(), LASER, 0)
+        self.proposals, self.poses, self.travel, last = [], [IDENTITY], [0.0], 0
+        self.truth, self.node_at = truth, []
+        for i, pose in enumerate(truth):
+            motion = between(odometry[last], odometry[i])
+            scan = LaserScan(1_000_000_000 + i * 100_000_000, cast(world, pose, rng))
+            view = self.front_end.observe(scan, motion)
+            if i % every:
+                continue
+            node = len(self.node_at)
+            self.node_at.append(i)
+            self.front_end.add_node(node, view)
+            relative = RelativePose(motion, np.diag(SIGMAS**2)) if node else None
+            tracked = self.front_end.track(node, relative)
+            if node:
+                step = tracked[0].relative if tracked and tracked[0].relative else relative
+                self.poses.append(compose(self.poses[-1], step.delta))
+                self.travel.append(self.travel[-1] + np.hypot(*step.delta[:2]))
+            self.proposals += tracked + self.front_end.close(node, self.belief())
+            last = i
+
+    def belief(self, poses=None):
+        travel = np.array(self.travel)
+
+        def covariance_from(node):
+            way = np.abs(travel - travel[node])
+            sigma_rad = np.deg2rad(0.11) * np.sqrt(way)
+            sigma_m = 0.005 * np.sqrt(way) + sigma_rad * way / 2
+            return np.stack([np.diag([s**2, s**2, r**2]) for s, r in zip(sigma_m, sigma_rad, strict=True)])
+
+        return Belief(np.array(self.poses) if poses is None else poses, np.zeros(len(travel)), travel, covariance_from)
+
+    def loops(self, verdict):
+        final = {p.key: p for p in self.proposals if p.kind == "loop"}
+        return [p for p in final.values() if p.verdict is verdict]
+
+    def error(self, proposal):
+        a, b = self.truth[self.node_at[proposal.source]], self.truth[self.node_at[proposal.target]]
+        return between(between(a, b), proposal.relative.delta)

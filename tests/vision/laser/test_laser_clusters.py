@@ -23,9 +23,13 @@ def hypothesis(probe, anchor, where=(2.0, 5.0, 0.3), quality=0.7, sigma_m=5.0):
     return Hypothesis(probe, anchor, relative, quality, sigma_m, {}, "")
 
 
+def moved(a, b, poses):
+    return between(poses[a], poses[b])
+
+
 @pytest.fixture
 def commitment():
-    return Commitment(CommitmentConfig(), TRAVEL.__getitem__, CHAIN.__getitem__)
+    return Commitment(CommitmentConfig(), TRAVEL.__getitem__, moved)
 
 
 def test_waits_until_enough_probes_over_enough_travel_agree(commitment):
@@ -43,7 +47,7 @@ def test_waits_until_enough_probes_over_enough_travel_agree(commitment):
 
 def test_a_wider_gate_asks_for_more_travel():
     def travel_needed(sigma_m):
-        commitment = Commitment(CommitmentConfig(), TRAVEL.__getitem__, CHAIN.__getitem__)
+        commitment = Commitment(CommitmentConfig(), TRAVEL.__getitem__, moved)
         for key, probe in enumerate(range(200, 240, 2)):
             commitment.add(key, hypothesis(probe, 20, sigma_m=sigma_m))
             if commitment.settle(TRAVEL[probe], BELIEF):

@@ -16,11 +16,11 @@ from hybridmap.graph.experience_map import Status
 from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import Rig
-from hybridmap.vision.base import Belief, Proposal, Verdict
+from hybridmap.vision.base import Proposal, Verdict
 from hybridmap.vision.rgbd.pnp import Verification
-from hybridmap.vision.rgbd.relocalising import Relocaliser
+from hybridmap.vision.rgbd.whole_map import WholeMap, chain_of
 from hybridmap.vision.templates import Matcher
-from hybridmap.vision.whereabouts import Whereabouts
+from hybridmap.vision.whereabouts import Chain
 
 VIEW = camera(width=240)
 PER_LAP, UP, DOWN = 16, 19, 28
@@ -112,7 +112,7 @@ def test_a_view_of_nothing_is_no_carry(carried):
 
 
 class FakeVerifier:
-    """Says of a pair what it was told; the profiles' first value is the node."""
+    """Says of a pair what it was told."""
 
     def __init__(self, found):
         self.found = found
@@ -123,113 +123,39 @@ class FakeVerifier:
         return Verification(relative, "" if delta is None else "agrees", {"inliers": 20.0})
 
 
-def step(source, target, verdict, sigma_m=0.01):
-    return Proposal(10**6 + 100 * target + source, "registration", source, target, verdict, "", None, {"sigma_m": sigma_m})
-
-
-def sought(sightings, nodes=(40, 41, 42, 43, 44), config=None, steps=None):
-    """Proposals by key and Relocaliser after some nodes of a straight drive of 0.3 m a node whose chain broke at 40."""
+def test_the_likeliest_views_some_nodes_apart_are_verified():
     rng = np.random.default_rng(0)
-    profiles = rng.normal(size=(50, 2, 16)).astype(np.float32)
+    profiles = rng.normal(size=(31, 2, 16)).astype(np.float32)
+    profiles[30] = profiles[12] + 0.1 * profiles[20]
+    profiles[13] = profiles[12] + 0.05
     keyframes = [SimpleNamespace(profile=profile, number=i) for i, profile in enumerate(profiles)]
     matcher = Matcher("plain", 0.5, 0.5, max_shift=2)
-    keys = iter(range(10**6))
-    relocaliser = Relocaliser(
-        keyframes, matcher, FakeVerifier(sightings), config or RelocalisingConfig(candidates=40, separation=0), keys.__next__
-    )
-    x = 0.3 * np.arange(50)
-    belief = Belief(np.column_stack([x, 0 * x, 0 * x]), np.arange(50.0), x, lambda _: np.zeros((50, 3, 3)))
-    for profile in profiles[:40]:
+    for profile in profiles:
         matcher.add(profile)
-    relocaliser.tracked(40, steps if steps is not None else [step(38, 40, Verdict.REJECTED), step(39, 40, Verdict.REJECTED)])
-    proposals = {}
-    for node in nodes:
-        matcher.add(profiles[node])
-        proposals |= {p.key: p for p in relocaliser.search(node, np.arange(40), belief)}
-    return proposals, relocaliser
+    verifier = FakeVerifier({(30, 12): (0.1, 0.0, 0.0)})
+    config = RelocalisingConfig(candidates=3, separation=4)
+    found = WholeMap(keyframes, matcher, verifier, config, iter(range(99)).__next__).search(30, np.arange(25))
+    assert len(found) == 3
+    assert (found[0].target, found[0].verdict) == (12, Verdict.PENDING)
+    assert "lost" in found[0].reason
+    assert [p.verdict for p in found[1:]] == [Verdict.REJECTED] * 2
+    assert all(abs(a.target - b.target) >= 4 for a in found for b in found if a is not b)
 
 
-def test_sightings_wait_until_enough_of_them_agree():
-    true = {(40 + i, 10 + i): (0.02 * i, 0.0, 0.0) for i in range(5)}  # nodes 40.. are where 10.. are
-    proposals, relocaliser = sought({key: true[key] for key in list(true)[:3]})
-    assert [p.verdict for p in proposals.values() if p.relative is not None] == [Verdict.PENDING] * 3
-    assert relocaliser.whereabouts.lost
-    settled = relocaliser.dismiss("over")
-    assert [(p.verdict, p.reason) for p in settled] == [(Verdict.REJECTED, "over")] * 3
-    proposals, relocaliser = sought(true)
-    accepted = [p for p in proposals.values() if p.verdict is Verdict.ACCEPTED]
-    assert [p.kind for p in accepted].count("loop") >= 4
-    rehung = next(p for p in accepted if p.kind == "registration")
-    assert (rehung.source, rehung.target, rehung.contradicts_odometry) == (39, 40, True)
-    assert rehung.relative.delta == pytest.approx([-8.7, 0.0, 0.0], abs=0.1)
-    assert not relocaliser.whereabouts.lost
+def step(verdict, sigma_m=0.01):
+    return Proposal(0, "registration", 39, 40, verdict, "", None, {"sigma_m": sigma_m})
 
 
-def test_a_rival_place_keeps_it_waiting():
-    two = {(40 + i, 10 + i): (0.0, 0.0, 0.0) for i in range(5)} | {(40 + i, 25 + i): (0.0, 0.0, 0.0) for i in range(5)}
-    proposals, relocaliser = sought(two)
-    assert not [p for p in proposals.values() if p.verdict is Verdict.ACCEPTED]
-    assert relocaliser.whereabouts.lost
-    one_less = {key: value for key, value in two.items() if key not in ((41, 26), (42, 27), (43, 28), (44, 29))}
-    proposals, _ = sought(one_less)
-    contradicting = [p for p in proposals.values() if p.relative is not None and p.target == 25]
-    assert [p.verdict for p in contradicting] == [Verdict.REJECTED]
-    assert "contradicts" in contradicting[0].reason
-
-
-def test_agreement_needs_travel_and_not_only_views():
-    on_the_spot = {(40, target): (0.3 * (target - 10), 0.0, 0.0) for target in range(8, 16)}
-    proposals, _ = sought(on_the_spot, nodes=(40, 41))
-    assert not [p for p in proposals.values() if p.verdict is Verdict.ACCEPTED]
-
-
-def test_places_that_are_known_and_not_recognised_make_it_lost():
-    whereabouts = Whereabouts(RelocalisingConfig(unrecognised_nodes=3))
-    for _ in range(2):
-        whereabouts.unrecognised()
-    assert not whereabouts.lost
-    whereabouts.recognised()
-    for _ in range(3):
-        whereabouts.unrecognised()
-    assert whereabouts.lost
-    assert whereabouts.first_break is None
-    whereabouts.recognised()
-    whereabouts.tracked(7, 0.05)
-    assert not whereabouts.lost
-
-
-def test_a_break_counts_for_more_than_a_doubt():
-    whereabouts = Whereabouts(RelocalisingConfig(doubtful_m=0.1))
-    for node, sigma_m in ((8, 0.3), (9, None), (10, 0.02), (12, 0.2)):
-        whereabouts.tracked(node, sigma_m)
-    assert whereabouts.lost
-    assert whereabouts.first_break == 8
-    assert [whereabouts.break_before(node) for node in (7, 8, 9, 11, 20)] == [None, 8, 9, 9, 9]
-    whereabouts.recognised()
-    assert whereabouts.break_before(20) is None
-
-
-def test_a_doubt_is_forgotten_and_a_break_is_not():
-    whereabouts = Whereabouts(RelocalisingConfig(doubtful_m=0.1, doubt_nodes=5))
-    whereabouts.tracked(3, 0.3)
-    for node in range(4, 9):
-        whereabouts.tracked(node, 0.01)
-        assert whereabouts.lost
-    whereabouts.tracked(9, 0.01)
-    assert not whereabouts.lost
-    whereabouts.tracked(10, None)
-    whereabouts.tracked(100, 0.01)
-    assert whereabouts.break_before(100) == 10
-
-
-def test_registrations_across_the_break_are_taken_back():
-    """One wall fits any other: the view at 40 fits, but slides, and 41 fits 39 as well."""
-    true = {(40 + i, 10 + i): (0.0, 0.0, 0.0) for i in range(5)}
-    believed = [step(39, 40, Verdict.ACCEPTED, 0.3), step(38, 40, Verdict.ACCEPTED, 0.4)]
-    proposals, relocaliser = sought(true, steps=believed)
-    taken_back = [p for p in proposals.values() if p.kind == "registration" and p.verdict is Verdict.REJECTED]
-    assert [(p.key, p.source, p.target) for p in taken_back] == [(p.key, p.source, 40) for p in believed]
-    assert all("carried between nodes 39 and 40" in p.reason for p in taken_back)
-    assert not relocaliser.whereabouts.lost
-    held = [step(39, 40, Verdict.ACCEPTED, 0.3), step(38, 40, Verdict.ACCEPTED, 0.01)]
-    assert not [p for p in sought(true, steps=held)[0].values() if p.kind == "registration"]
+@pytest.mark.parametrize(
+    ("steps", "chain"),
+    [
+        ([], Chain.HOLDS),
+        ([step(Verdict.REJECTED), step(Verdict.REJECTED)], Chain.BROKEN),
+        ([step(Verdict.REJECTED), step(Verdict.ACCEPTED)], Chain.HOLDS),
+        ([step(Verdict.ACCEPTED, 0.3), step(Verdict.ACCEPTED, 0.4)], Chain.DOUBTFUL),
+        ([step(Verdict.ACCEPTED, 0.3), step(Verdict.ACCEPTED, 0.02)], Chain.HOLDS),
+    ],
+)
+def test_one_wall_fits_any_other(steps, chain):
+    assert chain_of(steps, RelocalisingConfig(doubtful_m=0.1)) is chain
+    assert chain_of(steps, RelocalisingConfig(candidates=0)) is Chain.HOLDS

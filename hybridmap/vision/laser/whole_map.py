@@ -1,0 +1,164 @@
+"""A laser robot that was carried away is looked for on the whole map."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hybridmap.config.laser import LaserConfig
+from hybridmap.vision.base import Belief, Proposal, Verdict
+from hybridmap.vision.laser.continuity import RECENT_M, Continuity
+from hybridmap.vision.laser.hypotheses import Hypothesis, Prober
+from hybridmap.vision.laser.submap import Atlas
+from hybridmap.vision.profile import Profile
+from hybridmap.vision.relocalising import Relocaliser, Settlement
+from hybridmap.vision.templates import Matcher
+from hybridmap.vision.whereabouts import Chain, Whereabouts
+
+MISFIT_STEPS = 10
+"""Steps for which the usual misfit of scans is taken before any was seen."""
+GATED = ("gate_sigma_m", "off_m", "off_deg")
+"""Figures of a hypothesis that mean nothing where there is no gate."""
+
+
+class WholeMap:
+    """Whether a laser robot is lost, and the search for it. The newer node is the source of an edge.
+
+    Where the chain breaks a new piece of the atlas begins. Its scans are held against all submaps of before, and what fits
+    is a sighting, until enough of them agree (`Relocaliser`).
+    """
+
+    def __init__(
+        self,
+        config: LaserConfig,
+        atlas: Atlas,
+        prober: Prober,
+        continuity: Continuity,
+        profiles: Sequence[Profile],
+        new_key: Callable[[], int],
+    ) -> None:
+        self._config = config
+        self._atlas = atlas
+        self._prober = prober
+        self._profiles = profiles
+        self._new_key = new_key
+        self._continuity = continuity
+        self._whereabouts = Whereabouts(config.relocalising.unrecognised_probes)
+        given_up = "too few other submaps put the robot there"
+        self._relocaliser = Relocaliser(config.relocalising, self._whereabouts, new_key, given_up)
+        self._views = Matcher("plain", 0.5, 0.5, config.scan.profile_width // 4)
+        self._misfits, self._steps = MISFIT_STEPS * config.relocalising.misfit, MISFIT_STEPS
+        self._broken_at: int | None = None
+        self._lost_m, self._searched_m = 0.0, -np.inf
+
+    @property
+    def since(self) -> int:
+        """The first node of the piece of map that the robot surely is on: 0, or where the chain broke."""
+        return self._broken_at or 0
+
+    def tracked(self, registration: Proposal, why: str) -> Proposal:
+        """Take notice of how the newest node of the atlas was registered; a new piece begins with it if the chain broke.
+
+        Args:
+            registration: of the newest node to those before it.
+            why: why the robot cannot have driven there; empty where the chain holds.
+
+        Returns:
+            The registration with the reason.
+        """
+        node = registration.target
+        if why:
+            self._atlas.part(node)
+            self._broken_at = node
+            self._lost_m, self._searched_m = self._atlas.travel_m[node], -np.inf
+            registration = replace(registration, reason=f"{registration.reason}; may have been carried: {why}")
+        else:
+            self._misfits, self._steps = self._misfits + 1.0 - registration.scores["fit"], self._steps + 1
+        self._relocaliser.tracked(node, Chain.BROKEN if why else Chain.HOLDS, [registration])
+        return registration
+
+    def probed(self, node: int, hypotheses: Sequence[Hypothesis], belief: Belief) -> None:
+        """Keep account of whether the robot recognises what it should, by what a probe inside the gate found.
+
+        A bare corridor fits, if anywhere along itself: that says neither.
+        """
+        c = self._config.probes
+        if self._broken_at is not None:
+            return
+        if any(not h.refusal for h in hypotheses):
+            self._whereabouts.recognised()
+        elif any(h.scores["near"] >= c.near_min and h.scores["fit"] >= c.fit_min for h in hypotheses):
+            return
+        elif self._continuity.contradicted(node, belief):
+            if not self._whereabouts.lost:
+                self._lost_m = self._atlas.travel_m[node] - self._config.relocalising.from_m
+            self._whereabouts.unrecognised()
+
+    def closed(self) -> list[Proposal]:
+        """Loops inside the gate have entered the map: the robot is where the map has it, if it is on that piece of it."""
+        if self._broken_at is not None:
+            return []
+        self._whereabouts.recognised()
+        return self._relocaliser.dismiss("the robot is where the map had it")
+
+    def finish(self) -> list[Proposal]:
+        """The drive is over: sightings that still wait are refused."""
+        return self._relocaliser.dismiss()
+
+    def search(self, node: int, belief: Belief) -> Settlement:
+        """While the robot is lost, hold its last metres against the whole map; now and then, once that has been in vain."""
+        if not self._whereabouts.lost or not self._due(node):
+            return Settlement([])
+        self._searched_m = self._atlas.travel_m[node]
+        broken = self._broken_at is not None
+        recent = self._atlas.along(node, self._config.probes.length_m if broken else RECENT_M, 0.0)
+        anchors = self._prober.anchors_before(self.since if broken else int(recent[0]))
+        found = self._prober.probe_anywhere(self._atlas.submap(node, recent), self._likeliest(node, anchors))
+        settlement = self._relocaliser.settle([self._sighting(h) for h in found], belief)
+        return self._found(settlement, belief) if settlement.friends else settlement
+
+    def _due(self, node: int) -> bool:
+        """Whether the whole map is to be searched: at each node soon after it got lost, then as often as it is probed."""
+        c, travel_m = self._config.relocalising, self._atlas.travel_m[node]
+        if travel_m - self._lost_m <= c.often_m:
+            return travel_m - self._lost_m >= c.from_m
+        return travel_m - self._searched_m >= self._config.probes.every_m
+
+    def _likeliest(self, node: int, anchors: list[int]) -> list[int]:
+        """All anchors if they are few; else those about the nodes whose views are most like the robot's."""
+        most = self._config.relocalising.submaps
+        if len(anchors) <= most:
+            return anchors
+        for profile in self._profiles[len(self._views.store) :]:
+            self._views.add(profile)
+        stop = anchors[-1] + 1
+        ranked = self._views.best(self._profiles[node], stop, np.arange(stop)).indices
+        nearest = np.searchsorted(np.array(anchors), ranked)
+        likeliest = list(dict.fromkeys(nearest.tolist()))[:most]
+        return [anchors[i] for i in sorted(likeliest)]
+
+    def _sighting(self, h: Hypothesis) -> Proposal:
+        scores = {name: value for name, value in h.scores.items() if name not in GATED} | {"whole_map": 1.0}
+        verdict, reason = Verdict.REJECTED, h.refusal
+        if not h.refusal:
+            misfit = self._misfits / self._steps
+            worse = max(1.0, self._config.relocalising.misfit / misfit)
+            scores["mismatch"] = worse * (1.0 - scores["fit"] + scores["violation"])
+            verdict, reason = Verdict.PENDING, "lost: waits for other submaps that put the robot there"
+        return Proposal(self._new_key(), "loop", h.probe, h.anchor, verdict, reason, h.relative, scores)
+
+    def _found(self, settlement: Settlement, belief: Belief) -> Settlement:
+        """The robot knows where it is; where nothing had shown when it was carried, find that out."""
+        broken_at, self._broken_at = self._broken_at, None
+        if broken_at is not None:
+            if settlement.carried_to is None:
+                self._atlas.join(broken_at)
+            return settlement
+        carried_to = self._continuity.carried_unnoticed(settlement.friends, belief)
+        if carried_to is None:
+            return settlement
+        self._atlas.part(carried_to)
+        rehung = self._relocaliser.rehang(carried_to, settlement.friends, belief)
+        return Settlement(settlement.proposals + rehung, settlement.friends, carried_to)

@@ -1,0 +1,180 @@
+"""A lost robot is told where it is once several of its sightings on the whole map say the same."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.config.agreement import AgreementConfig
+from hybridmap.geometry import Array, RelativePose, between, compose, inverse
+from hybridmap.vision.base import Belief, Proposal, Verdict
+from hybridmap.vision.whereabouts import Chain, Whereabouts
+
+Indices = NDArray[np.int64]
+
+REHUNG_M, REHUNG_RAD = 0.5, float(np.deg2rad(10.0))
+"""Standard deviations of the edge in the place of the broken one: it holds the chain together, the closures place it."""
+WHERE_IT_WAS = 2.0
+"""A robot that is found within so many of these deviations of where the chain has it was not carried."""
+KEPT_STEPS = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Settlement:
+    """What came of the sightings.
+
+    Attributes:
+        proposals: those that changed, and what happens to the chain.
+        friends: the sightings that entered the map; empty while the robot is not found.
+        carried_to: the node to which the robot was carried; None where it is not found, or was not carried.
+    """
+
+    proposals: list[Proposal]
+    friends: tuple[Proposal, ...] = ()
+    carried_to: int | None = None
+
+
+class Relocaliser:
+    """Keeps the sightings of a lost robot. The newer node is the source of an edge.
+
+    Sightings wait until `support` of them, of distinct nodes over `span_m` of travel, put the robot at one and the same pose,
+    and those that contradict them count for less than half as much. Then all of them enter the map together, and the odometry
+    edge at which the chain broke gives way to one that leads to where they have it; registrations across the break are taken
+    back. A sighting may say how badly it fits (its score `mismatch`, 0 for perfectly): the worse those that agree best, the
+    more travel is needed, and of one node's sightings the worse count less.
+    """
+
+    def __init__(self, config: AgreementConfig, whereabouts: Whereabouts, new_key: Callable[[], int], given_up: str) -> None:
+        """Start without a sighting; `given_up` is the reason of those that find no others to agree with."""
+        self.whereabouts = whereabouts
+        self._given_up = given_up
+        self._config = config
+        self._new_key = new_key
+        self._waiting: list[Proposal] = []
+        self._steps: deque[Proposal] = deque(maxlen=KEPT_STEPS)
+
+    def tracked(self, node: int, chain: Chain, steps: list[Proposal]) -> None:
+        """Take notice of how a new node was registered to the ones before it."""
+        self.whereabouts.tracked(node, chain)
+        self._steps += [step for step in steps if step.verdict is Verdict.ACCEPTED]
+
+    def settle(self, found: list[Proposal], belief: Belief) -> Settlement:
+        """Let new sightings wait, and accept the largest set of them that agree if it is good enough.
+
+        Args:
+            found: what was looked at, in any state; those that are pending are sightings.
+            belief: the map's; poses on either side of the break are right among themselves.
+        """
+        self._waiting += [p for p in found if p.verdict is Verdict.PENDING]
+        out = found + self._expired(belief)
+        if not self._waiting:
+            return Settlement(out)
+        agree, weights = self._agreement(belief), self._weights()
+        chosen = np.flatnonzero(agree[int(np.argmax(agree @ weights))])
+        if not self._enough(chosen, weights, belief):
+            return Settlement(out)
+        reason = f"lost; {len(chosen)} closures put the robot there"
+        friends = tuple(replace(self._waiting[i], verdict=Verdict.ACCEPTED, reason=reason) for i in chosen.tolist())
+        self._waiting = [s for i, s in enumerate(self._waiting) if i not in set(chosen.tolist())]
+        out += [*friends, *self.dismiss("contradicts the closures that put the robot elsewhere")]
+        broken_at = self.whereabouts.break_before(min(s.source for s in friends))
+        self.whereabouts.recognised()
+        carried_to = broken_at if broken_at is not None and self._carried(broken_at, friends, belief) else None
+        return Settlement(
+            out + (self.rehang(carried_to, friends, belief) if carried_to is not None else []), friends, carried_to
+        )
+
+    def dismiss(self, reason: str | None = None) -> list[Proposal]:
+        """Refuse all sightings that wait; without a reason they are given up."""
+        out = [replace(s, verdict=Verdict.REJECTED, reason=reason or self._given_up) for s in self._waiting]
+        self._waiting = []
+        return out
+
+    def rehang(self, broken_at: int, friends: tuple[Proposal, ...], belief: Belief) -> list[Proposal]:
+        """Take back what was registered across a break, and hang the node behind it where its sightings have it."""
+        crossing = [step for step in self._steps if step.source < broken_at <= step.target]
+        reason = f"the robot was carried between nodes {broken_at - 1} and {broken_at}; before that was known: "
+        return [
+            *(
+                replace(step, verdict=Verdict.REJECTED, reason=reason + step.reason, contradicts_odometry=False)
+                for step in crossing
+            ),
+            self._rehung(broken_at, friends, belief),
+        ]
+
+    def _expired(self, belief: Belief) -> list[Proposal]:
+        """Refuse sightings that have waited too long."""
+        oldest_m = float(belief.travel_m[-1]) - self._config.wait_m
+        old = [s for s in self._waiting if belief.travel_m[s.source] < oldest_m]
+        self._waiting = [s for s in self._waiting if belief.travel_m[s.source] >= oldest_m]
+        return [replace(s, verdict=Verdict.REJECTED, reason=self._given_up) for s in old]
+
+    def _agreement(self, belief: Belief) -> NDArray[np.bool_]:
+        """(n, n) which sightings put the robot at the same pose, each carried along the chain to the newest node."""
+        poses, sources = belief.poses_map_node, self._sources()
+        newest = int(sources.max())
+        placed = np.array([_placed(s, newest, poses) for s in self._waiting])
+        apart = between(placed[:, None], placed[None])
+        travelled = np.abs(belief.travel_m[sources][:, None] - belief.travel_m[sources][None])
+        near = np.hypot(apart[..., 0], apart[..., 1]) <= self._config.agree_m + 0.05 * travelled
+        return np.asarray(near & (np.degrees(np.abs(apart[..., 2])) <= self._config.agree_deg + travelled))
+
+    def _weights(self) -> Array:
+        """(n,) 1 for each node's best sighting, less for those of the same node that fit worse."""
+        sources, mismatch = self._sources(), self._mismatch()
+        best = np.array([mismatch[sources == source].min() for source in sources])
+        return np.asarray(np.exp((best - mismatch) / self._config.mismatch_scale))
+
+    def _enough(self, chosen: Indices, weights: Array, belief: Belief) -> bool:
+        """Whether the chosen ones, or the best fitting of them, cover enough travel, and hardly any contradict them."""
+        if 2.0 * (weights.sum() - weights[chosen].sum()) >= weights[chosen].sum():
+            return False
+        mismatch = self._mismatch()[chosen]
+        order = np.argsort(mismatch, kind="stable")
+        sources, worst = self._sources()[chosen[order]], self._config.mismatch_max
+        for count in range(self._config.support, len(chosen) + 1):
+            fits = 1.0 - float(mismatch[order[:count]].mean()) / worst
+            seen = np.unique(sources[:count])
+            span_m = float(belief.travel_m[seen[-1]] - belief.travel_m[seen[0]])
+            if fits > 0.0 and len(seen) >= self._config.support and span_m * fits >= self._config.span_m:
+                return True
+        return False
+
+    def _carried(self, broken_at: int, friends: tuple[Proposal, ...], belief: Belief) -> bool:
+        off = between(belief.poses_map_node[broken_at], placed_by(friends, broken_at, belief.poses_map_node))
+        return bool(np.hypot(off[0], off[1]) > WHERE_IT_WAS * REHUNG_M or abs(off[2]) > WHERE_IT_WAS * REHUNG_RAD)
+
+    def _rehung(self, broken_at: int, friends: tuple[Proposal, ...], belief: Belief) -> Proposal:
+        """The edge into the node at which the chain broke, by way of the closures; it contradicts the odometry beside it."""
+        poses = belief.poses_map_node
+        middle = placed_by(friends, broken_at, poses)
+        relative = RelativePose(between(poses[broken_at - 1], middle), np.diag([REHUNG_M, REHUNG_M, REHUNG_RAD]) ** 2)
+        moved_m = float(np.hypot(*(middle - poses[broken_at])[:2]))
+        reason = f"carried: {len(friends)} closures put the robot {moved_m:.1f} m from where the odometry has it"
+        scores = {"closures": float(len(friends)), "carried_m": moved_m}
+        return Proposal(
+            self._new_key(), "registration", broken_at - 1, broken_at, Verdict.ACCEPTED, reason, relative, scores, True
+        )
+
+    def _sources(self) -> Indices:
+        return np.array([s.source for s in self._waiting], dtype=np.int64)
+
+    def _mismatch(self) -> Array:
+        return np.array([s.scores.get("mismatch", 0.0) for s in self._waiting])
+
+
+def placed_by(sightings: Sequence[Proposal], at: int, poses: Array) -> Array:
+    """Pose (3,) on the map of a node, by the sighting that lies most amid the others."""
+    placed = np.array([_placed(s, at, poses) for s in sightings])
+    return np.asarray(placed[int(np.argmin(np.abs(placed[:, None, :2] - placed[None, :, :2]).sum(axis=(1, 2))))])
+
+
+def _placed(sighting: Proposal, at: int, poses: Array) -> Array:
+    """Pose (3,) on the map of a node of the new piece of chain, as one sighting has it."""
+    assert sighting.relative is not None
+    seen = compose(poses[sighting.target], inverse(sighting.relative.delta))
+    return compose(seen, between(poses[sighting.source], poses[at]))

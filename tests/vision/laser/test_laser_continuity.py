@@ -1,0 +1,135 @@
+"""What shows that a laser robot was carried, and what does not."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from laser_worlds import LASER, box, cast, ring, ring_drive, room
+
+from hybridmap.config.laser import LaserConfig, LaserRelocalisingConfig, ScanConfig
+from hybridmap.geometry import IDENTITY, RelativePose, between, compose
+from hybridmap.streams.base import LaserScan
+from hybridmap.vision.base import Belief, Proposal, Verdict
+from hybridmap.vision.laser.cloud import cloud_of_scan
+from hybridmap.vision.laser.continuity import Continuity
+from hybridmap.vision.laser.submap import Atlas
+from hybridmap.vision.laser.tracking import Tracker
+
+SURE = np.diag([0.05, 0.05, np.deg2rad(1.0)]) ** 2
+OTHER_ROOM = np.array([(-30.0, 9.0, 30.0, 9.0), (-20.0, 9.0, 5.0, -30.0)])
+
+
+class Chain:
+    """An atlas of scans that were taken at some poses and believed to be at others, as the map has them."""
+
+    def __init__(self, taken, believed, world, config=None):
+        rng = np.random.default_rng(4)
+        config = config or LaserConfig()
+        self.atlas, self.poses = Atlas(config), np.asarray(believed, float)
+        for at, pose in zip(taken, self.poses, strict=True):
+            self.add(cast(world, at, rng), pose)
+        self.continuity = Continuity(config, self.atlas, LASER, Tracker(config, self.atlas))
+
+    def add(self, ranges, pose):
+        self.atlas.add(cloud_of_scan(ranges, LASER, ScanConfig()), ranges, pose, np.zeros((3, 3)))
+
+    def belief(self, sigma_m=0.05):
+        n = len(self.poses)
+        covariance = np.tile(np.diag([0.5 * sigma_m**2, 0.5 * sigma_m**2, 1e-4]), (n, 1, 1))
+        return Belief(self.poses, np.arange(n, dtype=float), np.array(self.atlas.travel_m), lambda _: covariance)
+
+
+def stepped(worlds, step, odometry, measured=True, config=None):
+    """What is said of a step of 0.4 m straight on, which began in the room, as its scans in a row see these worlds."""
+    rng, along = np.random.default_rng(5), np.linspace(0.0, 1.0, len(worlds) + 1)[1:, None]
+    start, way, wheels = np.array([-1.5, 0.0, 0.0]), along * [0.4, 0.0, 0.0], along * odometry
+    scans = [LaserScan(i, cast(world, compose(start, at), rng)) for i, (world, at) in enumerate(zip(worlds, way, strict=True))]
+    chain = Chain([start], [IDENTITY], room(), config)
+    chain.add(scans[-1].ranges_m, compose(IDENTITY, step))
+    judged = SimpleNamespace(relative=RelativePose(np.asarray(step, float), SURE), measured=measured)
+    on_the_way = list(zip(wheels[:-1], scans[:-1], strict=True))
+    return chain.continuity.broken(1, judged, RelativePose(np.asarray(odometry, float), SURE), on_the_way)
+
+
+TURNED = [0.4, 0.0, np.deg2rad(20.0)]
+STRAIGHT = [0.4, 0.0, 0.0]
+
+
+def test_a_drop_out_of_the_wheels_is_no_carry():
+    assert stepped([room()] * 4, STRAIGHT, TURNED) == ""
+    assert stepped([room()] * 4, STRAIGHT, [1.6, 0.0, 0.0]) == ""
+
+
+@pytest.mark.parametrize("seen_before", [0, 2, 4])
+def test_another_room_is_a_carry_where_it_fits_nowhere_or_contradicts_the_wheels(seen_before):
+    worlds = [room()] * seen_before + [OTHER_ROOM] * (5 - seen_before)
+    assert "fits nowhere near, free space violated" in stepped(worlds, STRAIGHT, STRAIGHT, measured=False)
+    assert "20 sigma from the odometry, free space" in stepped(worlds, TURNED, STRAIGHT)
+
+
+def test_wheels_and_scans_that_agree_are_believed():
+    assert stepped([OTHER_ROOM], STRAIGHT, STRAIGHT) == ""
+
+
+def test_people_who_step_into_view_while_the_wheels_drop_out_are_no_carry():
+    """The scans of the two nodes look through each other's walls, but each follows on the one before it."""
+    crowd = [np.concatenate([room(), box(0.2, -width, 0.5, width)]) for width in np.arange(0.1, 2.1, 0.1)]
+    assert stepped(crowd, STRAIGHT, TURNED) == ""
+    assert "free space" in stepped(crowd[-1:], STRAIGHT, TURNED)
+
+
+def test_it_can_be_switched_off():
+    config = LaserConfig(relocalising=LaserRelocalisingConfig(violation=1.0))
+    assert stepped([OTHER_ROOM], STRAIGHT, STRAIGHT, measured=False, config=config) == ""
+
+
+LAP, DOWN, PER_LAP, AFTER = ring_drive(2.1)[::5], 124, 108, 12
+"""Nodes of two laps of the ring; from the second lap on they are known. At node 124 the robot is carried, and drives on."""
+
+
+def carried(onward):
+    """The robot goes on so many nodes farther along the ring, and is believed to have driven on where it was."""
+    on = LAP[DOWN + onward : DOWN + onward + AFTER]
+    return Chain(np.concatenate([LAP[:DOWN], on]), np.concatenate([LAP[:DOWN], compose(LAP[DOWN], between(on[0], on))]), ring())
+
+
+@pytest.fixture(scope="module")
+def driven():
+    return Chain(LAP[: DOWN + AFTER], LAP[: DOWN + AFTER], ring())
+
+
+def test_a_map_that_shows_walls_where_the_robot_looks_through_contradicts(driven):
+    last, chain = DOWN + AFTER - 1, carried(66)
+    assert chain.continuity.contradicted(last, chain.belief())
+    assert not chain.continuity.contradicted(last, chain.belief(sigma_m=0.5))
+    assert not driven.continuity.contradicted(last, driven.belief())
+
+
+def test_in_a_place_that_was_never_seen_nothing_contradicts():
+    first_lap = Chain(LAP[:60], LAP[:60], ring())
+    assert not first_lap.continuity.contradicted(59, first_lap.belief())
+
+
+def sightings(onward):
+    """Loops from the last four nodes to old ones of the first lap, where they would be if the robot had been carried."""
+    out = []
+    for node in range(DOWN + AFTER - 4, DOWN + AFTER):
+        there = LAP[node + onward]
+        old = int(np.argmin(np.hypot(*(LAP[:PER_LAP] - there)[:, :2].T)))
+        out.append(Proposal(node, "loop", node, old, Verdict.ACCEPTED, "", RelativePose(between(there, LAP[old]), SURE), {}))
+    return out
+
+
+@pytest.mark.parametrize("onward", [10, 40, 66])
+def test_where_nothing_showed_the_carry_the_old_map_tells_when_it_was(onward):
+    chain = carried(onward)
+    assert chain.continuity.carried_unnoticed(sightings(onward), chain.belief()) == DOWN
+
+
+def test_a_chain_that_may_have_drifted_so_far_was_not_carried():
+    chain = carried(10)
+    assert chain.continuity.carried_unnoticed(sightings(10), chain.belief(sigma_m=0.5)) is None
+
+
+def test_a_chain_that_fits_the_map_as_it_is_was_not_carried(driven):
+    assert driven.continuity.carried_unnoticed(sightings(40), driven.belief()) is None
