@@ -21,13 +21,11 @@ from hybridmap.vision.rgbd.pnp import Verification, Verifier
 from hybridmap.vision.rgbd.revisits import Revisits
 from hybridmap.vision.rgbd.second_look import SecondLook
 from hybridmap.vision.rgbd.support import Hypothesis, Support
-from hybridmap.vision.rgbd.whole_map import WholeMap, chain_of
+from hybridmap.vision.rgbd.whole_map import RANKED, WholeMap, chain_of
 from hybridmap.vision.templates import MODERATE_THRESHOLD, Matcher
 from hybridmap.vision.whereabouts import Whereabouts
 
 Indices = NDArray[np.int64]
-RANKED = 6
-"""Profiles ranked for each candidate that is verified: the best of one place lie next to each other."""
 DEFAULT_RELOCALISING = RelocalisingConfig()
 SURE = 4.0
 """While driving, depth alone is trusted only where the map's own uncertainty is below this many `repropose_sigma`."""

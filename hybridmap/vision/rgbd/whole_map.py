@@ -18,7 +18,7 @@ from hybridmap.vision.whereabouts import Chain
 Indices = NDArray[np.int64]
 
 RANKED = 6
-"""Profiles ranked for each candidate that is verified."""
+"""Profiles ranked for each candidate that is verified: the best of one place lie next to each other."""
 
 
 class WholeMap:
