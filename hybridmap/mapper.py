@@ -166,6 +166,11 @@ class Mapper:
         return updates
 
     @property
+    def lost_since(self) -> int | None:
+        """First node from which on the robot may be elsewhere than the map has it: the chain broke there, no loop since."""
+        return self.vision.lost_since if self.vision is not None else None
+
+    @property
     def pose_map_robot(self) -> Array:
         """(3,) where the robot is, by the primary back-end."""
         return self._update(self.cells.pose_odom_robot, "").pose_map_robot

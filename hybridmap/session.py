@@ -204,6 +204,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
             *stream.report.remarks,
             *map(str, mapper.calibration.changes),
             *([str(free)] if free is not None and free.matters else []),
+            *_lost(mapper),
         ],
     }
     for key in ("graph_hash", "primary_backend"):
@@ -213,6 +214,14 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
         metrics.append(Metric("unobserved", free.sliding_m + free.blind_m, "m", str(free)))
     folder.write_metrics(head, metrics)
     return Session(folder, head, metrics)
+
+
+def _lost(mapper: Mapper) -> list[str]:
+    """That the drive ended without it being known where the robot was, if it did."""
+    if mapper.lost_since is None:
+        return []
+    rest = "lies where the odometry has it; the robot may have been carried: what it saw there follows on nothing before"
+    return [f"the map from node {mapper.lost_since} of {len(mapper.map)} on {rest}, and no loop since then says where it was"]
 
 
 def _weak(name: str, report: SolveReport) -> list[Metric]:

@@ -20,6 +20,7 @@ from hybridmap.geometry import between
 from hybridmap.graph.hashing import graph_hash
 from hybridmap.store import MapStore
 from hybridmap.trajectory import read_tum
+from hybridmap.vision.laser.front_end import LaserFrontEnd
 from tests.streams_for_tests import RoomDrive
 
 OVERRIDES = {"backends.names": ["gtsam-gnc", "relaxation-ratslam", "odometry"]}
@@ -79,6 +80,14 @@ def test_scans_between_nodes_are_put_right_on_the_final_map(finished, tmp_path):
         assert len(bare.track().anchors) == 0
     dead_reckoning = [(run.folder.trajectory / "odometry.tum").read_bytes() for run in (finished, off)]
     assert dead_reckoning[0] == dead_reckoning[1]
+
+
+def test_a_drive_that_ends_lost_says_so(tmp_path, monkeypatch):
+    lost = session.run(RoomDrive(laps=0.2), Config.load("laser", OVERRIDES), tmp_path / "known")
+    assert lost.head["remarks"] == []
+    monkeypatch.setattr(LaserFrontEnd, "lost_since", 3)
+    lost = session.run(RoomDrive(laps=0.2), Config.load("laser", OVERRIDES), tmp_path / "lost")
+    assert [remark[:24] for remark in lost.head["remarks"]] == ["the map from node 3 of 4"]
 
 
 def test_a_session_is_not_overwritten_by_chance_but_on_demand(tmp_path):

@@ -110,6 +110,10 @@ class FrontEnd(Protocol):
     def finish(self, belief: Belief) -> list[Proposal]:
         """Re-propose on the optimised map; settle what is pending."""
 
+    @property
+    def lost_since(self) -> int | None:
+        """First node from which on the robot may be elsewhere than the map has it, as its chain broke there; None: none."""
+
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
         """What the map file keeps of a node's frame: `profile`, and `ranges_m`, or `color` and `depth_mm` (compact dtypes)."""
 

@@ -42,6 +42,11 @@ class Whereabouts:
         """The first node since the last closure before which the chain broke or may have broken; None where it holds."""
         return min(self._breaks, default=None)
 
+    @property
+    def lost_since(self) -> int | None:
+        """The first node since the last closure before which the chain certainly broke; None where it did not."""
+        return min((at for at, how in self._breaks.items() if how is Chain.BROKEN), default=None)
+
     def break_before(self, node: int) -> int | None:
         """Where the chain broke, if the robot is elsewhere at a node: the last break up to it, else the last doubt."""
         before = [at for at in self._breaks if at <= node]

@@ -30,9 +30,11 @@ def test_a_break_counts_for_more_than_a_doubt():
         whereabouts.tracked(node, chain)
     assert whereabouts.lost
     assert whereabouts.first_break == 8
+    assert whereabouts.lost_since == 9
     assert [whereabouts.break_before(node) for node in (7, 8, 9, 11, 20)] == [None, 8, 9, 9, 9]
     whereabouts.recognised()
     assert whereabouts.break_before(20) is None
+    assert whereabouts.lost_since is None
 
 
 def test_a_doubt_is_forgotten_and_a_break_is_not():

@@ -151,6 +151,11 @@ class LaserFrontEnd:
         scans = [s for s in self._scans if s.node >= 0] if self._config.retrace.enabled else []
         return self._retracer.retrace(scans, np.array(self._steps), belief.poses_map_node)
 
+    @property
+    def lost_since(self) -> int | None:
+        """As `vision.base.FrontEnd`."""
+        return self._whole_map.lost_since
+
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
         """Profile and ranges of a node's scan."""
         return {"profile": self._profiles[node], "ranges_m": self._atlas.ranges[node]}

@@ -54,6 +54,11 @@ class WholeMap:
         self._lost_m, self._searched_m = 0.0, -np.inf
 
     @property
+    def lost_since(self) -> int | None:
+        """The node at which the chain broke, while the robot is not found."""
+        return self._broken_at
+
+    @property
     def since(self) -> int:
         """The first node of the piece of map that the robot surely is on: 0, or where the chain broke."""
         return self._broken_at or 0

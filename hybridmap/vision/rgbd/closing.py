@@ -108,6 +108,11 @@ class LoopCloser:
         """Take notice of how a new node was registered to the ones before it."""
         self._relocaliser.tracked(node, chain_of(steps, self._relocalising), steps)
 
+    @property
+    def lost_since(self) -> int | None:
+        """As `vision.base.FrontEnd`."""
+        return self._relocaliser.whereabouts.lost_since
+
     def note(self, node: int) -> dict[str, Array]:
         """What the map file keeps of the newest node's search: `gate` (see `GATE_FIELDS`), `ranked` (n, 3): node, G, shift."""
         return dict(self._note) if node == self._noted else {}

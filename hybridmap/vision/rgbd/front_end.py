@@ -128,6 +128,11 @@ class RgbdFrontEnd:
         """Measure again, from where their nodes lie on the map, loops that a back-end holds for false."""
         return self._closer.verify(doubted, belief)
 
+    @property
+    def lost_since(self) -> int | None:
+        """As `vision.base.FrontEnd`."""
+        return self._closer.lost_since
+
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
         """`profile` float32, `color` (H, W, 3) uint8 RGB, `depth_mm` (H, W) uint16, `T_base_camera` (4, 4) as it was then.
 

@@ -127,6 +127,7 @@ def test_in_a_place_that_it_does_not_know_it_is_not_found():
     on_top = np.array(run.poses)
     on_top[down:] = compose(on_top[0], between(on_top[down], on_top[down:]))
     at_the_end = run.front_end.finish(run.belief(on_top))
+    assert run.front_end.lost_since == down
     assert len(at_the_end) > 0
     assert [p for p in at_the_end if p.source >= down > p.target and p.verdict is not Verdict.REJECTED] == []
     assert [p for p in at_the_end if p.source >= down > p.target and "whole_map" not in p.scores] == []
@@ -142,4 +143,5 @@ def test_a_glimpse_of_something_else_is_no_carry():
     assert not [p for p in run.proposals if p.reason.startswith("carried:")]
     assert len([p for p in run.loops(Verdict.ACCEPTED) if "whole_map" in p.scores]) >= 4
     assert len(run.front_end._atlas.pieces) == 1
+    assert run.front_end.lost_since is None
     assert run.front_end._whole_map.since == 0

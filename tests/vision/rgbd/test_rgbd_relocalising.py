@@ -85,6 +85,14 @@ def test_it_is_found_again_and_the_chain_is_joined_where_it_broke(carried, found
     assert np.hypot(gap[0], gap[1]) < 0.1
     assert sum("lost" in edge.reason for edge in mapper.map.edges if edge.status is Status.ACCEPTED) >= 4
     assert off_m(mapper.poses(), truth).max() < 0.05
+    assert mapper.lost_since is None
+
+
+def test_until_then_it_is_lost_since_it_was_carried(carried):
+    truth, wheels, frames = carried
+    mapper, found_at = mapped((truth[: UP + 3], wheels[: UP + 3], frames[: UP + 3]))
+    assert found_at is None
+    assert mapper.lost_since == UP + 1
 
 
 @pytest.mark.parametrize("name", ["gtsam-lm", "gtsam-isam2", "gtsam-cauchy", "gtsam-dcs", "relaxation-ratslam"])
