@@ -86,6 +86,8 @@ def _show(done: Study) -> None:
 
 
 def _lines(done: Study) -> list[list[str]]:
+    from hybridmap.report.tables import interval
+
     by_row: dict[tuple[str, str], dict[str, Any]] = {}
     for one in done.summaries:
         if one.measure in _HEADLINES:
@@ -94,8 +96,7 @@ def _lines(done: Study) -> list[list[str]]:
     for (label, backend), found in by_row.items():
         ate, kept, lost = (found[name] for name in _HEADLINES)
         apart = ate.difference
-        paired = "" if apart is None or not apart.count else f"{apart.value:.3g}"
-        paired += "" if apart is None or apart.count < 2 else f" [{apart.low:.3g}, {apart.high:.3g}]"
+        paired = "" if apart is None or not apart.count else interval(apart.value, apart.low, apart.high)
         figures = [f"{one.median:.4g}" if one.solved else "" for one in (ate, kept, lost)]
         lines.append([label, backend, f"{ate.solved}/{ate.cells}", figures[0], paired, figures[1], figures[2]])
     return lines

@@ -15,12 +15,14 @@ from hybridmap.report.study_figures import FLOOR_M, MOST_PANELS
 from hybridmap.report.template import rendered
 from hybridmap.study.cell import MEASURES, CellResult
 from hybridmap.study.folder import PAGE
-from hybridmap.study.statistics import Interval, Summary
+from hybridmap.study.statistics import Summary
 from hybridmap.study.study import Study
 from hybridmap.trajectory import write_text_atomic
 
 _TEMPLATE = "study.html.j2"
 _SOLVED = ("converged", "max-iterations")
+SHOWN_M = 5e-7
+"""Differences below it are shown as 0."""
 _SUMMED = ("chi2_own", "false_kept", "own_lost", "iterations")
 
 
@@ -144,23 +146,18 @@ def _line(by_measure: dict[str, Summary]) -> Line:
     ate = by_measure["ate_m"]
     apart = ate.difference
     verdict = ""
-    if apart is not None and apart.excludes_zero and apart.count > 1:
+    if apart is not None and apart.excludes_zero and apart.count > 1 and abs(apart.value) >= SHOWN_M:
         verdict = "lower" if apart.high < 0.0 else "higher"
     return Line(
         backend=ate.backend,
         solved=f"{ate.solved} of {ate.cells}",
         median=tables.number(ate.median),
-        mean=_interval(ate.mean),
-        difference="" if apart is None else _interval(apart),
+        mean=tables.interval(ate.mean.value, ate.mean.low, ate.mean.high),
+        difference="" if apart is None else tables.interval(apart.value, apart.low, apart.high),
         verdict=verdict,
         better="" if math.isnan(ate.better) else f"{100.0 * ate.better:.0f} %",
         others=tuple(tables.number(by_measure[name].median) for name in _SUMMED),
     )
-
-
-def _interval(one: Interval) -> str:
-    value, low, high = (tables.number(round(figure, 6)) for figure in (one.value, one.low, one.high))  # micrometres
-    return value if math.isnan(one.low) else f"{value} [{low}, {high}]"
 
 
 def _remarks(study: Study) -> list[Remark]:

@@ -63,6 +63,17 @@ def number(value: float) -> str:
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e7 else f"{value:.4g}"
 
 
+def interval(value: float, low: float, high: float) -> str:
+    """A value with its interval, of as many decimals as the interval bears out and at most six; alone if it has none."""
+    if not all(map(math.isfinite, (value, low, high))):
+        return number(value)
+    width = 0.5 * (high - low)
+    decimals = min(6, max(0, 2 - math.floor(math.log10(width)))) if width > 0.0 else 6
+    figures = [round(figure, decimals) + 0.0 for figure in (value, low, high)]
+    middle, left, right = (f"{figure:.{decimals if any(figures) else 0}f}" for figure in figures)
+    return f"{middle} [{left}, {right}]"
+
+
 def length(value_m: float) -> tuple[str, str]:
     """A length as people say it: (digits, unit), below a metre in cm."""
     if not math.isfinite(value_m):

@@ -1,5 +1,7 @@
 """What the page's parts compute: alignment, errors over time, fates of loops, what a keyframe shows from above."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -130,3 +132,22 @@ def test_lengths_are_said_as_people_say_them(value: float, said: tuple[str, str]
 @pytest.mark.parametrize(("value", "said"), [(37.5, ("38", "s")), (1060.0, ("17.7", "min")), (float("nan"), ("nan", "s"))])
 def test_times_are_said_as_people_say_them(value: float, said: tuple[str, str]) -> None:
     assert tables.duration(value) == said
+
+
+@pytest.mark.parametrize(
+    ("figures", "text"),
+    [
+        ((0.2306, 0.07054, 0.3907), "0.231 [0.071, 0.391]"),
+        ((0.001547, 0.001371, 0.001722), "0.001547 [0.001371, 0.001722]"),
+        ((5.96, 5.9, 6.02), "5.9600 [5.9000, 6.0200]"),
+        ((0.02, 0.0004, 0.039), "0.0200 [0.0004, 0.0390]"),
+        ((-7e-8, -1.4e-7, -3e-9), "0 [0, 0]"),
+        ((2e-6, -7e-6, 1e-5), "0.000002 [-0.000007, 0.000010]"),
+        ((1234.0, 1000.0, 1500.0), "1234 [1000, 1500]"),
+        ((0.5, 0.5, 0.5), "0.500000 [0.500000, 0.500000]"),
+        ((1.25, math.nan, math.nan), "1.25"),
+        ((math.nan, math.nan, math.nan), "–"),
+    ],
+)
+def test_an_interval_has_the_decimals_that_it_bears_out(figures, text):
+    assert tables.interval(*figures) == text
