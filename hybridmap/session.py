@@ -205,6 +205,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
             *map(str, mapper.calibration.changes),
             *([str(free)] if free is not None and free.matters else []),
             *_lost(mapper),
+            *_doubts(mapper),
         ],
     }
     for key in ("graph_hash", "primary_backend"):
@@ -222,6 +223,13 @@ def _lost(mapper: Mapper) -> list[str]:
         return []
     rest = "lies where the odometry has it; the robot may have been carried: what it saw there follows on nothing before"
     return [f"the map from node {mapper.lost_since} of {len(mapper.map)} on {rest}, and no loop since then says where it was"]
+
+
+def _doubts(mapper: Mapper) -> list[str]:
+    """What the loops that the primary back-end rejected say against its map."""
+    solution = mapper.backends.solutions.get(mapper.backends.primary)
+    doubt = solution.report.doubt if solution is not None else ""
+    return [f"{mapper.backends.primary}: {doubt}"] if doubt else []
 
 
 def _weak(name: str, report: SolveReport) -> list[Metric]:

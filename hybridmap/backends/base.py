@@ -68,6 +68,21 @@ class SolveReport:
     weak_edges: dict[int, float] = field(default_factory=dict)
     hanging_nodes: int = 0
 
+    @property
+    def doubt(self) -> str:
+        """What the rejected loops that agree with each other say against the map; empty where there are none."""
+        together, groups = sum(map(len, self.rejected_clusters)), len(self.rejected_clusters)
+        if not groups:
+            return ""
+        where = "one group" if groups == 1 else f"{groups} groups"
+        found = f"{together} of {len(self.rejected_edge_ids)} rejected loops agree with each other, in {where}"
+        return f"{found}: false ones that repeat one mistake, or true ones, where odometry errs more than it says"
+
+    @property
+    def summary(self) -> str:
+        """The message, and what speaks against the map."""
+        return "; ".join(filter(None, (self.message, self.doubt)))
+
 
 @dataclass(frozen=True, slots=True)
 class Solution:

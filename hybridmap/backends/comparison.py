@@ -63,7 +63,7 @@ class Row:
     @property
     def message(self) -> str:
         """One line for people."""
-        return self.failure if self.solution is None else self.solution.report.message
+        return self.failure if self.solution is None else self.solution.report.summary
 
 
 def compare(
@@ -154,6 +154,11 @@ def metrics_of(rows: Sequence[Row]) -> list[Metric]:
             ("cpu_s", report.cpu_s, "s", "process time"),
             ("rejected_loops", float(len(report.rejected_edge_ids)), "1", "loop edges that the back-end holds for false"),
         ]
+        if report.rejected_clusters:
+            together = float(sum(map(len, report.rejected_clusters)))
+            figures.append(("rejected_together", together, "1", "of those, the ones that agree with each other"))
+        if report.chi2_odometry is not None:
+            figures.append(("chi2_odometry", report.chi2_odometry, "1", "share of chi2 that is not of loops"))
         if report.unit_variance is not None:
             figures.append(("unit_variance", report.unit_variance, "1", "chi2 of the edges kept per degree of freedom"))
         if report.weak_edges:

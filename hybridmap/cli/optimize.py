@@ -44,9 +44,10 @@ def optimize(
     head = source.head | {
         "backend": backend,
         "status": str(report.status),
-        "message": report.message,
+        "message": report.summary,
         "certificate": proof.message,
         "rejected_edge_ids": list(report.rejected_edge_ids),
+        "rejected_clusters": [list(cluster) for cluster in report.rejected_clusters],
     }
     emit(
         head,
@@ -55,6 +56,6 @@ def optimize(
         title=f"{graph}: {backend}: {report.status}",
     )
     if not as_json:
-        typer.echo(f"{report.message}\ncertificate: {proof.message}")
+        typer.echo(f"{report.summary}\ncertificate: {proof.message}")
     if not solved:
         raise typer.Exit(1)

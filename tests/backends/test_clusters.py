@@ -90,6 +90,11 @@ def test_the_report_says_what_was_rejected_together_and_how_strained_odometry_is
     assert len(report.rejected_clusters) >= 1
     assert 0.5 < report.unit_variance < 1.5
     assert 0.0 < report.chi2_odometry < report.chi2
+    together = sum(map(len, report.rejected_clusters))
+    assert report.doubt.startswith(f"{together} of {len(report.rejected_edge_ids)} rejected loops agree with each other, in ")
+    assert report.summary == f"{report.message}; {report.doubt}"
     ruined = backends.create("gtsam-lm").solve(false).report
     assert ruined.chi2_odometry > 10.0 * report.chi2_odometry
     assert ruined.unit_variance > 10.0 * report.unit_variance
+    assert ruined.doubt == ""
+    assert ruined.summary == ruined.message
