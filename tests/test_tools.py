@@ -7,9 +7,12 @@ import sys
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
+from hybridmap.graph.io import write_g2o
 from hybridmap.metrics import Metric, to_json
+from tests.backends.graphs_for_tests import laps
 from tests.store.sessions import ring_map, write_session
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -76,3 +79,35 @@ def test_a_command_s_own_bars_are_taken_with_their_side(tmp_path: Path) -> None:
 def test_results_names_its_studies() -> None:
     said = subprocess.run([sys.executable, ROOT / "tools" / "results.py", "--list"], capture_output=True, text=True, check=True)
     assert "demo: The demo" in said.stdout
+
+
+def test_a_bar_has_a_side() -> None:
+    barred, results, studies = (importlib.import_module(name) for name in ("barred", "results", "result_studies"))
+    few, many = barred.at_least("speed/x", 14.0, 15.0, "times"), barred.at_most("cost/x", 1.2, 1.15, "of bare")
+    assert not few.passed
+    assert not many.passed
+    assert barred.at_least("speed/x", 15.0, 15.0, "times").passed
+    assert barred.at_most("cost/x", 1.15, 1.15, "of bare").passed
+    rows = [results.own_row(studies.Step("x", own_bars=True), metric.to_json()) for metric in (few, many)]
+    assert [results.table_line(row) for row in rows] == [
+        "| `speed/x` | 14 |  | >= 15 ✗ missed |",
+        "| `cost/x` | 1.2 |  | <= 1.15 ✗ missed |",
+    ]
+
+
+def test_the_study_of_false_loops_gives_its_table_as_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    study = importlib.import_module("false_loop_study")
+    graph, truth = laps(np.random.default_rng(0), nodes=90, per_lap=30)
+    write_g2o(tmp_path / "laps.g2o", graph, truth)
+    words = ["--seeds", "2", "--shares", "0.1", "--modes", "random", "--backends", "gtsam-lm", "gtsam-gnc", "--json"]
+    monkeypatch.setattr(sys, "argv", ["false_loop_study", str(tmp_path / "laps.g2o"), *words])
+    study.main()
+    printed = capsys.readouterr()
+    found = {metric["name"]: metric["value"] for metric in json.loads(printed.out)["metrics"]}
+    assert found["ate_max/gtsam-gnc-random-10%"] < 0.05 < found["ate_median/gtsam-lm-random-10%"]
+    assert found["within_5_cm/gtsam-gnc-random-10%"] == 2
+    assert found["false_kept/gtsam-lm-random-10%"] >= 5
+    assert found["true_lost/gtsam-lm-random-10%"] == 0.0
+    assert "gtsam-gnc" in printed.err

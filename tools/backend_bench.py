@@ -1,4 +1,4 @@
-"""What the back-ends cost, by process time and as ratios within one run.
+"""What the back-ends cost, by process time and as ratios within one run, held against bars.
 
     python tools/backend_bench.py sweep
     python tools/backend_bench.py overhead gnc isam2 --data $HYBRIDMAP_DATA
@@ -8,20 +8,24 @@
 `gnc`       gtsam-gnc against gtsam.GncLMOptimizer with odometry as known inliers: intel, random false loops
 `isam2`     updates of a replay against one batch optimisation from the odometry chain, and false edges taken out again:
             Manhattan and city10000, some minutes
+
+Exit code 1 where a bar is missed.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import bare_gtsam
 import gtsam
 import numpy as np
 import replay_bench
+from barred import at_least, at_most
 from numpy.typing import NDArray
 
 from hybridmap import backends
@@ -33,6 +37,7 @@ from hybridmap.geometry import Array, between, compose, exp, wrap_angle
 from hybridmap.graph.connectivity import chain
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.metrics import Metric, to_json
 
 _ROUNDS = 7  # of measuring everything in turn, so that all see the same machine
 
@@ -42,10 +47,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("studies", nargs="+", choices=sorted(STUDIES))
     parser.add_argument("--data", type=Path, default=None, help="folder with posegraphs/, for all but `sweep`")
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output; the table goes to stderr")
     chosen = parser.parse_args()
+    table, metrics = sys.stderr if chosen.json else sys.stdout, list[Metric]()
     for study in chosen.studies:
-        for line in STUDIES[study](chosen.data):
-            print(line, flush=True)
+        for metric in STUDIES[study](chosen.data):
+            metrics.append(metric)
+            print(line(metric), file=table, flush=True)
+    if chosen.json:
+        print(to_json({}, metrics))
+    raise SystemExit(1 if any(metric.passed is False for metric in metrics) else 0)
+
+
+def line(metric: Metric) -> str:
+    """A figure as people read it."""
+    verdict = "" if metric.passed is None else "ok" if metric.passed else "MISSED"
+    return f"{metric.name:52}{metric.value:12.6g} {metric.unit:3}{verdict:7}{metric.description}"
 
 
 def cpu_s(work: Callable[[], object], repeats: int = 3) -> float:
@@ -120,7 +137,7 @@ def loop_over_floats(graph: PoseGraph, theta: float, sweeps: int) -> Array:
     return np.array([x, y, yaw]).T
 
 
-def sweep_study(data: Path | None) -> list[str]:
+def sweep_study(data: Path | None) -> Iterator[Metric]:
     """A sweep of the per-link rule against plain Python, all in the same order of links."""
     del data
     graph, theta = drive(1000, 1500, np.random.default_rng(0)), 0.5
@@ -133,57 +150,52 @@ def sweep_study(data: Path | None) -> list[str]:
         off = ours(20) - plain(graph, theta, 20)
         assert max(np.abs(off[:, :2]).max(), np.abs(wrap_angle(off[:, 2])).max()) < 1e-9
     studied: dict[str, tuple[int, Callable[[], object]]] = {
-        "loop over arrays": (3, lambda: loop_over_arrays(graph, theta, 3)),
-        "loop over floats": (100, lambda: loop_over_floats(graph, theta, 100)),
-        "relaxation-ratslam, 1,000 sweeps a call": (1000, lambda: ours(1000)),
-        "relaxation-ratslam, 20 sweeps a call": (1000, lambda: [ours(20) for _ in range(50)]),
-        "relaxation-robust, 1,000 sweeps a call": (1000, lambda: ours(1000, robust=True)),
+        "loop-over-arrays": (3, lambda: loop_over_arrays(graph, theta, 3)),
+        "loop-over-floats": (100, lambda: loop_over_floats(graph, theta, 100)),
+        "relaxation-ratslam": (1000, lambda: ours(1000)),
+        "relaxation-ratslam-by-20": (1000, lambda: [ours(20) for _ in range(50)]),
+        "relaxation-robust": (1000, lambda: ours(1000, robust=True)),
     }
     spent = dict.fromkeys(studied, math.inf)
     for _ in range(_ROUNDS):
         for name, (sweeps, work) in studied.items():
             spent[name] = min(spent[name], cpu_s(work, 1) / sweeps)
-    arrays, floats = spent["loop over arrays"], spent["loop over floats"]
-    head = f"sweep of {graph.n_nodes} nodes, {graph.n_edges} edges, us of CPU, times as fast as each loop:"
-    return [head, *(f"  {name:41}{s * 1e6:8.1f}{arrays / s:8.1f} x{floats / s:7.1f} x" for name, s in spent.items())]
+    for name, cost_s in spent.items():
+        yield Metric(f"sweep/{name}", 1e6 * cost_s, "us", f"a sweep of {graph.n_nodes} nodes, {graph.n_edges} edges")
+    for name in ("relaxation-ratslam", "relaxation-ratslam-by-20"):
+        yield at_least(f"speed/{name}", spent["loop-over-floats"] / spent[name], 15.0, "times as fast as plain Python's floats")
 
 
-def overhead_study(data: Path | None) -> list[str]:
+def overhead_study(data: Path | None) -> Iterator[Metric]:
     """`gtsam-lm` against GTSAM alone."""
-    lines = []
     for name in ("intel.g2o", "manhattanOlson3500.g2o"):
         path = posegraph(data, name)
         graph, parsed = read_graph(path), bare_gtsam.parse(path)
         chi2, bare, ours = bare_gtsam.optimise(*parsed)[1], math.inf, math.inf
-        for _ in range(7):  # in turn, so that both see the same machine
+        for _ in range(_ROUNDS):
             bare = min(bare, cpu_s(lambda parsed=parsed: bare_gtsam.optimise(*parsed), 1))
             ours = min(ours, cpu_s(lambda graph=graph: backends.create("gtsam-lm").solve(graph), 1))
         mine = backends.create("gtsam-lm").solve(graph).report.chi2
-        lines.append(
-            f"{name}: bare gtsam {bare:.3f} s, chi2 {chi2:.6g}; gtsam-lm {ours:.3f} s, {mine:.6g}: {ours / bare:.2f} x"
-        )
-    return lines
+        yield at_most(f"overhead/{path.stem}", ours / bare, 1.15, f"of {bare:.3f} s of CPU of bare gtsam")
+        yield at_most(f"chi2_ratio/{path.stem}", mine / chi2, 1.0 + 1e-6, f"of the chi2 of bare gtsam, {chi2:.6g}")
 
 
-def gnc_study(data: Path | None) -> list[str]:
+def gnc_study(data: Path | None) -> Iterator[Metric]:
     """Our GNC against GTSAM's."""
-    lines = []
     graph = read_graph(posegraph(data, "intel.g2o"))
-    for share in (0.1, 0.4):
-        false = inject(graph, share, "random", np.random.default_rng(0))
+    for share, times in ((0.1, 5.0), (0.4, 20.0)):
+        false, name = inject(graph, share, "random", np.random.default_rng(0)), f"intel-{share:.0%}"
         started = time.process_time()
         theirs = gtsams_gnc(false)
         plain = time.process_time() - started
         ours = cpu_s(lambda false=false: backends.create("gtsam-gnc").solve(false))
         rejected = np.array(backends.create("gtsam-gnc").solve(false).report.rejected_edge_ids)
-        verdicts = " and ".join(
-            f"{int(np.isin(out, graph.edge_ids).sum())} true loops lost, "
-            f"{false.n_edges - graph.n_edges - int((~np.isin(out, graph.edge_ids)).sum())} false kept"
-            for out in (theirs, rejected)
-        )
-        cost = f"GncLMOptimizer {plain:.2f} s, gtsam-gnc {ours:.2f} s: 1/{plain / ours:.1f}"
-        lines.append(f"intel, {share:.0%} false: {cost}; {verdicts}")
-    return lines
+        yield at_least(f"speed_gnc/{name}", plain / ours, times, f"times as fast as GncLMOptimizer, {plain:.2f} s of CPU")
+        injected = np.setdiff1d(false.edge_ids, graph.edge_ids)
+        lost, bar = (float(np.isin(graph.edge_ids, out).sum()) for out in (rejected, theirs))
+        yield at_most(f"true_loops_lost/{name}", lost, bar, "the bar is GncLMOptimizer's")
+        kept, bar = (float((~np.isin(injected, out)).sum()) for out in (rejected, theirs))
+        yield at_most(f"false_loops_kept/{name}", kept, bar, "the bar is GncLMOptimizer's")
 
 
 def gtsams_gnc(graph: PoseGraph) -> NDArray[np.int64]:
@@ -197,7 +209,7 @@ def gtsams_gnc(graph: PoseGraph) -> NDArray[np.int64]:
     return graph.edge_ids[graph.is_loop & (weights < 0.5)]
 
 
-def isam2_study(data: Path | None) -> Iterator[str]:
+def isam2_study(data: Path | None) -> Iterator[Metric]:
     """A replay's updates against one batch optimisation, with false edges put in and taken out."""
     for name in replay_bench.GRAPHS:
         yield from replay_bench.study(posegraph(data, name))
@@ -210,7 +222,7 @@ def posegraph(data: Path | None, name: str) -> Path:
     return data / "posegraphs" / name
 
 
-STUDIES: dict[str, Callable[[Path | None], Iterable[str]]] = {
+STUDIES: dict[str, Callable[[Path | None], Iterator[Metric]]] = {
     "sweep": sweep_study,
     "overhead": overhead_study,
     "gnc": gnc_study,

@@ -17,6 +17,7 @@ r"""What a back-end makes of false loops in the standard graphs, over seeds: the
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,7 @@ from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array, align, transform_points
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.metrics import Metric, to_json
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,22 +64,28 @@ def main() -> None:
     parser.add_argument("--dropouts", type=float, default=0.0, metavar="SHARE", help="of odometry edges 20 deg and 0.5 m off")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings of the back-ends")
     parser.add_argument("--first", type=int, default=0, metavar="SEED")
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output; the table goes to stderr")
     chosen = parser.parse_args()
+    table, metrics = sys.stderr if chosen.json else sys.stdout, list[Metric]()
     graph = read_graph(chosen.graph)
     clean = backends.create("gtsam-lm").solve(graph).poses
     graph = bend(graph, chosen.bias) if chosen.bias else graph
     settings = Config.load(None, {f"backends.{key}": value for key, value in parse_settings(chosen.set).items()}).backends
-    print(f"{chosen.graph.name}: {graph.n_nodes} nodes, {int(graph.is_loop.sum())} true loops; ATE in m, CPU in s")
+    print(f"{chosen.graph.name}: {graph.n_nodes} nodes, {int(graph.is_loop.sum())} true loops; ATE in m, CPU in s", file=table)
     print(
         f"{'back-end':20}{'kind':9}{'share':>6}{'ATE median':>12}{'max':>9}{'<= 0.05':>9}"
-        f"{'lost max':>12}{'kept max':>10}{'CPU':>8}"
+        f"{'lost max':>12}{'kept max':>10}{'CPU':>8}",
+        file=table,
     )
     for name in chosen.backends:
         for share in chosen.shares:
             for mode in chosen.modes:
                 seeds = range(chosen.first, chosen.first + chosen.seeds)
                 cells = [cell(disturbed(graph, chosen.dropouts, share, mode, s), graph, clean, name, settings) for s in seeds]
-                print(line(name, mode, share, cells, int(graph.is_loop.sum())), flush=True)
+                print(line(name, mode, share, cells, int(graph.is_loop.sum())), file=table, flush=True)
+                metrics += metrics_of(f"{name}-{mode}-{share:.0%}", cells, int(graph.is_loop.sum()))
+    if chosen.json:
+        print(to_json({"graph": str(chosen.graph)}, metrics))
 
 
 def disturbed(graph: PoseGraph, dropouts: float, share: float, mode: str, seed: int) -> PoseGraph:
@@ -101,6 +109,18 @@ def ate(poses: Array, reference: Array) -> float:
     """RMSE of position after alignment, m."""
     moved = transform_points(align(reference, poses), poses[:, :2])
     return float(np.sqrt(np.mean(np.sum((moved - reference[:, :2]) ** 2, axis=1))))
+
+
+def metrics_of(where: str, cells: list[Cell], true_loops: int) -> list[Metric]:
+    """Figures over the seeds."""
+    errors = [c.ate_m for c in cells]
+    return [
+        Metric(f"ate_median/{where}", float(np.median(errors)), "m", "against the clean optimum"),
+        Metric(f"ate_max/{where}", max(errors), "m", "in the worst seed"),
+        Metric(f"within_5_cm/{where}", sum(error <= 0.05 for error in errors), "1", f"of {len(cells)} seeds"),
+        Metric(f"true_lost/{where}", 100.0 * max(c.lost for c in cells) / true_loops, "%", "of true loops, in the worst seed"),
+        Metric(f"false_kept/{where}", max(c.kept for c in cells), "1", "in the worst seed"),
+    ]
 
 
 def line(name: str, mode: str, share: float, cells: list[Cell], true_loops: int) -> str:

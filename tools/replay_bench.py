@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from barred import at_least, at_most
 
 from hybridmap import backends
 from hybridmap.backends.base import Backend, Solution
@@ -19,6 +20,7 @@ from hybridmap.geometry import Array, between
 from hybridmap.graph.connectivity import chain
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.metrics import Metric
 
 GRAPHS = {"manhattanOlson3500.g2o": None, "city10000.g2o": 4000}
 """Files, and how many nodes of each are replayed with false edges (all of them: minutes of least squares on a ruined map)."""
@@ -41,25 +43,22 @@ class Replay:
     last: Solution
 
 
-def study(path: Path) -> Iterator[str]:
-    """Lines on `gtsam-isam2` over one graph: the cost of its updates, then false edges put in and taken out."""
-    graph = chain(read_graph(path))
+def study(path: Path) -> Iterator[Metric]:
+    """Figures of `gtsam-isam2` over one graph: the cost of its updates, then false edges put in and taken out."""
+    graph, name = chain(read_graph(path)), path.stem
     batch_s = min(_batch_s(graph) for _ in range(3))
     best = backends.create("gtsam-lm").solve(graph).report.chi2
     backend = backends.create("gtsam-isam2")
     replay = replayed(backend, graph)
     end = backend.finish(graph).report
-    median, p99 = np.quantile(replay.spent_s, [0.5, 0.99])
-    yield f"isam2, {path.name}: one batch optimisation from the chain {batch_s:.3f} s"
-    yield (
-        f"  updates: median {median * 1e3:.2f} ms = 1/{batch_s / median:.0f} of it, 99 % {p99 * 1e3:.0f} ms, "
-        f"{replay.spent_s.sum():.1f} s in all; ISAM2 worked at {replay.works} of {graph.n_nodes} nodes"
-    )
-    yield (
-        f"  chi2: last update {replay.last.report.chi2 / best:.5f} x batch, "
-        f"end of the drive {end.chi2:.6g} = {end.chi2 / best:.6f} x batch ({end.cpu_s:.2f} s)"
-    )
-    yield _false_edges(prefix(graph, GRAPHS.get(path.name) or graph.n_nodes))
+    median_s, p99_s = np.quantile(replay.spent_s, [0.5, 0.99])
+    yield Metric(f"update_median/{name}", 1e3 * median_s, "ms", f"ISAM2 worked at {replay.works} of {graph.n_nodes} nodes")
+    yield Metric(f"update_p99/{name}", 1e3 * p99_s, "ms", f"{replay.spent_s.sum():.1f} s in all")
+    times = f"median update goes so often into one batch optimisation from the chain, {batch_s:.3f} s of CPU"
+    yield at_least(f"updates_a_batch/{name}", batch_s / median_s, 300.0, times)
+    yield at_most(f"chi2_last_update/{name}", replay.last.report.chi2 / best, 1.001, "of batch")
+    yield at_most(f"chi2_at_the_end/{name}", end.chi2 / best, 1.001, f"of batch; {end.cpu_s:.2f} s of CPU")
+    yield from _false_edges(prefix(graph, GRAPHS.get(path.name) or graph.n_nodes), name)
 
 
 def replayed(backend: Backend, graph: PoseGraph) -> Replay:
@@ -81,7 +80,7 @@ def _batch_s(graph: PoseGraph) -> float:
     return time.process_time() - started
 
 
-def _false_edges(clean: PoseGraph) -> str:
+def _false_edges(clean: PoseGraph, name: str) -> Iterator[Metric]:
     """Replay with false edges, take them all out at once, and compare with the optimum that never saw them."""
     best = backends.create("gtsam-lm").solve(clean)
     false = inject(clean, _SHARE, "random", np.random.default_rng(_SEED))
@@ -89,9 +88,7 @@ def _false_edges(clean: PoseGraph) -> str:
     ruined = replayed(backend, false)
     back = backend.update(clean)
     off = np.abs(between(best.poses, back.poses))
-    return (
-        f"  {false.n_edges - clean.n_edges} false edges ({_SHARE:.0%}) over {clean.n_nodes} nodes: replay "
-        f"{ruined.spent_s.sum():.0f} s, chi2 {ruined.last.report.chi2:.6g}; taken out in {back.report.cpu_s:.2f} s: "
-        f"chi2 {back.report.chi2 / best.report.chi2 - 1.0:+.1e} relative to the clean optimum, "
-        f"largest difference {off[:, :2].max():.1e} m, {off[:, 2].max():.1e} rad"
-    )
+    what = f"{false.n_edges - clean.n_edges} false edges over {clean.n_nodes} nodes"
+    chi2 = f"of the optimum without them; {ruined.last.report.chi2:.4g} before, {back.report.cpu_s:.2f} s of CPU"
+    yield at_most(f"chi2_after_removal/{name}", back.report.chi2 / best.report.chi2, 1.0 + 1e-6, f"{what}: {chi2}")
+    yield at_most(f"off_after_removal/{name}", float(off[:, :2].max()), 1e-3, "largest distance from that optimum", "m")

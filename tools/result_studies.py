@@ -54,6 +54,17 @@ class Study:
 
 OFFICE = (Figure("ate_rmse/PRIMARY", 0.20),)
 
+
+def _survival(shares: tuple[str, ...], worst_m: float, seeds: int | None) -> tuple[Figure, ...]:
+    """Figures of `gtsam-gnc` at some shares of false loops: worst error, seeds within 5 cm of ten (else the median), counts."""
+    found = []
+    for where in (f"gtsam-gnc-{mode}-{share}" for share in shares for mode in ("random", "aliased")):
+        usual = Figure(f"within_5_cm/{where}", seeds, at_least=True) if seeds else Figure(f"ate_median/{where}", 0.05)
+        counts = Figure(f"true_lost/{where}", 0.5 if seeds else None), Figure(f"false_kept/{where}", 2 if seeds else None)
+        found += [usual, Figure(f"ate_max/{where}", worst_m), *counts]
+    return tuple(found)
+
+
 STUDIES = (
     Study(
         "demo",
@@ -219,6 +230,82 @@ STUDIES = (
             ),
         ),
         needs="posegraphs/manhattanOlson3500.g2o",
+    ),
+    Study(
+        "optima",
+        "Standard pose graphs, the global optimum",
+        "From the file's own poses; the bar of chi2 is 1.001 times the best known. Where the gap is proved, no map is better.",
+        tuple(
+            Step(
+                f"hybridmap optimize $HYBRIDMAP_DATA/posegraphs/{name} --backend gtsam-lm",
+                (Figure("chi2/gtsam-lm", bar), Figure("certificate_gap/gtsam-lm", gap), Figure("cpu_s/gtsam-lm", 2.0)),
+            )
+            for name, bar, gap in (
+                ("intel.g2o", 45.0492, 1e-6),
+                ("CSAIL.g2o", 40.5914, 1e-6),
+                ("FR079_P_toro.graph", 37.6093, None),
+                ("manhattanOlson3500.g2o", 146.2248, 1e-6),
+                ("city10000.g2o", 512.4995, 1e-6),
+            )
+        ),
+        needs="posegraphs/city10000.g2o",
+    ),
+    Study(
+        "false-loops",
+        "What survives false loops",
+        "Ten seeds on intel and three on manhattanOlson3500; loops at random, and copies of true ones that are moved together. "
+        "Errors are against the optimum of the clean graph. Then robust relaxation, and an odometry that pulls to one side by "
+        "0.06 rad/m, with no false loop.",
+        (
+            Step(
+                "python tools/false_loop_study.py $HYBRIDMAP_DATA/posegraphs/intel.g2o --seeds 10 --shares 0.1 0.4 0.7",
+                (*_survival(("10%", "40%"), 0.15, 9), *_survival(("70%",), 0.30, None)),
+            ),
+            Step(
+                "python tools/false_loop_study.py $HYBRIDMAP_DATA/posegraphs/manhattanOlson3500.g2o --seeds 3"
+                " --shares 0.1 0.2 0.4",
+                tuple(
+                    Figure(f"ate_max/gtsam-gnc-{mode}-{share}", bar)
+                    for share in ("10%", "20%", "40%")
+                    for mode, bar in (("random", 0.25), ("aliased", 0.05))
+                ),
+            ),
+            Step(
+                "python tools/false_loop_study.py $HYBRIDMAP_DATA/posegraphs/intel.g2o --seeds 10 --shares 0 0.05 0.1"
+                " --backends relaxation-robust relaxation-ratslam",
+                tuple(
+                    Figure(f"ate_max/{name}-{mode}-{share}", 0.10 if name == "relaxation-robust" else None)
+                    for share in ("0%", "5%", "10%")
+                    for mode in ("random", "aliased")
+                    for name in ("relaxation-robust", "relaxation-ratslam")
+                ),
+            ),
+            *(
+                Step(
+                    f"python tools/false_loop_study.py $HYBRIDMAP_DATA/posegraphs/{graph}.g2o --bias 0.06 --shares 0 --seeds 1"
+                    " --modes random --backends odometry relaxation-ratslam gtsam-lm gtsam-cauchy gtsam-gnc gtsam-calibrated",
+                    (
+                        *(
+                            Figure(f"ate_max/{name}-random-0%")
+                            for name in ("odometry", "relaxation-ratslam", "gtsam-lm", "gtsam-cauchy", "gtsam-gnc")
+                        ),
+                        Figure("ate_max/gtsam-calibrated-random-0%", 0.5),
+                        Figure("true_lost/gtsam-calibrated-random-0%", 1.0),
+                    ),
+                )
+                for graph in ("intel", "manhattanOlson3500")
+            ),
+        ),
+        needs="posegraphs/intel.g2o",
+    ),
+    Study(
+        "cost-backends",
+        "The cost of the back-ends",
+        "Process time as ratios within one run: a sweep of relaxation against plain Python, `gtsam-lm` against bare GTSAM, "
+        "`gtsam-gnc` against GTSAM's own, an update of `gtsam-isam2` against one batch optimisation; and what false edges "
+        "leave behind once they are taken out.",
+        (Step("python tools/backend_bench.py sweep overhead gnc isam2 --data $HYBRIDMAP_DATA", own_bars=True),),
+        needs="posegraphs/city10000.g2o",
     ),
     Study(
         "cells",
