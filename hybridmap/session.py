@@ -16,6 +16,7 @@ from hybridmap.calibration.sessions import GAIN_CHANGES
 from hybridmap.config import Config
 from hybridmap.errors import HybridMapError, StreamError
 from hybridmap.geometry import Array, between, compose
+from hybridmap.graph.carries import carries
 from hybridmap.graph.experience_map import Status
 from hybridmap.graph.hashing import graph_hash
 from hybridmap.graph.observability import unobserved
@@ -204,6 +205,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
             *stream.report.remarks,
             *map(str, mapper.calibration.changes),
             *([str(free)] if free is not None and free.matters else []),
+            *map(str, carries(mapper.map)),
             *_lost(mapper),
             *_doubts(mapper),
         ],

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hybridmap.config import Config
+from hybridmap.evaluate import evaluate_session
 from hybridmap.geometry import align, between, compose
 from hybridmap.graph.experience_map import Status
 from hybridmap.graph.pose_graph import EdgeKind
@@ -45,5 +46,8 @@ def test_it_is_relocalised_within_five_metres(config, world, carried_m, seed, tm
     first = min(back, key=lambda edge: edge.since_node)
     error = between(between(truth[first.source], truth[first.target]), first.relative.delta)
     assert np.hypot(error[0], error[1]) < 0.1
+    assert [remark for remark in done.head["remarks"] if f"carried between nodes {down - 1} and {down}" in remark]
+    figures = {metric.name: metric.value for metric in evaluate_session(done.folder.path)}
+    assert figures["ate_max/gtsam-gnc"] < 0.2
     ends = compose(align(truth, final.poses), final.poses)
     assert np.hypot(*(ends - truth)[:, :2].T).max() < 0.2

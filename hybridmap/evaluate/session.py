@@ -11,6 +11,7 @@ from hybridmap.evaluate.closures import ClosureErrors, closure_errors
 from hybridmap.evaluate.edges import EdgeErrors, edge_errors
 from hybridmap.evaluate.relations import ErrorStatistics, Relations, read_relations, relation_errors
 from hybridmap.evaluate.trajectory import absolute_error_of, drift_percent, relative_error_of
+from hybridmap.graph.carries import grounded
 from hybridmap.metrics import Metric
 from hybridmap.store import MapStore, SessionFolder, trajectory_of
 from hybridmap.trajectory import Trajectory, read_tum
@@ -64,7 +65,8 @@ def evaluate_session(folder: Path, reference: Path | None = None, relations: Pat
 def session_trajectories(session: SessionFolder, store: MapStore) -> dict[str, Trajectory]:
     """Name -> estimate of a session: `odometry`, then each back-end's final and `_online`.
 
-    Taken from `trajectory/`; what a killed run could not write there comes from the map file.
+    Taken from `trajectory/`; what a killed run could not write there comes from the map file. The poses while the robot was
+    carried, as far as the map knows, are left out.
     """
     written = session.trajectories()
     estimates = {ODOMETRY: written[ODOMETRY] if ODOMETRY in written else store.track().odometry}
@@ -81,7 +83,8 @@ def session_trajectories(session: SessionFolder, store: MapStore) -> dict[str, T
             estimates[name + _ONLINE] = written[name + _ONLINE]
         elif name in followed:
             estimates[name + _ONLINE] = store.online(name)
-    return estimates
+    experiences = store.map()
+    return {name: grounded(estimate, experiences) for name, estimate in estimates.items()}
 
 
 def _judge_closures(store: MapStore, truth: Trajectory) -> dict[str, ClosureErrors]:

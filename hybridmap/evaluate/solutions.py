@@ -10,6 +10,7 @@ from hybridmap.evaluate.relations import read_relations
 from hybridmap.evaluate.session import ODOMETRY, against_relations, against_truth
 from hybridmap.evaluate.trajectory import absolute_error
 from hybridmap.geometry import Array, compose, inverse
+from hybridmap.graph.carries import grounded
 from hybridmap.metrics import Metric
 from hybridmap.store import MapStore, SessionFolder, trajectory_of
 from hybridmap.trajectory import read_tum
@@ -48,8 +49,9 @@ def judge_solutions(
     truth = None if truth_file is None else read_tum(truth_file)
     verified = None if relations is None else read_relations(relations)
     with MapStore.open(folder) as store:
-        track = store.track()
+        track, experiences = store.track(), store.map()
     ways = {name: track.odometry if name == ODOMETRY else trajectory_of(track, poses) for name, poses in solutions.items()}
+    ways = {name: grounded(way, experiences) for name, way in ways.items()}
     metrics: list[Metric] = []
     for name, way in ways.items():
         metrics += [] if truth is None else against_truth(name, way, truth)

@@ -5,7 +5,10 @@ import pytest
 
 from hybridmap.errors import EvaluationError, StoreError, StreamError
 from hybridmap.evaluate import evaluate_session
-from hybridmap.geometry import between
+from hybridmap.evaluate.solutions import judge_solutions
+from hybridmap.geometry import RelativePose, between
+from hybridmap.graph.experience_map import Edge, Status
+from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.store import SessionFolder
 from hybridmap.trajectory import read_tum
 from tests.store.sessions import SECOND, ring_map, truth_at, write_session
@@ -51,6 +54,18 @@ def test_killed_session_is_evaluated_from_its_map_file(tmp_path):
     assert figures["ate_rmse/odometry"] > 0.1
     assert "ate_rmse/gtsam-lm" not in figures
     assert figures["ate_rmse_online/gtsam-lm"] > 0.1
+
+
+def test_the_way_through_the_air_counts_for_nothing(tmp_path):
+    experiences = ring_map()
+    hung = RelativePose(np.array([3.0, 4.0, 0.0]), np.eye(3))
+    experiences.add_edge(Edge(20, 21, EdgeKind.REGISTRATION, Status.ACCEPTED, "carried", hung, {"carried_m": 5.0}))
+    folder = write_session(tmp_path / "s", experiences, keyframes=False).path
+    figures = {metric.name: metric.value for metric in evaluate_session(folder)}
+    track = len(read_tum(folder / "trajectory" / "odometry.tum"))
+    assert {figures[f"ate_poses/{name}"] for name in ("odometry", "gtsam-lm")} == {track - 10}
+    judged = judge_solutions(folder, {"x": np.array([node.pose_odom for node in experiences.nodes])})
+    assert {metric.name: metric.value for metric in judged.metrics}["ate_poses/x"] == track - 10
 
 
 def test_a_named_reference_wins_over_the_session_s_own(folder, tmp_path):

@@ -1,0 +1,55 @@
+"""Where the robot was carried, as far as its map knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridmap.graph.experience_map import ExperienceMap, Status
+from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.trajectory import Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class Carry:
+    """A break of the chain after which the robot was found elsewhere.
+
+    Attributes:
+        before, after: the last node before it and the first one after.
+        found_at: the newest node when it was found.
+        moved_m: how far it was found from where the odometry had it.
+        search_m: way driven from `after` to `found_at`.
+    """
+
+    before: int
+    after: int
+    found_at: int
+    moved_m: float
+    search_m: float
+
+    def __str__(self) -> str:
+        found = f"found {self.moved_m:.1f} m from where the odometry has it, {self.search_m:.1f} m on, at node {self.found_at}"
+        return f"carried between nodes {self.before} and {self.after}: {found}; no error is taken of the way between"
+
+
+def carries(experiences: ExperienceMap) -> tuple[Carry, ...]:
+    """Every carry of a drive, in its order: the edges that a search of the whole map hung in the place of broken ones."""
+    found = []
+    for edge in experiences.edges:
+        if edge.kind is EdgeKind.REGISTRATION and edge.status is Status.ACCEPTED and "carried_m" in edge.scores:
+            search_m = experiences.node(edge.since_node).travel_m - experiences.node(edge.target).travel_m
+            found.append(Carry(edge.source, edge.target, edge.since_node, edge.scores["carried_m"], search_m))
+    return tuple(sorted(found, key=lambda carry: carry.after))
+
+
+def grounded(trajectory: Trajectory, experiences: ExperienceMap) -> Trajectory:
+    """A trajectory without the poses while the robot was carried, which no sensor tells.
+
+    The motion up to a node belongs to the way before it, so that the pose at the very stamp of `after` is left out too.
+    """
+    kept = np.ones(len(trajectory), dtype=bool)
+    for carry in carries(experiences):
+        up_ns, down_ns = experiences.node(carry.before).stamp_ns, experiences.node(carry.after).stamp_ns
+        kept &= (trajectory.stamps_ns <= up_ns) | (trajectory.stamps_ns > down_ns)
+    return trajectory if kept.all() else Trajectory(trajectory.stamps_ns[kept], trajectory.poses[kept])

@@ -1,0 +1,45 @@
+"""Where the robot was carried, and a trajectory without it."""
+
+import numpy as np
+
+from hybridmap.geometry import RelativePose
+from hybridmap.graph.carries import carries, grounded
+from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
+from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.trajectory import Trajectory
+
+SECOND = 10**9
+
+
+def drive(*edges):
+    """Six nodes, one a second and 0.5 m apart; a carry between nodes 2 and 3 is found at node 5."""
+    experiences = ExperienceMap()
+    for k in range(6):
+        pose = np.array([0.5 * k, 0.0, 0.0])
+        experiences.add_node(Node(k * SECOND, pose, np.zeros(4, dtype=np.float32), -1, 0.5 * k), pose)
+    relative = RelativePose(np.array([3.0, 4.0, 0.0]), np.eye(3))
+    for kind, status, scores in edges:
+        experiences.add_edge(Edge(2, 3, kind, status, "carried", relative, scores))
+    return experiences
+
+
+def test_a_carry_is_what_was_hung_in_the_place_of_a_broken_edge():
+    hung = (EdgeKind.REGISTRATION, Status.ACCEPTED, {"carried_m": 5.0, "closures": 4.0})
+    (carry,) = carries(drive(hung))
+    assert (carry.before, carry.after, carry.found_at, carry.moved_m, carry.search_m) == (2, 3, 5, 5.0, 1.0)
+    assert "between nodes 2 and 3: found 5.0 m from where the odometry has it, 1.0 m on, at node 5" in str(carry)
+
+
+def test_what_was_taken_back_or_is_of_another_kind_is_no_carry():
+    taken_back = (EdgeKind.REGISTRATION, Status.REJECTED, {"carried_m": 5.0})
+    ordinary = (EdgeKind.REGISTRATION, Status.ACCEPTED, {"fit": 0.9})
+    assert carries(drive(taken_back, ordinary)) == ()
+
+
+def test_a_trajectory_has_no_pose_of_the_way_through_the_air():
+    stamps = np.arange(0, 5 * SECOND + 1, SECOND // 2)
+    way = Trajectory(stamps, np.zeros((len(stamps), 3)))
+    hung = (EdgeKind.REGISTRATION, Status.ACCEPTED, {"carried_m": 5.0})
+    left = grounded(way, drive(hung)).stamps_ns / SECOND
+    assert left.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, 3.5, 4.0, 4.5, 5.0]
+    assert grounded(way, drive()) is way
