@@ -210,15 +210,15 @@ class LaserRelocalisingConfig(AgreementConfig):
     contradiction_sigmas: float = Field(default=4.0, gt=0)
     """A registration this far from the odometry, in deviations of the odometry, does not show that the robot drove there."""
     violation: float = Field(default=0.13, gt=0, le=1)
-    """Nor does the odometry alone: the chain is broken where beside that two consecutive scans see each other's walls, this
-    share of them, in free space. 1: it never is."""
+    """The odometry alone does not show it either: the chain is broken where beside that two consecutive scans see each other's
+    walls, this share of them, in free space. 1: it never is."""
     unrecognised_probes: int = Field(default=2, ge=0)
     """Probes that recognise nothing while the map contradicts what is seen, with none that does between them, after which the
     robot is lost too; 0: never."""
     map_violation: float = Field(default=0.4, gt=0, le=1)
-    """The map contradicts the last scans if more of either's walls than this share lie in the other's free space,"""
+    """The map contradicts the last scans if more of either's walls than this share lie in the other's free space."""
     sure_m: float = Field(default=0.3, gt=0)
-    """and if it is this sure of where they lie (standard deviation of the position), m."""
+    """It can contradict them only where it is this sure of where they lie (standard deviation of the position), m."""
     from_m: float = Field(default=0.9, gt=0)
     """Travel since the break from which on the scans since then are held against the whole map, m."""
     often_m: float = Field(default=6.0, gt=0)

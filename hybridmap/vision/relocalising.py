@@ -21,6 +21,9 @@ REHUNG_M, REHUNG_RAD = 0.5, float(np.deg2rad(10.0))
 WHERE_IT_WAS = 2.0
 """A robot that is found within so many of these deviations of where the chain has it was not carried."""
 KEPT_STEPS = 1000
+"""The newest registrations, which are taken back where they reach across a break."""
+DRIFT_M_PER_M, DRIFT_DEG_PER_M = 0.05, 1.0
+"""How much further apart sightings may put the robot for every metre that it drove between them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +66,7 @@ class Relocaliser:
         self._steps += [step for step in steps if step.verdict is Verdict.ACCEPTED]
 
     def settle(self, found: list[Proposal], belief: Belief) -> Settlement:
-        """Let new sightings wait, and accept the largest set of them that agree if it is good enough.
+        """Let new sightings wait; accept the one that most agree with, and these with it, if they are good enough.
 
         Args:
             found: what was looked at, in any state; those that are pending are sightings.
@@ -95,7 +98,16 @@ class Relocaliser:
         return out
 
     def rehang(self, broken_at: int, friends: tuple[Proposal, ...], belief: Belief) -> list[Proposal]:
-        """Take back what was registered across a break, and hang the node behind it where its sightings have it."""
+        """Take back what was registered across a break, and hang the node behind it where its sightings have it.
+
+        Args:
+            broken_at: the first node behind the break.
+            friends: sightings that agree; their sources lie behind the break, their targets before it.
+            belief: poses on either side of the break are right among themselves.
+
+        Returns:
+            The registrations taken back, and the edge from the node before the break to the one behind it.
+        """
         crossing = [step for step in self._steps if step.source < broken_at <= step.target]
         reason = f"the robot was carried between nodes {broken_at - 1} and {broken_at}; before that was known: "
         return [
@@ -120,8 +132,8 @@ class Relocaliser:
         placed = np.array([_placed(s, newest, poses) for s in self._waiting])
         apart = between(placed[:, None], placed[None])
         travelled = np.abs(belief.travel_m[sources][:, None] - belief.travel_m[sources][None])
-        near = np.hypot(apart[..., 0], apart[..., 1]) <= self._config.agree_m + 0.05 * travelled
-        return np.asarray(near & (np.degrees(np.abs(apart[..., 2])) <= self._config.agree_deg + travelled))
+        near = np.hypot(apart[..., 0], apart[..., 1]) <= self._config.agree_m + DRIFT_M_PER_M * travelled
+        return np.asarray(near & (np.degrees(np.abs(apart[..., 2])) <= self._config.agree_deg + DRIFT_DEG_PER_M * travelled))
 
     def _weights(self) -> Array:
         """(n,) 1 for each node's best sighting, less for those of the same node that fit worse."""

@@ -54,9 +54,11 @@ class Continuity:
             on_the_way: in order, the scans between the two nodes, and where the wheels have them: motion (3,) since the first.
         """
         c = self._config.relocalising
+        if c.violation >= 1.0:  # switched off
+            return ""
         error = between(odometry.delta, step.relative.delta)
         sigmas = float(np.sqrt(error @ np.linalg.solve(odometry.covariance, error)))
-        if c.violation >= 1.0 or (step.measured and sigmas <= c.contradiction_sigmas):
+        if step.measured and sigmas <= c.contradiction_sigmas:
             return ""
         last, here = (_alone(self._atlas.clouds[i], i) for i in (node - 1, node))
         seen = self._violation(here, last, step.relative.delta, self._atlas.ranges)

@@ -18,6 +18,8 @@ from hybridmap.vision.laser.visibility import violation
 
 REGISTERED_POINTS = 400
 UNKNOWN = 1e8
+SAME_M, SAME_RAD = 0.3, 0.1
+"""Hypotheses of one anchor that lie so near to each other are one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,6 +229,6 @@ def _distinct(found: list[Hypothesis]) -> list[Hypothesis]:
     for h in found:
         same = [o for o in out if o.anchor == h.anchor]
         gaps = [between(o.relative.delta, h.relative.delta) for o in same]
-        if not any(np.hypot(g[0], g[1]) < 0.3 and abs(g[2]) < 0.1 for g in gaps):
+        if not any(np.hypot(g[0], g[1]) < SAME_M and abs(g[2]) < SAME_RAD for g in gaps):
             out.append(h)
     return out

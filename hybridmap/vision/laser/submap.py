@@ -184,4 +184,5 @@ class Atlas:
 
 
 def _span(anchor: int, nodes: NDArray[np.int64]) -> Span:
+    """What tells one submap of nodes without a gap from another."""
     return anchor, int(nodes[0]), int(nodes[-1])

@@ -19,6 +19,8 @@ from hybridmap.vision.whereabouts import Chain, Whereabouts
 
 MISFIT_STEPS = 10
 """Steps for which the usual misfit of scans is taken before any was seen."""
+ALIKE = (0.5, 0.5)
+"""Weights of intensity and depth where views are ranked: a laser's profile has the one band, and they do not matter."""
 GATED = ("gate_sigma_m", "off_m", "off_deg")
 """Figures of a hypothesis that mean nothing where there is no gate."""
 
@@ -48,7 +50,7 @@ class WholeMap:
         self._whereabouts = Whereabouts(config.relocalising.unrecognised_probes)
         given_up = "too few other submaps put the robot there"
         self._relocaliser = Relocaliser(config.relocalising, self._whereabouts, new_key, given_up)
-        self._views = Matcher("plain", 0.5, 0.5, config.scan.profile_width // 4)
+        self._views = Matcher("plain", *ALIKE, max_shift=config.scan.profile_width // 4)
         self._misfits, self._steps = MISFIT_STEPS * config.relocalising.misfit, MISFIT_STEPS
         self._broken_at: int | None = None
         self._lost_m, self._searched_m = 0.0, -np.inf
@@ -140,8 +142,8 @@ class WholeMap:
             self._views.add(profile)
         stop = anchors[-1] + 1
         ranked = self._views.best(self._profiles[node], stop, np.arange(stop)).indices
-        nearest = np.searchsorted(np.array(anchors), ranked)
-        likeliest = list(dict.fromkeys(nearest.tolist()))[:most]
+        following = np.searchsorted(np.array(anchors), ranked)
+        likeliest = list(dict.fromkeys(following.tolist()))[:most]
         return [anchors[i] for i in sorted(likeliest)]
 
     def _sighting(self, h: Hypothesis) -> Proposal:
