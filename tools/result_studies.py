@@ -196,6 +196,16 @@ STUDIES = (
         (Step("python tools/rgbd_robustness.py --recordings $OUT", own_bars=True),),
     ),
     Study(
+        "carried",
+        "Carried away unseen",
+        "A robot is carried 20 m away and drives on in a place that it knows. How far until its map has it there, and loops "
+        "that are wrong by more than 1 m; by laser and by RGB-D camera.",
+        (
+            Step("python tools/carried_study.py office --config laser --seeds 1 2 3 4 5", own_bars=True),
+            Step("python tools/carried_study.py office --config rgbd --seeds 1 2 3", own_bars=True),
+        ),
+    ),
+    Study(
         "never-harmful",
         "A threshold from far too strict to far too loose",
         "Error of the robust map at each value of an acceptance threshold; its bar is the error of odometry.",
