@@ -17,6 +17,7 @@ from hybridmap.report.map_figure import loops_by_fate
 from hybridmap.report.outline import outline, outlines, raster
 from hybridmap.report.scene import Scene, load_scene
 from hybridmap.store import MapStore, SessionFolder
+from hybridmap.study.statistics import Interval
 from hybridmap.trajectory import Trajectory
 from tests.store.sessions import RIG, keyframe_of, ring_map, truth_at, write_session
 
@@ -189,9 +190,11 @@ def test_times_are_said_as_people_say_them(value: float, said: tuple[str, str]) 
         ((2e-6, -7e-6, 1e-5), "0.000002 [-0.000007, 0.000010]"),
         ((1234.0, 1000.0, 1500.0), "1234 [1000, 1500]"),
         ((0.5, 0.5, 0.5), "0.500000 [0.500000, 0.500000]"),
-        ((1.25, math.nan, math.nan), "1.25"),
+        ((1.25, math.nan, math.nan), "1.25 (7 values: no interval)"),
+        ((-1e-14, math.nan, math.nan), "0 (7 values: no interval)"),
         ((math.nan, math.nan, math.nan), "–"),
     ],
 )
 def test_an_interval_has_the_decimals_that_it_bears_out(figures, text):
-    assert tables.interval(*figures) == text
+    count = 0 if math.isnan(figures[0]) else 7
+    assert tables.interval(Interval(*figures, count, 0.95)) == text
