@@ -31,8 +31,10 @@ def inject(graph: PoseGraph, share: float, mode: Literal["random", "aliased"], r
         GraphError: no loop to copy, or a share outside [0, 1).
     """
     true = np.flatnonzero(graph.is_loop)
-    if len(true) == 0 or not 0.0 <= share < 1.0:
-        raise GraphError(f"graph: cannot inject a share of {share} false loops into {len(true)} loops; expected 0 <= share < 1")
+    if not 0.0 <= share < 1.0:
+        raise GraphError(f"graph: cannot inject a share of {share} false loops; expected 0 <= share < 1")
+    if len(true) == 0:
+        raise GraphError("graph: found no loops, expected at least one for false ones to copy")
     count = round(len(true) * share / (1.0 - share))
     copied, ends = _random_pairs(graph, true, count, rng) if mode == "random" else _aliased_pairs(graph, true, count, rng)
     last = int(graph.edge_ids[-1]) if graph.n_edges else -1

@@ -68,6 +68,8 @@ def _show(done: Study) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from hybridmap.study.model import quoted
+
     console = Console()
     if not console.is_terminal:
         console = Console(width=140)
@@ -78,7 +80,7 @@ def _show(done: Study) -> None:
     )
     table.add_column("source / setting / false loops")
     table.add_column("back-end")
-    for column in ("solved", "median ATE (m)", f"mean minus {done.head['baseline']} (m)", "false kept", "own lost"):
+    for column in ("solved", "median ATE (m)", f"mean minus {quoted(done.head['baseline'])} (m)", "false kept", "own lost"):
         table.add_column(column, justify="right")
     for line in _lines(done):
         table.add_row(*line)
@@ -96,7 +98,7 @@ def _lines(done: Study) -> list[list[str]]:
     for (label, backend), found in by_row.items():
         ate, kept, lost = (found[name] for name in _HEADLINES)
         apart = ate.difference
-        paired = "" if apart is None or not apart.count else interval(apart.value, apart.low, apart.high)
+        paired = "" if apart is None or not apart.count else interval(apart)
         figures = [f"{one.median:.4g}" if one.solved else "" for one in (ate, kept, lost)]
         lines.append([label, backend, f"{ate.solved}/{ate.cells}", figures[0], paired, figures[1], figures[2]])
     return lines

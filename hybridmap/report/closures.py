@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.evaluate.scores import in_words
 from hybridmap.geometry import Array, between, transform_points
 from hybridmap.graph.experience_map import Edge, Status
 from hybridmap.report import style
@@ -22,6 +23,9 @@ _NEIGHBOURS = 6
 _MAX_POINTS = 3000
 _SIMILAR_HEADING_RAD = np.radians(40.0)
 _APART_S = 20.0
+WIDTH_IN, TITLE_PT = 3.8, 8.5
+"""Of the pictures of a closure, and of their titles."""
+_LEFT = 0.15  # of the overlay: where its axes and its title begin
 _OVERLAY_SHAPE = 1.345  # width over height of its axes
 _NEW, _OLD = style.PRIMARY, style.ODOMETRY
 
@@ -125,8 +129,9 @@ def _facts(scene: Scene, edge: Edge) -> tuple[tuple[str, str], ...]:
         drift = between(edge.relative.delta, between(nodes[edge.source].pose_odom, nodes[edge.target].pose_odom))
         rows.append((f"{ODOMETRY} disagrees by", f"{np.hypot(drift[0], drift[1]):.3f} m, {np.degrees(abs(drift[2])):.2f}°"))
         rows.append(("final map disagrees by", f"{_contradiction_m(scene, edge):.3f} m"))
-    rows += [(name.replace("_", " "), f"{value:.4g}") for name, value in edge.scores.items()]
-    return tuple(rows)
+    else:
+        rows.append(("measured", "nothing"))
+    return (*rows, *in_words(edge.scores))
 
 
 def _seen_around(scene: Scene, node: int, points_of: Mapping[int, Array]) -> Array:
@@ -144,7 +149,7 @@ def _overlay(scene: Scene, edge: Edge, points_of: Mapping[int, Array]) -> str | 
         return None
     delta = edge.relative.delta if edge.relative is not None else between(scene.nodes[edge.source], scene.nodes[edge.target])
     placed = transform_points(delta, old)
-    with style.figure(3.8, 3.4, margins=(0.15, 0.98, 0.23, 0.92)) as picture:
+    with style.figure(WIDTH_IN, 3.4, margins=(_LEFT, 0.98, 0.23, 0.92)) as picture:
         axes = picture.add_subplot()
         style.metric_axes(axes, adjustable="box")
         dots: dict[str, Any] = {"linestyle": "none", "marker": ".", "markeredgewidth": 0, "rasterized": True}
@@ -157,12 +162,16 @@ def _overlay(scene: Scene, edge: Edge, points_of: Mapping[int, Array]) -> str | 
         half_width = max(half[0], half[1] * _OVERLAY_SHAPE)
         axes.set_xlim(center[0] - half_width, center[0] + half_width)
         axes.set_ylim(center[1] - half_width / _OVERLAY_SHAPE, center[1] + half_width / _OVERLAY_SHAPE)
-        how = "by the measured pose" if edge.relative is not None else "as the map has them (nothing was measured)"
-        axes.set_title(f"laid over each other {how}", fontsize=8.5)
+        axes.set_title(overlay_title(edge), fontsize=TITLE_PT)
         legend = picture.legend(loc="lower center", ncols=2, markerscale=3.0)
         for handle in legend.legend_handles:
             handle.set_alpha(1.0)
         return style.svg_uri(picture)
+
+
+def overlay_title(edge: Edge) -> str:
+    """How the two views came to lie over each other."""
+    return f"laid over each other {'as the map has them' if edge.relative is None else 'by the measured pose'}"
 
 
 def _draw_robot(axes: Any, pose: Array, color: str) -> None:
@@ -174,7 +183,7 @@ def _profiles(new: NDArray[Any], old: NDArray[Any], shift: int) -> str:
     bands, width = new.shape
     spacing = 1.15 * float(max(np.ptp(new, axis=1).max(), np.ptp(old, axis=1).max(), 1e-6))
     column = np.arange(width)
-    with style.figure(3.8, 3.4, margins=(0.22, 0.98, 0.15, 0.92)) as picture:
+    with style.figure(WIDTH_IN, 3.4, margins=(0.22, 0.98, 0.15, 0.92)) as picture:
         axes = picture.add_subplot()
         for band in range(bands):
             base = (bands - 1 - band) * spacing
@@ -182,7 +191,7 @@ def _profiles(new: NDArray[Any], old: NDArray[Any], shift: int) -> str:
             axes.plot(column, new[band] + base, color=_NEW, linewidth=1.0)
         axes.set_yticks([(bands - 1 - band) * spacing for band in range(bands)], _band_names(bands))
         axes.set_xlabel(f"column; the older one moved by {shift}" if shift else "column")
-        axes.set_title("scanline profiles, normalised", fontsize=8.5)
+        axes.set_title("scanline profiles, normalised", fontsize=TITLE_PT)
         return style.svg_uri(picture)
 
 

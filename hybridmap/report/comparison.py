@@ -62,7 +62,7 @@ def write_comparison(folder: Path, compared: Compared) -> Path:
         facts=[(key, value) for key, value in compared.head.items() if key not in ("nodes", "edges", "loops")],
         tiles=[(compared.head[key], key) for key in ("nodes", "edges", "loops")],
         columns=compared.cells[0],
-        rows=[{"cells": line, "bad": row.solution is None} for row, line in zip(rows, compared.cells[1:], strict=True)],
+        rows=[{"cells": line, "bad": not figures.has_map(row)} for row, line in zip(rows, compared.cells[1:], strict=True)],
         messages=[(row.title, row.message) for row in rows],
         ways={str(row.way) for row in rows},
         of_truth=compared.truth is not None,
@@ -71,7 +71,8 @@ def write_comparison(folder: Path, compared: Compared) -> Path:
         convergence=figures.convergence(rows),
         weights=figures.weights(graph, rows),
         residuals=figures.residuals(graph, rows),
-        worst=[(row.title, worst_edges(graph, row)) for row in rows if row.solution is not None],
+        worst=[(row.title, worst_edges(graph, row)) for row in rows if figures.has_map(row)],
+        without=[row.title for row in rows if not figures.has_map(row)],
         settings=yaml.safe_dump(compared.settings.model_dump(mode="json", exclude={"names"}), sort_keys=False),
         version=version("hybridmap"),
     )

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hybridmap.backends.base import SolveStatus
 from hybridmap.backends.comparison import Row, Way
 from hybridmap.backends.objective import squared_norms
 from hybridmap.geometry import Array
@@ -17,19 +18,30 @@ from hybridmap.report import style
 
 _CHAIN, _LOOP, _REJECTED = style.PRIMARY, style.ACCEPTED, style.REJECTED
 _COLUMNS = 3
+_THICK_PT, _THIN_PT = 4.4, 1.1  # of the first line and the last
 _MARGIN = 0.05  # round a map, of its size
 _SHARP = 24  # lines of an image for each bar: smoothing along the loops must not run from bar to bar
 _BAR_IN = 0.34  # height of a back-end's bar of weights
 
 
 def solved(rows: Sequence[Row]) -> dict[str, Array]:
-    """Title -> poses (N, 3) of the rows that have a map."""
-    return {row.title: row.solution.poses for row in rows if row.solution is not None}
+    """Title -> poses (N, 3) of the rows that have a map: one that diverged has its start only."""
+    return {row.title: row.solution.poses for row in rows if has_map(row) and row.solution is not None}
+
+
+def has_map(row: Row) -> bool:
+    """Whether a row came to a map of its own."""
+    return row.solution is not None and row.solution.report.status not in (SolveStatus.FAILED, SolveStatus.DIVERGED)
 
 
 def overlay(rows: Sequence[Row], truth: Array | None) -> str:
-    """The chain of nodes of every row in one frame, over the truth (P, 3) where it is known; a `data:` URI."""
+    """The chain of nodes of every row in one frame, over the truth (P, 3) where it is known; a `data:` URI.
+
+    Empty where no row has a map.
+    """
     maps = solved(rows)
+    if not maps:
+        return ""
     framed = [poses for title, poses in maps.items() if title != "odometry"] or list(maps.values())
     low, high = _box(framed if truth is None else [*framed, truth])
     with style.figure(*style.fitted_size(high - low)) as picture:
@@ -75,7 +87,7 @@ def save_panels(path: Path, graph: PoseGraph, rows: Sequence[Row], start: str) -
 
 def convergence(rows: Sequence[Row]) -> str:
     """Batch: chi2 over iterations; incremental: unit variance over nodes; a `data:` URI, empty where nothing was traced."""
-    traced = [row for row in rows if row.curve is not None and row.backend != "odometry"]
+    traced = [row for row in rows if has_map(row) and row.curve is not None and row.backend != "odometry"]
     ways = [way for way in Way if any(row.way is way for row in traced)]
     if not ways:
         return ""
@@ -97,7 +109,7 @@ def weights(graph: PoseGraph, rows: Sequence[Row]) -> str:
     ids = graph.edge_ids[graph.is_loop].tolist()
     bars: dict[str, list[float]] = {}
     for row in rows:
-        report = row.solution.report if row.solution is not None else None
+        report = row.solution.report if row.solution is not None and has_map(row) else None
         if report is not None and (report.weights or report.rejected_edge_ids):
             out = set(report.rejected_edge_ids)
             bars[row.title] = [0.0 if edge in out else report.weights.get(edge, 1.0) for edge in ids]
@@ -116,7 +128,12 @@ def weights(graph: PoseGraph, rows: Sequence[Row]) -> str:
 
 
 def residuals(graph: PoseGraph, rows: Sequence[Row]) -> str:
-    """Share of edges (%) whose squared Mahalanobis residual is below a value, a line a row; a `data:` URI."""
+    """Share of edges (%) whose squared Mahalanobis residual is below a value, a line a row; a `data:` URI.
+
+    Empty where no row has a map.
+    """
+    if not solved(rows):
+        return ""
     share = 100.0 * (np.arange(graph.n_edges) + 1) / max(graph.n_edges, 1)
     looks = _looks(rows)
     with style.figure(style.PAGE_WIDTH_IN, 3.6) as picture:
@@ -132,17 +149,23 @@ def residuals(graph: PoseGraph, rows: Sequence[Row]) -> str:
 
 
 def _looks(rows: Sequence[Row]) -> Mapping[str, dict[str, Any]]:
-    """Title -> how its line is drawn: a colour a back-end, dashes for the incremental way."""
+    """Title -> how its line is drawn: a colour a back-end, dashes for the incremental way.
+
+    Each is thinner than those before and on top of them, so that lines which coincide can all be seen.
+    """
     colors = (style.PRIMARY, *style.OTHERS)
     names = [name for name in dict.fromkeys(row.backend for row in rows) if name != "odometry"]
     color_of = {"odometry": style.ODOMETRY} | {name: colors[i % len(colors)] for i, name in enumerate(names)}
-    plain: dict[str, Any] = {"linewidth": 1.4, "zorder": 5}
-    dashed = {"linewidth": 1.4, "zorder": 6, "linestyle": (0, (4, 1.6))}
-    dotted = {"linewidth": 1.2, "zorder": 4, "linestyle": (0, (1, 1))}
+    width = dict(zip((row.title for row in rows), np.linspace(_THICK_PT, _THIN_PT, len(rows)), strict=True))
     return {
         row.title: {
             "color": color_of[row.backend],
-            **(dotted if row.backend == "odometry" else dashed if row.way is Way.INCREMENTAL else plain),
+            "zorder": 5,
+            **(
+                {"linewidth": _THIN_PT, "linestyle": (0, (1, 1)), "zorder": 4}
+                if row.backend == "odometry"
+                else {"linewidth": width[row.title], "linestyle": (0, (4, 1.6)) if row.way is Way.INCREMENTAL else "-"}
+            ),
         }
         for row in rows
     }
@@ -158,9 +181,9 @@ def _box(maps: Sequence[Array]) -> tuple[Array, Array]:
 
 def _draw_map(axes: Any, graph: PoseGraph, poses: Array, rejected: tuple[int, ...]) -> None:
     lost, loops = np.isin(graph.edge_ids, np.array(rejected, dtype=np.int64)), graph.is_loop
-    _draw_edges(axes, graph, poses, loops & ~lost, color=_LOOP, linewidths=0.5, label="loops")
-    _draw_edges(axes, graph, poses, ~loops, color=_CHAIN, linewidths=0.9)
-    _draw_edges(axes, graph, poses, lost, color=_REJECTED, linewidths=0.8)
+    _draw_edges(axes, graph, poses, lost, color=_REJECTED, linewidths=0.4, alpha=0.6, zorder=1.1)
+    _draw_edges(axes, graph, poses, loops & ~lost, color=_LOOP, linewidths=0.6, zorder=1.2)
+    _draw_edges(axes, graph, poses, ~loops, color=_CHAIN, linewidths=0.9, zorder=1.3)
     style.metric_axes(axes)
 
 

@@ -12,6 +12,10 @@ from hybridmap.report import style
 from hybridmap.report.outline import Raster
 from hybridmap.report.scene import Scene
 
+_PALE = "#efbd97"
+_LEGEND_PT = 1.8
+_MANY = 200
+
 
 def trajectories_figure(scene: Scene, building: Raster | None) -> str:
     """Every back-end's trajectory over the truth and over what the primary back-end's map shows; a `data:` URI."""
@@ -49,27 +53,37 @@ def graph_figure(scene: Scene, building: Raster | None) -> str:
         _draw_edges(axes, scene, chain, color="#9a9a9a", linewidth=0.8, zorder=2)
         loops = loops_by_fate(scene)
         for fate, looks in _FATES.items():
-            _draw_edges(axes, scene, loops[fate], label=f"{fate} ({len(loops[fate])})", **looks)
+            many = len(loops[fate]) if fate == "loops rejected" else 0  # thousands of them would hide the building
+            alpha = min(1.0, max(0.3, _MANY / max(many, 1)))
+            _draw_edges(axes, scene, loops[fate], label=f"{fate} ({len(loops[fate])})", alpha=alpha, **looks)
         axes.plot(
-            scene.nodes[:, 0], scene.nodes[:, 1], linestyle="none", marker=".", markersize=3.5, color="#222222",
-            label=f"nodes ({len(scene.nodes)})", zorder=6,
+            scene.nodes[:, 0], scene.nodes[:, 1], linestyle="none", marker=".", markersize=1.8, color="#222222",
+            label=f"nodes ({len(scene.nodes)})", zorder=7,
         )  # fmt: skip
         style.metric_axes(axes)
-        picture.legend(loc="outside upper left", ncols=3)
+        _draw_legend(picture)
         return style.svg_uri(picture)
 
 
 _FATES: dict[str, dict[str, Any]] = {
-    "loops accepted": {"color": style.ACCEPTED, "linewidth": 1.6, "zorder": 5},
+    "loops accepted": {"color": style.ACCEPTED, "linewidth": 2.6, "zorder": 6},  # short ones show beside the nodes on them
     "accepted, no weight in the primary back-end": {
         "color": style.UNWEIGHTED,
-        "linewidth": 1.6,
+        "linewidth": 2.0,
         "linestyle": (0, (3, 1)),
         "zorder": 5,
     },
     "loops pending": {"color": style.PENDING, "linewidth": 1.1, "linestyle": (0, (4, 2)), "zorder": 4},
-    "loops rejected": {"color": style.REJECTED, "linewidth": 0.7, "linestyle": (0, (1, 1.5)), "alpha": 0.55, "zorder": 3},
+    "loops rejected": {"color": _PALE, "linewidth": 0.4, "zorder": 3},
 }
+
+
+def _draw_legend(picture: Any) -> None:
+    """Lines of the legend can be seen, however thin and pale they are in the picture."""
+    legend = picture.legend(loc="outside upper left", ncols=3, markerscale=2.5)
+    for line in legend.get_lines():
+        line.set_alpha(1.0)
+        line.set_linewidth(max(line.get_linewidth(), _LEGEND_PT))
 
 
 def loops_by_fate(scene: Scene) -> dict[str, list[Edge]]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from hybridmap.report import style
 from hybridmap.study.cell import CellResult
 from hybridmap.study.grid import Cell
+from hybridmap.study.model import quoted
 from hybridmap.study.statistics import Summary
 from hybridmap.study.study import Study
 
@@ -21,6 +22,7 @@ MOST_PANELS = 12
 FLOOR_M = 1e-4
 """Smaller errors are drawn here: a logarithm has no zero."""
 
+_LINEAR_M = 0.01  # differences below are drawn to scale
 _MOST_LINES = 9  # with more back-ends each gets a row of its own instead of a line
 _COLUMNS = 2
 Figure = Callable[[CellResult], float | None]
@@ -89,19 +91,25 @@ def _gathered(entries: Sequence[tuple[str, str, Cell, CellResult]], ticks: Seque
     return tuple(Panel(title, tuple(ticks), tuple(cells)) for title, cells in by_title.items())
 
 
+def having(plan: Layout, figure: Figure) -> Layout:
+    """Without the panels in which no cell has the figure."""
+    kept = (panel for panel in plan.panels if any(figure(result) is not None for _, _, result in panel.cells))
+    return replace(plan, panels=tuple(kept))
+
+
 def merit_figure(study: Study, plan: Layout, label: str, figure: Figure, *, logarithmic: bool) -> str:
-    """One figure of merit, an error or a share in percent: dots are cells, lines and bars their medians; a `data:` URI."""
-    shown = plan.panels[:MOST_PANELS]
+    """One figure of merit, an error or a share in percent: dots are cells, lines and bars their medians; a `data:` URI.
+
+    Panels in which no cell has it are left out; empty where none has.
+    """
+    shown = having(plan, figure).panels[:MOST_PANELS]
+    if not shown:
+        return ""
     titles = [variant.title for variant in study.grid.study.backends]
     looks = style.line_styles(titles)
     rows = plan.along == "back-end"
     with _axes(len(shown), 0.24 * len(titles) + 1.0 if rows else 2.9) as (picture, panels):
         for axes, panel in zip(panels, shown, strict=False):
-            if all(figure(result) is None for _, _, result in panel.cells):
-                axes.text(0.5, 0.5, "no cell has this figure", ha="center", transform=axes.transAxes, color="#666666")
-                axes.set_axis_off()
-                axes.set_title(panel.title, fontsize=9.0)
-                continue
             (_draw_rows if rows else _draw_lines)(axes, panel, figure, looks)
             axes.set_title(panel.title, fontsize=9.0)
             value_axis = axes.xaxis if rows else axes.yaxis
@@ -121,12 +129,20 @@ def merit_figure(study: Study, plan: Layout, label: str, figure: Figure, *, loga
         return style.svg_uri(picture)
 
 
-def difference_figure(summaries: Sequence[Summary]) -> str:
-    """Mean paired difference of ATE to the baseline with its interval, a panel a group; a `data:` URI, empty without any."""
+def paired_groups(summaries: Sequence[Summary]) -> dict[str, list[Summary]]:
+    """Group -> the differences of ATE to the baseline that are of several seeds; only groups that have some."""
     groups: dict[str, list[Summary]] = {}
     for one in summaries:
         if one.measure == "ate_m" and one.difference is not None and one.difference.count > 1:
             groups.setdefault(one.label, []).append(one)
+    return groups
+
+
+def difference_figure(groups: Mapping[str, Sequence[Summary]]) -> str:
+    """Mean paired difference of ATE to the baseline with its interval, a panel a group; a `data:` URI, empty without any.
+
+    A difference without an interval is a dot alone.
+    """
     if not groups:
         return ""
     shown = list(groups.items())[:MOST_PANELS]
@@ -136,21 +152,30 @@ def difference_figure(summaries: Sequence[Summary]) -> str:
             for row, one in enumerate(ones):
                 _draw_interval(axes, row, one)
             axes.axvline(0.0, color="#444444", linewidth=0.8)
-            axes.set_xscale("symlog", linthresh=0.01)
+            axes.set_xscale("symlog", linthresh=_LINEAR_M)
+            axes.set_xlim(*_reach(ones))
             axes.set_yticks(range(len(ones)), [one.backend for one in ones])
             axes.set_ylim(len(ones) - 0.5, -0.5)
             axes.set_title(label, fontsize=9.0)
-            axes.set_xlabel(f"ATE minus that of {ones[0].baseline} (m)")
+            axes.set_xlabel(f"ATE minus that of {quoted(ones[0].baseline)} (m)")
             axes.grid(True, axis="x", linewidth=0.5)
             axes.tick_params(axis="x", labelsize=7.5)
         return style.svg_uri(picture)
+
+
+def _reach(ones: Sequence[Summary]) -> tuple[float, float]:
+    """Limits of the axis, m: all that is drawn and some room, and never less than what is linear."""
+    drawn = [one.difference for one in ones if one.difference is not None]
+    ends = [end for apart in drawn for end in (apart.value, apart.low, apart.high) if np.isfinite(end)]
+    return 1.6 * min(-_LINEAR_M, *ends), 1.6 * max(_LINEAR_M, *ends)
 
 
 def _draw_interval(axes: Any, row: int, one: Summary) -> None:
     apart = one.difference
     assert apart is not None
     colour = "#666666" if not apart.excludes_zero else style.ACCEPTED if apart.high < 0.0 else style.REJECTED
-    axes.plot([apart.low, apart.high], [row, row], color=colour, linewidth=2.2, solid_capstyle="butt")
+    if apart.known:
+        axes.plot([apart.low, apart.high], [row, row], color=colour, linewidth=2.2, solid_capstyle="butt")
     axes.plot([apart.value], [row], "o", color=colour, markersize=4.5)
 
 
@@ -164,7 +189,8 @@ def _draw_lines(axes: Any, panel: Panel, figure: Figure, looks: dict[str, dict[s
             values = _values(panel, position, backend, figure)
             axes.plot([position + offset] * len(values), values, ".", color=looks[backend]["color"], markersize=3.5, alpha=0.55)
             medians.append(float(np.median(values)) if len(values) else np.nan)
-        axes.plot(np.arange(len(medians)) + offset, medians, label=backend, **looks[backend])
+        if np.isfinite(medians).any():
+            axes.plot(np.arange(len(medians)) + offset, medians, label=backend, **looks[backend])
     axes.set_xticks(range(len(panel.ticks)), panel.ticks)
     axes.set_xlim(-0.3, len(panel.ticks) - 0.7)
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from hybridmap.metrics import Metric
+from hybridmap.study.statistics import Interval
 
 _FIRST = ("ate", "relation")
 
@@ -63,13 +64,15 @@ def number(value: float) -> str:
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e7 else f"{value:.4g}"
 
 
-def interval(value: float, low: float, high: float) -> str:
-    """A value with its interval, of as many decimals as the interval bears out and at most six; alone if it has none."""
-    if not all(map(math.isfinite, (value, low, high))):
-        return number(value)
-    width = 0.5 * (high - low)
+def interval(found: Interval) -> str:
+    """A mean with its interval, of as many decimals as the interval bears out and at most six; where there is none, why."""
+    if not found.count:
+        return number(found.value)
+    if not found.known:
+        return f"{number(found.value if abs(found.value) >= 5e-7 else 0.0)} ({found})"
+    width = 0.5 * (found.high - found.low)
     decimals = min(6, max(0, 2 - math.floor(math.log10(width)))) if width > 0.0 else 6
-    figures = [round(figure, decimals) + 0.0 for figure in (value, low, high)]
+    figures = [round(figure, decimals) + 0.0 for figure in (found.value, found.low, found.high)]
     middle, left, right = (f"{figure:.{decimals if any(figures) else 0}f}" for figure in figures)
     return f"{middle} [{left}, {right}]"
 

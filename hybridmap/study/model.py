@@ -207,6 +207,11 @@ class StudyConfig(Section):
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
 
 
+def quoted(title: str) -> str:
+    """A title as it stands within a sentence: in quotes where it is of several words."""
+    return f"“{title}”" if re.search(r"[\s,;]", title) else title
+
+
 def named_studies() -> dict[str, Path]:
     """Name -> file of the studies that come with the package (in a checkout: `configs/studies/`)."""
     package = Path(str(resources.files("hybridmap")))

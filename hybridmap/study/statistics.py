@@ -14,10 +14,14 @@ from hybridmap.study.cell import MEASURES, CellResult
 from hybridmap.study.grid import Cell, Grid
 from hybridmap.study.model import StatisticsConfig
 
+LEAST = {"t": 3, "bootstrap": 5}
+"""Method -> values that an interval needs. Two give Student's t one degree of freedom, hence limits of no use; of a few
+values the bootstrap's limits are the least and the greatest of them, whatever the confidence asked for."""
+
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A mean with its confidence interval; both limits are NaN with fewer than two values.
+    """A mean with its confidence interval; both limits are NaN with fewer values than the method needs (`LEAST`).
 
     Attributes:
         value, low, high: the mean and its limits; NaN without any value.
@@ -32,13 +36,18 @@ class Interval:
     confidence: float
 
     def __str__(self) -> str:
-        if math.isnan(self.low):
-            return f"{self.count} values: no interval"
+        if not self.known:
+            return f"{self.count} value{'' if self.count == 1 else 's'}: no interval"
         return f"{100 * self.confidence:g} % interval {self.low:.4g} to {self.high:.4g} of {self.count}"
 
     @property
+    def known(self) -> bool:
+        """Whether there is an interval."""
+        return math.isfinite(self.low) and math.isfinite(self.high)
+
+    @property
     def excludes_zero(self) -> bool:
-        """Whether the whole interval is on one side of zero."""
+        """Whether there is an interval and all of it is on one side of zero."""
         return self.low > 0.0 or self.high < 0.0
 
 
@@ -95,11 +104,11 @@ def summarise(grid: Grid, results: Mapping[str, CellResult]) -> list[Summary]:
 def mean_of(values: Array, config: StatisticsConfig) -> Interval:
     """The mean of (N,) values with its confidence interval, by Student's t or the BCa bootstrap; no draw is left to chance.
 
-    Values that are all alike have an interval of no width.
+    With fewer values than `LEAST` there is no interval; enough values that are all alike have one of no width.
     """
     count = len(values)
     mean = float(np.mean(values)) if count else math.nan
-    if count < 2:
+    if count < LEAST[config.method]:
         return Interval(mean, math.nan, math.nan, count, config.confidence)
     if np.ptp(values) == 0.0:
         return Interval(mean, mean, mean, count, config.confidence)

@@ -13,7 +13,7 @@ from hybridmap.study import provenance, tables
 from hybridmap.study.cell import CellResult
 from hybridmap.study.folder import CELLS_CSV, METRICS, STUDY, SUMMARY_CSV, TIMINGS_CSV, StudyFolder
 from hybridmap.study.grid import Cell, Grid, lay_out
-from hybridmap.study.model import StudyConfig
+from hybridmap.study.model import StudyConfig, quoted
 from hybridmap.study.pools import Pool
 from hybridmap.study.runner import Progress, run
 from hybridmap.study.statistics import Summary, summarise
@@ -101,6 +101,6 @@ def _metrics(summaries: Sequence[Summary]) -> list[Metric]:
         metrics.append(Metric(f"{stem}_median/{stage}", one.median, one.unit, f"median of {one.solved} of {one.cells} cells"))
         metrics.append(Metric(f"{stem}_mean/{stage}", one.mean.value, one.unit, f"mean, {one.mean}"))
         if one.difference is not None:
-            what = f"mean of the paired differences to {one.baseline}, {one.difference}"
+            what = f"mean of the paired differences to {quoted(one.baseline)}, {one.difference}"
             metrics.append(Metric(f"{stem}_difference/{stage}", one.difference.value, one.unit, what))
     return metrics

@@ -1,19 +1,23 @@
 """What the page's parts compute: alignment, errors over time, fates of loops, what a keyframe shows from above."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from hybridmap.evaluate import checks
+from hybridmap.evaluate.scores import in_words
 from hybridmap.geometry import compose, transform_points
 from hybridmap.metrics import Metric
-from hybridmap.report import tables
+from hybridmap.report import closures, map_figure, style, tables
 from hybridmap.report.closures import examples, spread
 from hybridmap.report.error_figure import ErrorSeries, error_series, over_intervals
 from hybridmap.report.map_figure import loops_by_fate
 from hybridmap.report.outline import outline, outlines, raster
 from hybridmap.report.scene import Scene, load_scene
 from hybridmap.store import MapStore, SessionFolder
+from hybridmap.study.statistics import Interval
 from hybridmap.trajectory import Trajectory
 from tests.store.sessions import RIG, keyframe_of, ring_map, truth_at, write_session
 
@@ -75,6 +79,47 @@ def test_examples_are_spread_and_end_with_a_refused_one(session: SessionFolder, 
     assert len({example.title for example in found}) == 4
     assert all(example.overlay and example.profiles and len(example.photos) == 2 for example in found)
     assert ("time apart", "40.0 s") in found[0].facts
+
+
+def test_the_figures_of_a_closure_are_in_words_with_units(scene: Scene) -> None:
+    assert in_words({"off_m": 0.25, "inliers": 12.0}) == [
+        ("off the expected position by", "0.25 m"),
+        ("features that agree on the pose", "12"),
+    ]
+    scans = dict(in_words({"near": 0.9, "fit": 0.8, "inliers": 0.7, "loosest_m": 0.012, "whole_map": 1.0, "new_one": 1.0}))
+    assert scans["share of all points that lie close"] == "0.7"
+    assert scans["standard deviation in the loosest direction"] == "0.012 m"
+    assert scans["sought in the whole map"] == "yes"
+    assert scans["new one"] == "1"
+
+
+def test_every_figure_that_decides_a_loop_has_words() -> None:
+    for rule in (*checks._PROFILE, *checks._BY_FEATURES, *checks._BY_DEPTH, *checks._BY_SCANS):
+        ((words, _),) = in_words({rule.figure: 1.0})
+        assert words != rule.figure.replace("_", " ")
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_titles_of_overlays_are_as_wide_as_their_axes(scene: Scene, measured: bool) -> None:
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextPath
+
+    edge = next(edge for edge in scene.experiences.edges if edge.relative is not None)
+    title = closures.overlay_title(edge if measured else replace(edge, relative=None))
+    bold = FontProperties(family="sans-serif", weight="bold", size=closures.TITLE_PT)
+    assert TextPath((0, 0), title, prop=bold).get_extents().width < 72 * 0.8 * closures.WIDTH_IN
+
+
+def test_accepted_loops_lie_over_the_rejected_ones_and_the_legend_can_be_read(scene: Scene) -> None:
+    order = [looks["zorder"] for looks in map_figure._FATES.values()]
+    assert order == sorted(order, reverse=True)
+    thin, thick = map_figure._FATES["loops rejected"], map_figure._FATES["loops accepted"]
+    assert thin["linewidth"] < 0.5 * thick["linewidth"]
+    with style.figure(4.0, 3.0) as picture:
+        picture.add_subplot().plot([0, 1], [0, 1], label="rejected", alpha=0.3, linewidth=thin["linewidth"])
+        map_figure._draw_legend(picture)
+        (line,) = picture.legends[0].get_lines()
+        assert (line.get_linewidth() >= 1.5, line.get_alpha()) == (True, 1.0)
 
 
 def test_spread_takes_the_middles() -> None:
@@ -145,9 +190,11 @@ def test_times_are_said_as_people_say_them(value: float, said: tuple[str, str]) 
         ((2e-6, -7e-6, 1e-5), "0.000002 [-0.000007, 0.000010]"),
         ((1234.0, 1000.0, 1500.0), "1234 [1000, 1500]"),
         ((0.5, 0.5, 0.5), "0.500000 [0.500000, 0.500000]"),
-        ((1.25, math.nan, math.nan), "1.25"),
+        ((1.25, math.nan, math.nan), "1.25 (7 values: no interval)"),
+        ((-1e-14, math.nan, math.nan), "0 (7 values: no interval)"),
         ((math.nan, math.nan, math.nan), "–"),
     ],
 )
 def test_an_interval_has_the_decimals_that_it_bears_out(figures, text):
-    assert tables.interval(*figures) == text
+    count = 0 if math.isnan(figures[0]) else 7
+    assert tables.interval(Interval(*figures, count, 0.95)) == text

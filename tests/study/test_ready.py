@@ -1,10 +1,52 @@
-"""A ready study on a real graph, in small."""
+"""A ready study on a real graph, in small, and what the studies that are shown ask for."""
+
+import re
+from pathlib import Path
 
 import pytest
+import yaml
 
-from hybridmap.study import StudyConfig
+from hybridmap.study import StudyConfig, named_studies
 from hybridmap.study.pools import ThisProcess
+from hybridmap.study.statistics import LEAST
 from hybridmap.study.study import run_study
+
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "studies.md"
+
+
+@pytest.fixture
+def example(monkeypatch):
+    """The study that is printed in the documents."""
+    monkeypatch.setenv("HYBRIDMAP_DATA", "/data")
+    (text,) = re.findall(r"^```yaml\n(.*?)^```$", DOCUMENT.read_text(), re.DOTALL | re.MULTILINE)
+    return StudyConfig.from_tree(yaml.safe_load(text), str(DOCUMENT), Path.cwd())
+
+
+def test_the_printed_example_ends_well_in_small(example, tmp_path):
+    assert len(example.seeds) >= LEAST[example.statistics.method]
+    laps = next(source for source in example.sources if source.synthetic).model_copy(update={"first_nodes": 75})
+    mixes = example.false_loops.model_copy(update={"rates": (0.0, 0.4), "kinds": ("random",)})
+    done = run_study(
+        example.model_copy(update={"seeds": (0,), "sources": (laps,), "false_loops": mixes}), tmp_path, ThisProcess()
+    )
+    assert set(done.head["status"]) <= {"converged", "max-iterations"}
+    assert all(result.figures["ate_m"] is not None for _, result in done.rows)
+
+
+@pytest.mark.slow
+def test_the_world_of_the_printed_example_has_loops(example, tmp_path):
+    world = next(source for source in example.sources if source.world)
+    changes = {"seeds": (0,), "sources": (world,), "settings": example.settings[:1], "backends": example.backends[:1]}
+    done = run_study(example.model_copy(update=changes), tmp_path, ThisProcess())
+    assert all((result.figures["own_loops"] or 0) > 10 for _, result in done.rows)
+    assert done.head["status"].keys() <= {"converged", "max-iterations"}
+
+
+@pytest.mark.parametrize("name", sorted(named_studies()))
+def test_ready_studies_have_seeds_enough_for_their_intervals(name, monkeypatch):
+    monkeypatch.setenv("HYBRIDMAP_DATA", "/data")
+    study = StudyConfig.load(name)
+    assert len(study.seeds) >= LEAST[study.statistics.method]
 
 
 @pytest.mark.data

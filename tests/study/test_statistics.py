@@ -49,8 +49,20 @@ def test_degenerate_samples_have_honest_intervals(method):
     alike = mean_of(np.full(5, 2.0), config)
     assert (alike.low, alike.high) == (2.0, 2.0)
     assert alike.excludes_zero
-    two = mean_of(np.array([1.0, 2.0]), config)
-    assert two.low <= 1.5 <= two.high
+
+
+@pytest.mark.parametrize(("method", "least"), [("t", 3), ("bootstrap", 5)])
+def test_a_few_values_have_no_interval_and_no_verdict(method, least):
+    config = StatisticsConfig(method=method)
+    for values in (np.linspace(1.0, 1.1, least - 1), np.ones(least - 1)):
+        few = mean_of(values, config)
+        assert not few.known
+        assert not few.excludes_zero
+        assert few.value == pytest.approx(values.mean())
+        assert str(few) == f"{least - 1} values: no interval"
+    enough = mean_of(np.linspace(1.0, 1.1, least), config)
+    assert enough.low < enough.value < enough.high
+    assert str(mean_of(np.ones(1), config)) == "1 value: no interval"
 
 
 def results_of(grid, ate):

@@ -1,0 +1,68 @@
+"""The page of a comparison: a row that diverged has no map, and lines that coincide can all be seen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybridmap.backends import comparison
+from hybridmap.backends.base import SolveStatus
+from hybridmap.config.backends import BackendsConfig
+from hybridmap.report import comparison_figures
+from hybridmap.report.comparison import Compared, write_comparison
+from tests.backends.graphs_for_tests import laps
+
+NAMES = ("gtsam-lm", "odometry", "relaxation-ratslam")
+
+
+@pytest.fixture(scope="module")
+def graph():
+    return laps(np.random.default_rng(0), nodes=30, per_lap=12)[0]
+
+
+@pytest.fixture(scope="module")
+def rows(graph):
+    return comparison.compare(graph, NAMES)
+
+
+def diverged(row):
+    report = replace(row.solution.report, status=SolveStatus.DIVERGED, message="theta is too large")
+    return replace(row, solution=replace(row.solution, report=report))
+
+
+def page_of(folder, graph, rows):
+    cells = [("back-end",), *((row.title,) for row in rows)]
+    head = {"nodes": 30, "edges": graph.n_edges, "loops": 18}
+    return write_comparison(folder, Compared("laps", "the start", head, graph, rows, cells, BackendsConfig())).read_text()
+
+
+def test_a_row_that_diverged_is_in_the_table_and_in_no_picture(graph, rows, tmp_path):
+    some = [*rows[:2], diverged(rows[2])]
+    assert list(comparison_figures.solved(some)) == ["gtsam-lm", "odometry"]
+    page = page_of(tmp_path, graph, some)
+    assert "Without a map, in the table alone: relaxation-ratslam." in page
+    assert '<tr class="bad"><td>relaxation-ratslam</td></tr>' in page
+    assert "theta is too large" in page
+    assert "Without a map" not in page_of(tmp_path, graph, rows)
+
+
+def test_a_page_without_any_map_shows_the_start_alone(graph, rows, tmp_path):
+    page = page_of(tmp_path, graph, [diverged(row) for row in rows])
+    assert page.count("data:image/") == 1
+    assert "What the edges cost" not in page
+
+
+def test_later_lines_are_thinner_and_on_top(rows):
+    looks = comparison_figures._looks([rows[0], rows[2], replace(rows[0], backend="gtsam-gnc", title="gtsam-gnc")])
+    widths = [look["linewidth"] for look in looks.values()]
+    assert widths == sorted(widths, reverse=True)
+    assert len(set(widths)) == 3
+    assert len({look["zorder"] for look in looks.values()}) == 1  # equal: drawn in their order
+
+
+def test_rejected_loops_lie_under_the_others(graph, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(comparison_figures, "_draw_edges", lambda *_, **looks: drawn.append((looks["zorder"], looks["color"])))
+    monkeypatch.setattr(comparison_figures.style, "metric_axes", lambda _: None)
+    comparison_figures._draw_map(None, graph, graph.initial, (int(graph.edge_ids[graph.is_loop][0]),))
+    assert min(drawn)[1] == comparison_figures.style.REJECTED
