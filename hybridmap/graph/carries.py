@@ -43,13 +43,23 @@ def carries(experiences: ExperienceMap) -> tuple[Carry, ...]:
     return tuple(sorted(found, key=lambda carry: carry.after))
 
 
-def grounded(trajectory: Trajectory, experiences: ExperienceMap) -> Trajectory:
-    """A trajectory without the poses while the robot was carried, which no sensor tells.
+def pieces(trajectory: Trajectory, experiences: ExperienceMap) -> list[Trajectory]:
+    """A trajectory before, between and after the carries of a drive, without the poses on the way through the air.
 
-    The motion up to a node belongs to the way before it, so that the pose at the very stamp of `after` is left out too.
+    The motion up to a node belongs to the way before it, so that the pose at the very stamp of `Carry.after` is left out too.
     """
-    kept = np.ones(len(trajectory), dtype=bool)
+    number, aloft = np.zeros(len(trajectory), dtype=np.int64), np.zeros(len(trajectory), dtype=bool)
     for carry in carries(experiences):
-        up_ns, down_ns = experiences.node(carry.before).stamp_ns, experiences.node(carry.after).stamp_ns
-        kept &= (trajectory.stamps_ns <= up_ns) | (trajectory.stamps_ns > down_ns)
-    return trajectory if kept.all() else Trajectory(trajectory.stamps_ns[kept], trajectory.poses[kept])
+        down = trajectory.stamps_ns > experiences.node(carry.after).stamp_ns
+        number += down
+        aloft |= (trajectory.stamps_ns > experiences.node(carry.before).stamp_ns) & ~down
+    found = [np.flatnonzero((number == i) & ~aloft) for i in range(int(number.max(initial=0)) + 1)]
+    return [Trajectory(trajectory.stamps_ns[rows], trajectory.poses[rows]) for rows in found if len(rows)]
+
+
+def grounded(trajectory: Trajectory, experiences: ExperienceMap) -> Trajectory:
+    """A trajectory without the poses while the robot was carried, which no sensor tells."""
+    parts = pieces(trajectory, experiences)
+    if len(parts) < 2:
+        return trajectory
+    return Trajectory(np.concatenate([p.stamps_ns for p in parts]), np.concatenate([p.poses for p in parts]))

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from hybridmap.graph.carries import pieces
 from hybridmap.graph.experience_map import Edge, Status
 from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.report import style
@@ -36,9 +37,10 @@ def draw_trajectories(axes: Any, scene: Scene, building: Raster | None) -> None:
     styles = style.line_styles(scene.backends)
     for name in scene.backends:
         if name in scene.estimates:
-            poses = style.thinned(scene.estimates[name].poses)
             label = f"{name} (primary)" if name == scene.primary else name
-            axes.plot(poses[:, 0], poses[:, 1], label=label, **styles[name])
+            for i, piece in enumerate(pieces(scene.estimates[name], scene.experiences)):
+                poses = style.thinned(piece.poses)
+                axes.plot(poses[:, 0], poses[:, 1], label="" if i else label, **styles[name])
     start = scene.estimates.get(scene.primary, scene.estimates["odometry"]).poses[0]
     axes.plot(*start[:2], marker="o", markersize=7, color="white", markeredgecolor="black", zorder=8, label="start")
     style.metric_axes(axes)

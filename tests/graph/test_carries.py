@@ -3,7 +3,7 @@
 import numpy as np
 
 from hybridmap.geometry import RelativePose
-from hybridmap.graph.carries import carries, grounded
+from hybridmap.graph.carries import carries, grounded, pieces
 from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
 from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.trajectory import Trajectory
@@ -42,4 +42,6 @@ def test_a_trajectory_has_no_pose_of_the_way_through_the_air():
     hung = (EdgeKind.REGISTRATION, Status.ACCEPTED, {"carried_m": 5.0})
     left = grounded(way, drive(hung)).stamps_ns / SECOND
     assert left.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, 3.5, 4.0, 4.5, 5.0]
+    assert [len(piece) for piece in pieces(way, drive(hung))] == [5, 4]
     assert grounded(way, drive()) is way
+    assert len(pieces(way, drive())) == 1
