@@ -65,6 +65,12 @@ class Row:
         """One line for people."""
         return self.failure if self.solution is None else self.solution.report.summary
 
+    @property
+    def verdict(self) -> str:
+        """The message, and why its solution is not certified."""
+        doubt = "" if self.certificate is None or self.certificate.certified else self.certificate.message
+        return "; ".join(filter(None, (self.message, doubt)))
+
 
 def compare(
     graph: PoseGraph,
@@ -166,7 +172,7 @@ def metrics_of(rows: Sequence[Row]) -> list[Metric]:
             figures.append(("weak_edges", weak, "1", "odometry and registration edges of next to no weight"))
             figures.append(("hanging_nodes", hanging, "1", "nodes that only such edges and rejected loops hold"))
         if row.certificate is not None and np.isfinite(row.certificate.gap):
-            what = "relative gap of the isotropised objective to its lower bound, over the edges kept"
+            what = "proved relative gap of the isotropised objective at its optimum beside the map, over the edges kept"
             figures.append(("certificate_gap", row.certificate.gap, "1", what))
         title = row.title or row.backend
         metrics += [Metric(f"{measure}/{title}", value, unit, text) for measure, value, unit, text in figures]

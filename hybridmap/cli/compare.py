@@ -148,4 +148,4 @@ def _show(cells: Sequence[Sequence[str]], rows: Sequence[Row], title: str) -> No
         table.add_row(*line)
     console.print(table)
     for row in rows:
-        typer.echo(f"{row.title}: {row.message}")
+        typer.echo(f"{row.title}: {row.verdict}")

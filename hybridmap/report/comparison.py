@@ -63,7 +63,7 @@ def write_comparison(folder: Path, compared: Compared) -> Path:
         tiles=[(compared.head[key], key) for key in ("nodes", "edges", "loops")],
         columns=compared.cells[0],
         rows=[{"cells": line, "bad": row.solution is None} for row, line in zip(rows, compared.cells[1:], strict=True)],
-        messages=[(row.title, row.message) for row in rows],
+        messages=[(row.title, row.verdict) for row in rows],
         ways={str(row.way) for row in rows},
         of_truth=compared.truth is not None,
         overlay=figures.overlay(rows, compared.truth),

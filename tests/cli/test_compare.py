@@ -164,3 +164,12 @@ def test_a_curve_leads_from_the_start_to_the_solution():
         assert np.all(np.diff(effort) > 0)
         assert np.all(np.diff(cost) <= 2e-3 * cost[:-1])  # relaxation's own objective is another one
         assert len(cost) >= 3
+
+
+def test_what_is_at_no_optimum_has_no_gap_and_says_why(monkeypatch, capsys, square):
+    words = ("compare", square, "--backends", "odometry,gtsam-lm")
+    _, printed, _ = run(monkeypatch, capsys, *words, "--json")
+    gaps = [row["name"] for row in json.loads(printed)["metrics"] if row["name"].startswith("certificate_gap")]
+    assert gaps == ["certificate_gap/gtsam-lm"]
+    _, printed, _ = run(monkeypatch, capsys, *words)
+    assert "odometry: dead reckoning; not certified: this solution is not at an optimum" in printed
