@@ -10,7 +10,7 @@ import numpy as np
 from hybridmap.errors import GraphError
 from hybridmap.geometry import Array
 from hybridmap.graph.connectivity import chain
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.pose_graph import EdgeKind, GraphFile, PoseGraph
 from hybridmap.trajectory import write_text_atomic
 
 # Where xx, xy, xt, yy, yt, tt stand among the six numbers of a line.
@@ -28,6 +28,7 @@ class _Lines:
     ends: list[tuple[int, int]] = field(default_factory=list)
     deltas: list[list[float]] = field(default_factory=list)
     upper: list[list[float]] = field(default_factory=list)
+    numbers: list[int] = field(default_factory=list)  # of the lines of the edges
 
 
 def read_graph(path: Path) -> PoseGraph:
@@ -47,6 +48,7 @@ def read_graph(path: Path) -> PoseGraph:
         fields = line.split("#", 1)[0].split()
         if fields:
             _parse(lines, fields, f"{path}:{number}")
+            lines.numbers += [number] * (len(lines.ends) - len(lines.numbers))
     if not lines.ends:
         raise GraphError(f"{path}: holds no edge (EDGE_SE2 or EDGE2 lines); is it a g2o or TORO file?")
     return _assemble(lines, path)
@@ -96,10 +98,10 @@ def _numbers(fields: list[str], start: int, count: int, where: str) -> list[floa
 def _assemble(lines: _Lines, path: Path) -> PoseGraph:
     names = sorted(lines.vertices) or sorted({end for ends in lines.ends for end in ends})
     index = {name: i for i, name in enumerate(names)}
-    for source, target in lines.ends:
+    for number, (source, target) in zip(lines.numbers, lines.ends, strict=True):
         for end in (source, target):
             if end not in index:
-                raise GraphError(f"{path}: edge {source} -> {target} names vertex {end}, which the file does not give")
+                raise GraphError(f"{path}:{number}: edge {source} -> {target} names vertex {end}, which the file does not give")
     sources = np.array([index[s] for s, _ in lines.ends], dtype=np.int64)
     targets = np.array([index[t] for _, t in lines.ends], dtype=np.int64)
     kinds = np.where(np.abs(sources - targets) == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP).astype(np.int8)
@@ -112,6 +114,7 @@ def _assemble(lines: _Lines, path: Path) -> PoseGraph:
         information=np.array(lines.upper)[:, _UPPER],
         kinds=kinds,
         edge_ids=np.arange(len(sources), dtype=np.int64),
+        file=GraphFile(path, np.array(names, dtype=np.int64), np.array(lines.numbers, dtype=np.int64)),
     )
     return graph if lines.vertices else chain(graph)
 

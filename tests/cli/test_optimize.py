@@ -105,10 +105,14 @@ def test_bad_input_is_one_line_and_exit_code_2(monkeypatch, capsys, square, tmp_
 BAD_LINES = {
     "found NaN or Inf": ["EDGE_SE2 3 0 nan 0 1.57 100 0 0 100 0 400"],
     "not positive definite": ["EDGE_SE2 3 0 1 0 1.57 100 200 0 100 0 400"],
-    "edge 4 (3 -> 0) has an information matrix that is not positive definite": ["EDGE_SE2 3 0 1 0 1.57 100 0 0 100 0 0"],
+    "bad.g2o:9: edge 3 -> 0 has an information matrix that is not positive definite": ["EDGE_SE2 3 0 1 0 1.57 100 0 0 100 0 0"],
     "outside 1e-09 to 1e+15": ["EDGE_SE2 3 0 1 0 1.57 100 0 0 100 0 1e-300"],
     "beyond 1e+09": ["EDGE_SE2 3 0 1e200 0 1.57 100 0 0 100 0 400"],
-    "node 4 is not connected to node 0": ["VERTEX_SE2 7 0 0 0", "VERTEX_SE2 8 1 0 0", "EDGE_SE2 7 8 1 0 0 1 0 0 1 0 1"],
+    "bad.g2o: vertex 7 is not connected to vertex 0 (2 of 6 nodes are not)": [
+        "VERTEX_SE2 7 0 0 0",
+        "VERTEX_SE2 8 1 0 0",
+        "EDGE_SE2 7 8 1 0 0 1 0 0 1 0 1",
+    ],
     "names vertex 99, which the file does not give": ["EDGE_SE2 3 99 1 0 0 100 0 0 100 0 400"],
     "vertex 0 is given twice": ["VERTEX_SE2 0 0 0 0"],
     "leads from a node to itself": ["EDGE_SE2 3 3 1 0 0 100 0 0 100 0 400"],
