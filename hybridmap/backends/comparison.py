@@ -95,8 +95,11 @@ def compare(
 
     Raises:
         GraphError: the graph is malformed: no back-end could take it.
-        BackendError: a name that there is not.
+        BackendError: a name that there is not, or is there twice.
     """
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise BackendError(f"back-end {twice!r} is named twice; name each back-end once")
     graph.validate()
     config = config or BackendsConfig()
     plan = [(create(name, config), way) for name, way in product(names, ways) if name != "odometry" or way is ways[0]]

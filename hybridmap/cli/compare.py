@@ -23,6 +23,7 @@ def compare(
     source: Annotated[Path, typer.Argument(metavar="DIR_OR_GRAPH", help="A session folder, or a planar g2o or TORO file.")],
     backends: Annotated[str, typer.Option(metavar="A,B,...", help="Back-ends, separated by commas.")] = _DEFAULT,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write maps.png and comparison.html here.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a comparison that is there.")] = False,
     batch: Annotated[
         bool,
         typer.Option("--batch", help="Solve the graph whole, from dead reckoning or the poses of the file; files: default."),
@@ -52,15 +53,18 @@ def compare(
     from hybridmap.backends import comparison
     from hybridmap.cli.graphs import open_graph, settings_of
     from hybridmap.cli.show import progress
-    from hybridmap.errors import BackendError, EvaluationError, GraphError
+    from hybridmap.errors import BackendError, EvaluationError
 
     opened = open_graph(source)
     settings = settings_of(opened, config, setting)
     names = [name.strip() for name in backends.split(",") if name.strip()]
     if not names:
         raise BackendError("--backends: found no name, expected back-ends separated by commas")
-    if out is not None and out.exists() and not out.is_dir():
-        raise GraphError(f"{out}: is a file; --out names a folder")
+    if out is not None:
+        from hybridmap.report.comparison import PAGE, PICTURE
+        from hybridmap.report.folder import prepare_folder
+
+        prepare_folder(out, "comparison", (PAGE, PICTURE), overwrite=overwrite)
     if not opened.is_session and (reference or relations):
         raise EvaluationError(f"{source}: a graph file has no stamps; --reference and --relations are for session folders")
     ways = _ways(opened, batch=batch, incremental=incremental)

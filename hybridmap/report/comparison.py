@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -19,7 +20,7 @@ from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 from hybridmap.report import comparison_figures as figures
 from hybridmap.report import tables
 from hybridmap.report.template import rendered
-from hybridmap.trajectory import write_text_atomic
+from hybridmap.trajectory import write_bytes_atomic, write_text_atomic
 
 PICTURE, PAGE = "maps.png", "comparison.html"
 _TEMPLATE = "comparison.html.j2"
@@ -54,6 +55,7 @@ class Compared:
 def write_comparison(folder: Path, compared: Compared) -> Path:
     """Write `maps.png` and `comparison.html` into a folder, which is made; returns the page."""
     graph, rows = compared.graph, compared.rows
+    picture = figures.panels(graph, rows, compared.start)
     page = rendered(
         _TEMPLATE,
         title=compared.title,
@@ -67,7 +69,7 @@ def write_comparison(folder: Path, compared: Compared) -> Path:
         ways={str(row.way) for row in rows},
         of_truth=compared.truth is not None,
         overlay=figures.overlay(rows, compared.truth),
-        panels=figures.save_panels(folder / PICTURE, graph, rows, compared.start),
+        panels="data:image/png;base64," + base64.b64encode(picture).decode("ascii"),
         convergence=figures.convergence(rows),
         weights=figures.weights(graph, rows),
         residuals=figures.residuals(graph, rows),
@@ -75,6 +77,7 @@ def write_comparison(folder: Path, compared: Compared) -> Path:
         settings=yaml.safe_dump(compared.settings.model_dump(mode="json", exclude={"names"}), sort_keys=False),
         version=version("hybridmap"),
     )
+    write_bytes_atomic(folder / PICTURE, picture)
     write_text_atomic(folder / PAGE, page)
     return folder / PAGE
 

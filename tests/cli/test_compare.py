@@ -173,3 +173,38 @@ def test_what_is_at_no_optimum_has_no_gap_and_says_why(monkeypatch, capsys, squa
     assert gaps == ["certificate_gap/gtsam-lm"]
     _, printed, _ = run(monkeypatch, capsys, *words)
     assert "odometry: dead reckoning; not certified: this solution is not at an optimum" in printed
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_an_earlier_comparison_goes_only_where_that_was_asked_for(monkeypatch, capsys, square, tmp_path):
+    out = tmp_path / "compared"
+    words = ("compare", square, "--out", out, "--backends")
+    assert run(monkeypatch, capsys, *words, "odometry")[0] == 0
+    before = contents(out)
+    code, printed, error = run(monkeypatch, capsys, *words, "gtsam-lm")
+    assert (code, printed, error.count("\n")) == (2, "", 1)
+    assert "holds a comparison already; choose another folder or give --overwrite" in error
+    assert contents(out) == before
+    assert run(monkeypatch, capsys, *words, "gtsam-lm", "--overwrite")[0] == 0
+    assert set(contents(out)) == set(before)
+    assert contents(out)["comparison.html"] != before["comparison.html"]
+
+
+@pytest.mark.parametrize("name", ["maps.png", "comparison.html", "notes.txt"])
+def test_a_file_of_somebody_else_is_never_lost(monkeypatch, capsys, square, tmp_path, name):
+    out = tmp_path / "mine"
+    out.mkdir()
+    (out / name).write_text("mine")
+    code, printed, error = run(monkeypatch, capsys, "compare", square, "--backends", "odometry", "--out", out, "--overwrite")
+    assert (code, printed) == (2, "")
+    assert f"not empty and no comparison (it holds '{name}')" in error
+    assert contents(out) == {name: b"mine"}
+
+
+def test_a_back_end_named_twice_is_refused(monkeypatch, capsys, square):
+    code, printed, error = run(monkeypatch, capsys, "compare", square, "--backends", "gtsam-lm, gtsam-lm")
+    assert (code, printed) == (2, "")
+    assert "back-end 'gtsam-lm' is named twice" in error
