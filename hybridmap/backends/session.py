@@ -168,7 +168,7 @@ class GraphSession:
         graph = _graph(self._state)
         for _ in range(budget):
             solution = self._backend.update(graph)
-            if solution.report.status is SolveStatus.CONVERGED:
+            if solution.report.status in (SolveStatus.CONVERGED, SolveStatus.WAITING):
                 break
         return self._adopt(solution)
 
