@@ -35,11 +35,13 @@ class GraphFile:
         path: the file.
         vertices: (N,) int64, the file's own number of each node.
         lines: (E,) int64, line of each edge, by its `edge_ids`; edges that came later have none.
+        held: the node that the file holds where it is; None: node 0, as it names none.
     """
 
     path: Path
     vertices: NDArray[np.int64]
     lines: NDArray[np.int64]
+    held: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

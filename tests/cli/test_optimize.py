@@ -165,3 +165,16 @@ def test_a_file_in_the_way_is_not_lost(monkeypatch, capsys, tmp_path):
     assert run(monkeypatch, capsys, *words, tmp_path)[0] == 2
     assert run(monkeypatch, capsys, *words, tmp_path / "out.g2o", "--overwrite")[0] == 0
     assert (tmp_path / "out.g2o").read_text().startswith("VERTEX_SE2")
+
+
+def test_the_vertex_that_a_file_fixes_stays_where_it_is(monkeypatch, capsys, square, tmp_path):
+    square.write_text(SQUARE + "FIX 2\n")
+    out = tmp_path / "out.g2o"
+    code, printed, _ = run(monkeypatch, capsys, "optimize", square, "--out", out, "--json")
+    assert code == 0
+    before, after = read_graph(square), read_graph(out)
+    assert np.array_equal(after.initial[2], before.initial[2])
+    assert not np.allclose(after.initial[0], before.initial[0], atol=1e-3)
+    assert after.file.held == 2
+    figures = {row["name"]: row["value"] for row in json.loads(printed)["metrics"]}
+    assert chi2(after, after.initial) == pytest.approx(figures["chi2/gtsam-lm"], rel=1e-9)

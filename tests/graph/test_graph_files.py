@@ -6,7 +6,7 @@ import pytest
 from hybridmap.errors import GraphError
 from hybridmap.geometry import between, compose, exp
 from hybridmap.graph.connectivity import chain, require_connected
-from hybridmap.graph.io import read_graph, write_g2o
+from hybridmap.graph.io import held, read_graph, write_g2o
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 
 G2O = """# a comment
@@ -135,6 +135,22 @@ def test_what_is_wrong_with_a_graph_is_told_in_the_numbers_of_its_file(tmp_path)
         read_graph(written(tmp_path, tens.replace("30 3", "30 3e99") + edges.format(9))).validate()
     with pytest.raises(GraphError, match=r"graph\.g2o: vertex 20 is not connected to an earlier node"):
         read_graph(written(tmp_path, "EDGE_SE2 10 30 1 0 0 9 0 0 9 0 9\nEDGE_SE2 20 30 1 0 0 9 0 0 9 0 9\n"))
+
+
+def test_the_first_fixed_vertex_is_held_and_written_again(tmp_path, caplog):
+    graph = read_graph(written(tmp_path, G2O.replace("FIX 0", "FIX 2\nFIX 1")))
+    assert "vertex 2 is held, the others may move" in caplog.text
+    moved = compose([3.0, 1.0, 0.7], graph.initial)
+    back = held(graph, moved)
+    assert np.array_equal(back[2], graph.initial[2])
+    assert np.allclose(between(back[:-1], back[1:]), between(moved[:-1], moved[1:]))
+    write_g2o(tmp_path / "out.g2o", graph, back)
+    again = read_graph(tmp_path / "out.g2o")
+    assert (again.file.held, "FIX 2\n" in (tmp_path / "out.g2o").read_text()) == (2, True)
+    with pytest.raises(GraphError, match=r"graph\.g2o: FIX names vertex 8, which the file does not give"):
+        read_graph(written(tmp_path, G2O.replace("FIX 0", "FIX 8")))
+    unfixed = read_graph(written(tmp_path, G2O.replace("FIX 0\n", "")))
+    assert held(unfixed, moved) is moved
 
 
 def test_files_without_edges_and_missing_files_are_refused(tmp_path):
