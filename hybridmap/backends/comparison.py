@@ -139,10 +139,12 @@ def _driven(row: Row, backend: Backend, graph: PoseGraph, report: Callable[[int]
         curve.append((done, solution.report.unit_variance))
         report(done)
     final = backend.finish(graph)
+    iterations += final.report.iterations
     total = replace(
         final.report,
+        message=f"{iterations} iterations over {graph.n_nodes} nodes; at the end: {final.report.message}",
         cpu_s=cpu_s + final.report.cpu_s,
-        iterations=iterations + final.report.iterations,
+        iterations=iterations,
         chi2_initial=chi2(graph, graph.initial),
     )
     curve.append((graph.n_nodes, final.report.unit_variance))

@@ -82,7 +82,7 @@ def compare(
     if as_json:
         _emit(opened, ways, rows, judged.metrics)
     else:
-        _show(cells, rows, f"{source}: {opened.graph.n_nodes} nodes, {opened.graph.n_edges} edges; batch from {opened.start}")
+        _show(cells, rows, f"{source}: {opened.graph.n_nodes} nodes, {opened.graph.n_edges} edges; {_done(opened, ways)}")
 
 
 def _judged(opened: GraphSource, rows: Sequence[Row], reference: Path | None, relations: Path | None) -> Judged:
@@ -118,6 +118,13 @@ def _ways(opened: GraphSource, *, batch: bool, incremental: bool) -> list[Way]:
     return asked or ([Way.BATCH, Way.INCREMENTAL] if opened.is_session else [Way.BATCH])
 
 
+def _done(opened: GraphSource, ways: Sequence[Way]) -> str:
+    from hybridmap.backends.comparison import Way
+
+    words = {Way.BATCH: f"batch from {opened.start}", Way.INCREMENTAL: "incremental from the first node on"}
+    return ", ".join(words[way] for way in ways)
+
+
 def _table(rows: Sequence[Row], judged: Sequence[Metric]) -> list[list[str]]:
     """Column titles, then a line of text a row."""
     by_name = {metric.name: f"{metric.value:.4f}" for metric in judged}
@@ -142,10 +149,13 @@ def _show(cells: Sequence[Sequence[str]], rows: Sequence[Row], title: str) -> No
     from rich.console import Console
     from rich.table import Table
 
+    from hybridmap.cli.show import print_title
+
     console = Console()
     if not console.is_terminal:
         console = Console(width=_WIDTH)
-    table = Table(title=title, title_justify="left", box=SIMPLE)
+    print_title(console, title)
+    table = Table(box=SIMPLE)
     for i, column in enumerate(cells[0]):
         table.add_column(column, justify="right" if i > 1 else "left", no_wrap=i < 2)
     for line in cells[1:]:

@@ -1,6 +1,7 @@
 """`hybridmap compare`: one table, one referee, and a back-end that fails is a row."""
 
 import json
+import logging
 import sys
 
 import numpy as np
@@ -208,3 +209,25 @@ def test_a_back_end_named_twice_is_refused(monkeypatch, capsys, square):
     code, printed, error = run(monkeypatch, capsys, "compare", square, "--backends", "gtsam-lm, gtsam-lm")
     assert (code, printed) == (2, "")
     assert "back-end 'gtsam-lm' is named twice" in error
+
+
+def test_the_words_over_the_table_say_what_was_done(monkeypatch, capsys, square):
+    for way, said, unsaid in (("--incremental", "incremental from", "batch"), ("--batch", "batch from", "incremental")):
+        _, printed, _ = run(monkeypatch, capsys, "compare", square, "--backends", "odometry", way)
+        title = printed.splitlines()[0]
+        assert said in title
+        assert unsaid not in title
+
+
+def test_the_message_of_a_drive_says_what_its_iterations_are():
+    graph, _ = laps(np.random.default_rng(0), nodes=40)
+    (row,) = comparison.compare(graph, ["relaxation-ratslam"], ways=[Way.INCREMENTAL])
+    report = row.solution.report
+    assert report.iterations > 20
+    assert row.message.startswith(f"{report.iterations} iterations over 40 nodes; at the end: ")
+
+
+def test_matplotlib_says_nothing_of_its_cache(monkeypatch, capsys, square):
+    run(monkeypatch, capsys, "compare", square, "--backends", "odometry")
+    logging.getLogger("matplotlib").warning("mkdir -p failed")
+    assert capsys.readouterr().err == ""

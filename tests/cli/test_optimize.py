@@ -54,10 +54,15 @@ def test_json_holds_the_figures_and_the_file_has_the_poses_they_are_of(monkeypat
     assert figures["chi2/gtsam-lm"] < 1e-2 * figures["chi2_initial/gtsam-lm"]
 
 
-def test_without_json_there_is_a_table(monkeypatch, capsys, square):
-    code, printed, _ = run(monkeypatch, capsys, "optimize", square)
+@pytest.mark.parametrize("name", ["gtsam-lm", "odometry"])
+def test_without_json_there_is_one_table_under_one_line(monkeypatch, capsys, tmp_path, name):
+    square = tmp_path / f"{'long' * 30}.g2o"
+    square.write_text(SQUARE)
+    code, printed, _ = run(monkeypatch, capsys, "optimize", square, "--backend", name)
     assert code == 0
-    assert "chi2/gtsam-lm" in printed
+    assert printed.splitlines()[0] == f"{square}: {name}: converged"
+    assert f"chi2/{name}" in printed
+    assert "meaning" in printed
 
 
 def test_a_back_end_that_diverged_is_exit_code_1_and_no_file(monkeypatch, capsys, tmp_path):
