@@ -119,7 +119,12 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 
 def write_text_atomic(path: Path, text: str) -> None:
     """Write a text file in one move, so that a reader or a crash never meets half of it."""
+    write_bytes_atomic(path, text.encode("utf-8"))
+
+
+def write_bytes_atomic(path: Path, content: bytes) -> None:
+    """The same for any file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text, encoding="utf-8")
+    partial.write_bytes(content)
     partial.replace(path)

@@ -38,6 +38,7 @@ def test_extending_in_a_circle_is_refused(tmp_path):
         ("nodes: {distance_m: -1}\n", r"nodes.distance_m: .*greater than 0, found -1"),
         ("nodes: {distance_m: .nan}\n", r"nodes.distance_m: .*finite"),
         ("nodes: [1]\n", r"nodes: "),
+        ("backends: {names: [gtsam-lm, gtsam-gnc, gtsam-lm]}\n", r"backends.names: .*'gtsam-lm' is there twice"),
         ("- 1\n", r"expected a mapping"),
         ("a: [\n", r"not a YAML file"),
     ],

@@ -11,9 +11,13 @@ from hybridmap.graph.pose_graph import PoseGraph
 
 
 class SolveStatus(StrEnum):
-    """Why a solver stopped; `diverged`, `singular` and `failed` came with no map, but for the one they began with."""
+    """Why a solver stopped; `diverged`, `singular` and `failed` came with no map, but for the one they began with.
+
+    `waiting`: an update only placed new nodes, and measurements beside the chain wait for a closure or the end of the drive.
+    """
 
     CONVERGED = "converged"
+    WAITING = "waiting"
     MAX_ITERATIONS = "max-iterations"
     STALLED = "stalled"
     DIVERGED = "diverged"

@@ -1,39 +1,31 @@
-"""Proof that a planar solution is globally optimal: the dual certificate of SE-Sync, for the isotropised objective.
+"""Whether a solution is at an optimum, and whether that is the global one of the isotropised objective.
 
-Rosen et al., "SE-Sync" (2019), in complex numbers. With positions t_i and unit headings z_i, and noise made isotropic
-(kappa = I_yaw, tau = 2 / tr(I_xy^-1)), the cost
-
-    F(t, z) = sum of 2 kappa |z_j - z_i e^(i yaw_ij)|^2 + tau |t_j - t_i - z_i t_ij|^2 = x^H Q x
-
-is quadratic in x = (t, z). Let lambda_i = Re(conj(z_i) (Q x)_i); at a critical point F = sum lambda_i. For every choice of unit
-headings F' >= sum lambda_i + n mu, mu the smallest eigenvalue of Q - diag(0, lambda) with the positions eliminated: if that
-is not negative at a critical point, it is the best there is. A Cholesky-like factorisation of the matrix plus delta with
-all pivots positive proves mu > -delta, and hence a relative gap of at most (F - sum lambda_i + n delta) / F.
+Three things are checked, over the edges that the back-end kept: Levenberg-Marquardt on the true objective chi2 finds next
+to nothing to gain from the solution; the critical point of the isotropised objective F beside it is proved to be the global
+optimum of F (`backends.dual`); and F at the solution is near that. No lower bound of chi2 itself is proved, but for zero.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import block_array, coo_array, csc_array, csr_array, diags_array
-from scipy.sparse.linalg import splu
 
-from hybridmap.backends.objective import squared_norms
+from hybridmap.backends.base import SolveStatus
+from hybridmap.backends.batch import run
+from hybridmap.backends.dual import prove
+from hybridmap.backends.factors import NoiseModels, factor_graph
+from hybridmap.backends.objective import chi2
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
-
-_Complex = NDArray[np.complex128]
 
 CERTIFIED_GAP = 1e-6
 """Relative gap up to which a solution is called certified."""
 
-_SLACKS = (1e-12, 1e-11, 1e-10, 1e-8, 1e-7, 1e-4, 1e-1)  # tried from the smallest: rounding makes zero eigenvalues negative
-_ITERATIONS = 10
-_FAR, _ROUNDING = 10.0, 1e-6  # of F: the noise as it is stated moves an optimum by less than the factor
-_STATIONARY = 1e-12  # relative decrease of F, promised by a Newton step, that no longer counts
+_AT_OPTIMUM = 1.01  # chi2 over that of the local optimum
+_NEAR = 2.0  # F over its optimum: directions that are made isotropic move the optimum of a surveyed graph by up to 1.7
+_EXACT = 1e-9  # chi2 that is rounding
+_ITERATIONS, _TOLERANCE = 100, 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,158 +33,73 @@ class Certificate:
     """What could be proved about a solution.
 
     Attributes:
-        objective: F at the critical point to which the solution was polished; what the certificate is about.
-        objective_given: F at the poses given.
-        gap: upper bound of (F - F_best) / F; infinite where nothing could be proved.
-        iterations: Newton steps of the polish.
+        gap: upper bound of (F - F_best) / F at the optimum of F beside the solution; infinite where none could be proved
+            and where the solution itself is not at an optimum.
         message: one line for people.
+        objective: F at its optimum beside the solution; NaN where none was reached or looked for.
+        objective_given: F at the solution; NaN where it was not looked at.
     """
 
-    objective: float
-    objective_given: float
     gap: float
-    iterations: int
     message: str
+    objective: float = np.nan
+    objective_given: float = np.nan
 
     @property
     def certified(self) -> bool:
-        """Whether the solution's basin holds the global optimum of the isotropised objective."""
+        """Whether the solution is at a local optimum of chi2 that lies beside the global optimum of F."""
         return self.gap <= CERTIFIED_GAP
 
     @property
     def word(self) -> str:
-        """`gap <= 1e-11`, or `not certified`; and by what factor the poses given are above the point that was certified."""
-        if not self.certified:
-            return "not certified"
-        far = self.objective_given > _FAR * self.objective + _ROUNDING
-        return f"gap <= {self.gap:.0e}" + (f", {self.objective_given / self.objective:.0e} x above" if far else "")
+        """`gap <= 1e-11`, or `not certified`."""
+        return f"gap <= {self.gap:.0e}" if self.certified else "not certified"
 
 
 def certify(graph: PoseGraph, poses: Array, rejected: tuple[int, ...] = ()) -> Certificate:
-    """Try to prove that a solution is the global optimum of the isotropised objective.
+    """Check a solution against the optimum of chi2 beside it, and that against the global optimum of F.
 
     Args:
         graph: connected.
-        poses: (N, 3) the solution; it is polished to the critical point of the isotropised objective beside it.
+        poses: (N, 3) the solution, m and rad.
         rejected: `edge_ids` that do not count, such as the loops that a robust back-end holds for false.
     """
     kept = graph.with_edges(~np.isin(graph.edge_ids, rejected)) if rejected else graph
-    if kept.n_nodes < 2 or not np.isfinite(poses).all() or not np.isfinite(squared_norms(kept, poses)).all():
-        return Certificate(np.nan, np.nan, np.inf, 0, "not certified: nothing to certify")
-    form = quadratic_form(kept)
-    given = np.concatenate([poses[:, 0] + 1j * poses[:, 1], np.exp(1j * poses[:, 2])])
-    before = _objective(form, given)
-    polished = _polished(form, given)
-    if polished is None:
-        return Certificate(before, before, np.inf, _ITERATIONS, "not certified: the poses are not near an optimum")
-    x, iterations = polished
-    after = _objective(form, x)
-    gap = _proved_gap(form, x, after)
-    message = f"F = {after:.7g}, relative gap <= {gap:.0e}" if np.isfinite(gap) else "no bound could be proved"
-    if gap > CERTIFIED_GAP:
-        message = f"not certified: {message}"
-    return Certificate(after, before, gap, iterations, message)
+    cost = chi2(kept, poses)
+    if not np.isfinite(cost):
+        return _refused("the poses have no finite chi2")
+    if cost <= _EXACT:
+        return Certificate(0.0, "chi2 is zero up to rounding: every measurement is met, and no map has less")
+    doubt = _not_at_optimum(kept, poses, cost, " over the edges kept" if rejected else "")
+    return _refused(doubt) if doubt else _proved(kept, poses)
 
 
-def quadratic_form(graph: PoseGraph) -> csr_array:
-    """Q (2N, 2N), Hermitian: positions, then headings."""
-    n, e = graph.n_nodes, graph.n_edges
-    kappa = np.sqrt(2.0 * graph.information[:, 2, 2])
-    tau = np.sqrt(2.0 / np.trace(np.linalg.inv(graph.information[:, :2, :2]), axis1=1, axis2=2))
-    step, turn = graph.deltas[:, 0] + 1j * graph.deltas[:, 1], np.exp(1j * graph.deltas[:, 2])
-    s, t, row = graph.sources, graph.targets, np.arange(e)
-    entries = np.concatenate([kappa, -kappa * turn, tau, -tau, -tau * step])
-    columns = np.concatenate([n + t, n + s, t, s, n + s])
-    rows = np.concatenate([row, row, e + row, e + row, e + row])
-    root = coo_array((entries, (rows, columns)), shape=(2 * e, 2 * n)).tocsr()
-    return csr_array(root.conj().T @ root)
+def _refused(why: str) -> Certificate:
+    return Certificate(np.inf, f"not certified: {why}")
 
 
-def _objective(form: csr_array, x: _Complex) -> float:
-    return float(np.sum(x.conj() * np.asarray(form @ x)).real)
+def _not_at_optimum(graph: PoseGraph, poses: Array, cost: float, counted: str) -> str:
+    """What speaks against poses being at an optimum of chi2, of which they have `cost`; empty if nothing does."""
+    local = run("lm", factor_graph(graph, NoiseModels()), poses, _ITERATIONS, tolerance=_TOLERANCE)
+    best = chi2(graph, local.poses)
+    if cost > _AT_OPTIMUM * best:
+        few = cost < 10.0 * best or best <= _EXACT
+        less = f"{100.0 * (1.0 - best / cost):.2g} % less" if few else f"{cost / best:.0f} times less"
+        where = "the one near it" if local.status is SolveStatus.CONVERGED else "one nearer to it"
+        return f"this solution is not at an optimum; {where} has chi2 {best:.4g}{counted}, {less}"
+    return "" if local.status is SolveStatus.CONVERGED else f"whether it is at an optimum is not known ({local.message})"
 
 
-def _multipliers(form: csr_array, x: _Complex) -> Array:
-    """(2N,): zero for positions, lambda_i for headings."""
-    n = len(x) // 2
-    return np.concatenate([np.zeros(n), (x[n:].conj() * np.asarray(form @ x)[n:]).real])
-
-
-def _polished(form: csr_array, x: _Complex) -> tuple[_Complex, int] | None:
-    """Damped Newton on positions and heading angles until F cannot fall further, and its steps; None if that takes too many."""
-    cost, damping = _objective(form, x), 0.0
-    for done in range(_ITERATIONS):
-        step, promised = _newton_step(form, x, damping)
-        moved = _moved(x, step)
-        after = _objective(form, moved)
-        if abs(promised) <= _STATIONARY * cost:
-            return moved, done + 1
-        if after < cost:
-            x, cost, damping = moved, after, 0.1 * damping
-        else:
-            damping = max(10.0 * damping, 1e-6)
-    return None
-
-
-def _moved(x: _Complex, step: Array) -> _Complex:
-    """Positions and headings after a step (3N,): x, y, angle."""
-    n = len(x) // 2
-    return np.concatenate([x[:n] + step[:n] + 1j * step[n : 2 * n], x[n:] * np.exp(1j * step[2 * n :])])
-
-
-def _newton_step(form: csr_array, x: _Complex, damping: float) -> tuple[Array, float]:
-    """Newton step (3N,) with the diagonal of the Hessian raised by a factor, and the decrease of F that it promises."""
-    n = len(x) // 2
-    slope = np.asarray(form @ x)
-    gradient = np.concatenate([slope[:n].real, slope[:n].imag, (np.conj(1j * x[n:]) * slope[n:]).real])
-    turned = diags_array(np.concatenate([np.ones(n), 1j * x[n:]]))
-    bent: Any = csr_array(turned.conj().T @ (form - diags_array(_multipliers(form, x))) @ turned)
-    real, imag = bent.real, bent.imag
-    hessian = block_array(
-        [
-            [real[:n, :n], None, real[:n, n:]],
-            [None, real[:n, :n], imag[:n, n:]],
-            [real[n:, :n], -imag[n:, :n], real[n:, n:]],
-        ],
-        format="csr",
-    )
-    free = np.arange(3 * n).reshape(3, n)[:, 1:].T.ravel()  # by node: x, y, angle
-    matrix: Any = hessian[free][:, free].tocsc()
-    factor = _factor(matrix + damping * diags_array(np.abs(matrix.diagonal())))
-    step = np.zeros(3 * n)
-    if factor is None:
-        return step, np.inf
-    step[free] = factor.solve(-gradient[free])
-    promised = -float(gradient @ step)
-    return (step, promised) if np.isfinite(promised) else (np.zeros(3 * n), np.inf)
-
-
-def _proved_gap(form: csr_array, x: _Complex, cost: float) -> float:
-    """(F - bound) / F for the best bound that the pivots prove; infinite where they prove none."""
-    n = len(x) // 2
-    multipliers = _multipliers(form, x)
-    dual: Any = form - diags_array(multipliers)
-    heading = np.concatenate([np.zeros(n), np.ones(n)])
-    free = np.concatenate([[n], np.arange(1, n).repeat(2) + np.tile([0, n], n - 1)])  # without the position of node 0
-    scale = max(cost, np.finfo(float).tiny)
-    short = max(cost - float(multipliers.sum()), 0.0) / scale
-    for slack in _SLACKS:
-        shifted = dual + diags_array(slack * scale / n * heading)
-        factor = _factor(shifted[free][:, free])
-        if factor is not None and _positive(factor):
-            return short + slack
-    return np.inf
-
-
-def _factor(matrix: Any) -> Any:
-    """LU without row exchanges, as a Cholesky factorisation; None where it breaks down."""
-    try:
-        return splu(csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    except RuntimeError:
-        return None
-
-
-def _positive(factor: Any) -> bool:
-    """Whether a Hermitian matrix is positive definite, by the pivots of its factorisation."""
-    pivots = factor.U.diagonal()
-    return bool(np.array_equal(factor.perm_r, factor.perm_c) and np.all(pivots.real > 0.0))
+def _proved(graph: PoseGraph, poses: Array) -> Certificate:
+    """The proof for poses that are at an optimum of chi2."""
+    proof = prove(graph, poses)
+    if not proof.reached:
+        return _refused("no optimum of the isotropised objective near it")
+    if proof.objective_given > _NEAR * proof.objective + _EXACT:
+        return _refused(
+            f"its isotropised objective is {proof.objective_given:.4g}, that of the optimum near it {proof.objective:.4g}"
+        )
+    bound = f"relative gap <= {proof.gap:.0e}" if np.isfinite(proof.gap) else "no bound could be proved"
+    known = f"F = {proof.objective:.7g}, {bound}"
+    message = known if proof.gap <= CERTIFIED_GAP else f"not certified: {known}"
+    return Certificate(proof.gap, message, proof.objective, proof.objective_given)

@@ -65,6 +65,12 @@ class Row:
         """One line for people."""
         return self.failure if self.solution is None else self.solution.report.summary
 
+    @property
+    def verdict(self) -> str:
+        """The message, and why its solution is not certified."""
+        doubt = "" if self.certificate is None or self.certificate.certified else self.certificate.message
+        return "; ".join(filter(None, (self.message, doubt)))
+
 
 def compare(
     graph: PoseGraph,
@@ -89,8 +95,11 @@ def compare(
 
     Raises:
         GraphError: the graph is malformed: no back-end could take it.
-        BackendError: a name that there is not.
+        BackendError: a name that there is not, or is there twice.
     """
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise BackendError(f"back-end {twice!r} is named twice; name each back-end once")
     graph.validate()
     config = config or BackendsConfig()
     plan = [(create(name, config), way) for name, way in product(names, ways) if name != "odometry" or way is ways[0]]
@@ -130,10 +139,12 @@ def _driven(row: Row, backend: Backend, graph: PoseGraph, report: Callable[[int]
         curve.append((done, solution.report.unit_variance))
         report(done)
     final = backend.finish(graph)
+    iterations += final.report.iterations
     total = replace(
         final.report,
+        message=f"{iterations} iterations over {graph.n_nodes} nodes; at the end: {final.report.message}",
         cpu_s=cpu_s + final.report.cpu_s,
-        iterations=iterations + final.report.iterations,
+        iterations=iterations,
         chi2_initial=chi2(graph, graph.initial),
     )
     curve.append((graph.n_nodes, final.report.unit_variance))
@@ -166,7 +177,7 @@ def metrics_of(rows: Sequence[Row]) -> list[Metric]:
             figures.append(("weak_edges", weak, "1", "odometry and registration edges of next to no weight"))
             figures.append(("hanging_nodes", hanging, "1", "nodes that only such edges and rejected loops hold"))
         if row.certificate is not None and np.isfinite(row.certificate.gap):
-            what = "relative gap of the isotropised objective to its lower bound, over the edges kept"
+            what = "proved relative gap of the isotropised objective at its optimum beside the map, over the edges kept"
             figures.append(("certificate_gap", row.certificate.gap, "1", what))
         title = row.title or row.backend
         metrics += [Metric(f"{measure}/{title}", value, unit, text) for measure, value, unit, text in figures]

@@ -138,6 +138,7 @@ class GraphBackend(ABC):
         self._squared: Array = np.zeros(0)
         self._weights: dict[int, float] = {}
         self._rejected: tuple[int, ...] = ()
+        self._waiting = 0  # measurements beside the chain that no solver has seen
 
     @property
     def name(self) -> str:
@@ -157,18 +158,25 @@ class GraphBackend(ABC):
         start = self._extend(new, placed)
         at_start = self._carried(new, change, start)
         if always is not None or self._must_work(change):
-            outcome = self._guarded(graph, start, change, always or self._follow)
+            outcome, waiting = self._guarded(graph, start, change, always or self._follow), 0
         else:
-            message = "extended by odometry"
-            outcome = Outcome(start, SolveStatus.CONVERGED, message, 0, self._weights, self._rejected)
+            waiting = self._waiting + new.n_edges - (len(start) - len(placed))
+            outcome = self._extended(start, waiting)
         squared = at_start if outcome.poses is start else squared_norms(graph, outcome.poses)
         before = total(at_start)
         if self._rose(before, total(squared)):
             message = f"{outcome.message}; chi2 rose, the next updates go on from there"
             outcome = replace(outcome, status=SolveStatus.STALLED, message=message)
         self._graph, self._poses, self._squared = graph, outcome.poses, squared
-        self._weights, self._rejected = outcome.weights, outcome.rejected
+        self._weights, self._rejected, self._waiting = outcome.weights, outcome.rejected, waiting
         return self._solution(graph, outcome, squared, before, started)
+
+    def _extended(self, start: Array, waiting: int) -> Outcome:
+        """What an update without work comes to."""
+        status, message = SolveStatus.CONVERGED, "extended by odometry"
+        if waiting:
+            status, message = SolveStatus.WAITING, f"{message}; {waiting} measurements beside the chain wait for a closure"
+        return Outcome(start, status, message, 0, self._weights, self._rejected)
 
     def finish(self, graph: PoseGraph) -> Solution:
         """See `Backend.finish`: a fresh solve; back-ends whose state is their merit go on from it instead."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -168,7 +168,7 @@ class GraphSession:
         graph = _graph(self._state)
         for _ in range(budget):
             solution = self._backend.update(graph)
-            if solution.report.status is SolveStatus.CONVERGED:
+            if solution.report.status in (SolveStatus.CONVERGED, SolveStatus.WAITING):
                 break
         return self._adopt(solution)
 
@@ -266,7 +266,7 @@ def _numbers(given: ArrayLike, shape: tuple[int, ...], what: str) -> Array:
 def _joined(graph: PoseGraph, more: PoseGraph) -> PoseGraph:
     """The nodes of the first with the edges of both."""
     names = ("sources", "targets", "deltas", "information", "kinds", "edge_ids")
-    both = {name: np.concatenate([getattr(graph, name), getattr(more, name)]) for name in names}
+    both: dict[str, Any] = {name: np.concatenate([getattr(graph, name), getattr(more, name)]) for name in names}
     return PoseGraph(initial=graph.initial, **both)
 
 

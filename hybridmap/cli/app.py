@@ -50,6 +50,7 @@ def _options(
 ) -> None:
     level = logging.INFO if verbose else logging.ERROR if quiet else logging.WARNING
     logging.basicConfig(level=level, format="hybridmap: %(levelname)s: %(message)s", stream=sys.stderr, force=True)
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where no home can be written to it warns of its own cache
     os.environ["HYBRIDMAP_QUIET"] = "1" if quiet else ""
 
 

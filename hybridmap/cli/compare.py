@@ -23,6 +23,7 @@ def compare(
     source: Annotated[Path, typer.Argument(metavar="DIR_OR_GRAPH", help="A session folder, or a planar g2o or TORO file.")],
     backends: Annotated[str, typer.Option(metavar="A,B,...", help="Back-ends, separated by commas.")] = _DEFAULT,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write maps.png and comparison.html here.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a comparison that is there.")] = False,
     batch: Annotated[
         bool,
         typer.Option("--batch", help="Solve the graph whole, from dead reckoning or the poses of the file; files: default."),
@@ -52,15 +53,18 @@ def compare(
     from hybridmap.backends import comparison
     from hybridmap.cli.graphs import open_graph, settings_of
     from hybridmap.cli.show import progress
-    from hybridmap.errors import BackendError, EvaluationError, GraphError
+    from hybridmap.errors import BackendError, EvaluationError
 
     opened = open_graph(source)
     settings = settings_of(opened, config, setting)
     names = [name.strip() for name in backends.split(",") if name.strip()]
     if not names:
         raise BackendError("--backends: found no name, expected back-ends separated by commas")
-    if out is not None and out.exists() and not out.is_dir():
-        raise GraphError(f"{out}: is a file; --out names a folder")
+    if out is not None:
+        from hybridmap.report.comparison import PAGE, PICTURE
+        from hybridmap.report.folder import prepare_folder
+
+        prepare_folder(out, "comparison", (PAGE, PICTURE), overwrite=overwrite)
     if not opened.is_session and (reference or relations):
         raise EvaluationError(f"{source}: a graph file has no stamps; --reference and --relations are for session folders")
     ways = _ways(opened, batch=batch, incremental=incremental)
@@ -78,7 +82,7 @@ def compare(
     if as_json:
         _emit(opened, ways, rows, judged.metrics)
     else:
-        _show(cells, rows, f"{source}: {opened.graph.n_nodes} nodes, {opened.graph.n_edges} edges; batch from {opened.start}")
+        _show(cells, rows, f"{source}: {opened.graph.n_nodes} nodes, {opened.graph.n_edges} edges; {_done(opened, ways)}")
 
 
 def _judged(opened: GraphSource, rows: Sequence[Row], reference: Path | None, relations: Path | None) -> Judged:
@@ -114,6 +118,13 @@ def _ways(opened: GraphSource, *, batch: bool, incremental: bool) -> list[Way]:
     return asked or ([Way.BATCH, Way.INCREMENTAL] if opened.is_session else [Way.BATCH])
 
 
+def _done(opened: GraphSource, ways: Sequence[Way]) -> str:
+    from hybridmap.backends.comparison import Way
+
+    words = {Way.BATCH: f"batch from {opened.start}", Way.INCREMENTAL: "incremental from the first node on"}
+    return ", ".join(words[way] for way in ways)
+
+
 def _table(rows: Sequence[Row], judged: Sequence[Metric]) -> list[list[str]]:
     """Column titles, then a line of text a row."""
     by_name = {metric.name: f"{metric.value:.4f}" for metric in judged}
@@ -138,14 +149,17 @@ def _show(cells: Sequence[Sequence[str]], rows: Sequence[Row], title: str) -> No
     from rich.console import Console
     from rich.table import Table
 
+    from hybridmap.cli.show import print_title
+
     console = Console()
     if not console.is_terminal:
         console = Console(width=_WIDTH)
-    table = Table(title=title, title_justify="left", box=SIMPLE)
+    print_title(console, title)
+    table = Table(box=SIMPLE)
     for i, column in enumerate(cells[0]):
         table.add_column(column, justify="right" if i > 1 else "left", no_wrap=i < 2)
     for line in cells[1:]:
         table.add_row(*line)
     console.print(table)
     for row in rows:
-        typer.echo(f"{row.title}: {row.message}")
+        typer.echo(f"{row.title}: {row.verdict}")

@@ -29,7 +29,7 @@ def optimize(
     from hybridmap.cli.graphs import open_graph, settings_of
     from hybridmap.cli.show import emit
     from hybridmap.errors import GraphError
-    from hybridmap.graph.io import write_g2o
+    from hybridmap.graph.io import held, write_g2o
 
     if out is not None and out.exists() and (out.is_dir() or not overwrite):
         raise GraphError(f"{out}: {'is a folder; name a file' if out.is_dir() else 'exists already; give --overwrite'}")
@@ -39,7 +39,7 @@ def optimize(
     report = solution.report
     solved = report.status.has_map
     if out is not None and solved:
-        write_g2o(out, source.graph, solution.poses)
+        write_g2o(out, source.graph, held(source.graph, solution.poses))
     proof = certify(source.graph, solution.poses, report.rejected_edge_ids)
     head = source.head | {
         "backend": backend,

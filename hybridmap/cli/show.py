@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from hybridmap.metrics import Metric, to_json
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
 
@@ -31,13 +32,22 @@ def emit(head: dict[str, Any], metrics: Iterable[Metric], *, as_json: bool, titl
     from rich.console import Console
 
     console = Console(width=None if sys.stdout.isatty() else 140)
-    columns = [str(name) for name in ("odometry", *head.get("backends", ()))]
+    columns = [str(name) for name in ("odometry", *head["backends"])] if "backends" in head else []
     columns = [name for name in dict.fromkeys(columns) if any(_stage(row) == name for row in rows)]
     plain = [row for row in rows if _stage(row) not in columns]
+    print_title(console, title)
     if plain:
-        console.print(_plain_table(plain, title))
+        console.print(_plain_table(plain))
     if columns:
-        console.print(_table_by_backend([row for row in rows if row not in plain], columns, "" if plain else title))
+        console.print(_table_by_backend([row for row in rows if row not in plain], columns))
+
+
+def print_title(console: Console, title: str) -> None:
+    """Print what stands over a table, in one line however narrow the table is; nothing where it is empty."""
+    from rich.text import Text
+
+    if title:
+        console.print(Text(title, style="italic"), soft_wrap=True)
 
 
 def _stage(row: Metric) -> str:
@@ -51,10 +61,10 @@ def _value(row: Metric | None) -> str:
     return "none" if math.isnan(row.value) else f"{row.value:.4g}{verdict}"
 
 
-def _plain_table(rows: list[Metric], title: str) -> Table:
+def _plain_table(rows: list[Metric]) -> Table:
     from rich.table import Table
 
-    table = Table(title=title or None, title_justify="left")
+    table = Table()
     table.add_column("figure", no_wrap=True)
     table.add_column("value", justify="right", no_wrap=True)
     table.add_column("unit")
@@ -64,10 +74,10 @@ def _plain_table(rows: list[Metric], title: str) -> Table:
     return table
 
 
-def _table_by_backend(rows: list[Metric], columns: list[str], title: str) -> Table:
+def _table_by_backend(rows: list[Metric], columns: list[str]) -> Table:
     from rich.table import Table
 
-    table = Table(title=title or None, title_justify="left")
+    table = Table()
     table.add_column("figure", no_wrap=True)
     table.add_column("unit")
     for column in columns:

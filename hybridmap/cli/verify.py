@@ -23,10 +23,11 @@ def verify(
     from hybridmap.cli.show import emit, progress
     from hybridmap.config import Config
     from hybridmap.evaluate.cells import Scale, rows_of, verify_cells
-    from hybridmap.report.verify_page import prepare_folder, write_verification
+    from hybridmap.report.folder import prepare_folder
+    from hybridmap.report.verify_page import METRICS, PAGE, write_verification
 
     config = Config.load(None, parse_settings(setting))
-    prepare_folder(out, overwrite=overwrite)
+    prepare_folder(out, "verification", (PAGE, METRICS), overwrite=overwrite)
     with progress("verifying the cells") as advance:
         result = verify_cells(seed, Scale(), config.neural.model_dump(), advance)
     rows = rows_of(result)

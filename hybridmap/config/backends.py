@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from hybridmap.config.section import Section
 
@@ -110,3 +110,11 @@ class BackendsConfig(Section):
     """Pairwise consistency of the loops."""
     isam2: Isam2Config = Isam2Config()
     """Incremental smoothing."""
+
+    @field_validator("names")
+    @classmethod
+    def _each_once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"{twice!r} is there twice; name each back-end once")
+        return names

@@ -28,7 +28,8 @@ def require_connected(graph: PoseGraph) -> None:
     _, label = connected_components(matrix, directed=False)
     apart = np.flatnonzero(label != label[0])
     if len(apart):
-        raise GraphError(f"graph: node {apart[0]} is not connected to node 0 ({len(apart)} of {n} nodes are not)")
+        first, node = graph.node_name(0), graph.node_name(int(apart[0]))
+        raise GraphError(f"{graph.where}: {node} is not connected to {first} ({len(apart)} of {n} nodes are not)")
 
 
 def extend(graph: PoseGraph, placed: Array) -> Array:
@@ -50,7 +51,7 @@ def extend(graph: PoseGraph, placed: Array) -> Array:
     best = dict(zip(later[candidates][order].tolist(), candidates[order].tolist(), strict=True))  # the last one wins
     for node in range(done, n):
         if node not in best:
-            raise GraphError(f"graph: node {node} is not connected to an earlier node")
+            raise GraphError(f"{graph.where}: {graph.node_name(node)} is not connected to an earlier node")
         edge = best[node]
         if graph.targets[edge] == node:
             poses[node] = compose(poses[graph.sources[edge]], graph.deltas[edge])

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from hybridmap.errors import GraphError
-from hybridmap.geometry import Array
+from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.connectivity import chain
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.pose_graph import EdgeKind, GraphFile, PoseGraph
 from hybridmap.trajectory import write_text_atomic
+
+log = logging.getLogger(__name__)
 
 # Where xx, xy, xt, yy, yt, tt stand among the six numbers of a line.
 _G2O_ORDER = (0, 1, 2, 3, 4, 5)
 _TORO_ORDER = (0, 1, 4, 2, 5, 3)
 _EDGES = {"EDGE_SE2": _G2O_ORDER, "EDGE2": _TORO_ORDER}
 _VERTICES = ("VERTEX_SE2", "VERTEX2")
-_IGNORED = ("FIX",)
+_FIX = "FIX"
 _UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
@@ -28,6 +31,8 @@ class _Lines:
     ends: list[tuple[int, int]] = field(default_factory=list)
     deltas: list[list[float]] = field(default_factory=list)
     upper: list[list[float]] = field(default_factory=list)
+    numbers: list[int] = field(default_factory=list)  # of the lines of the edges
+    fixed: list[int] = field(default_factory=list)
 
 
 def read_graph(path: Path) -> PoseGraph:
@@ -35,6 +40,7 @@ def read_graph(path: Path) -> PoseGraph:
 
     Vertices are numbered anew from 0 in the order of their numbers in the file; edges keep the file's order. An edge between
     consecutive vertices counts as odometry, every other one as a loop. A file without vertices is chained from its edges.
+    The first vertex that a `FIX` line names is the one that is `held`; nothing else is fixed.
 
     Raises:
         GraphError: no such file, a damaged line (named), a 3-D file, a vertex given twice or missing, no edge.
@@ -47,6 +53,7 @@ def read_graph(path: Path) -> PoseGraph:
         fields = line.split("#", 1)[0].split()
         if fields:
             _parse(lines, fields, f"{path}:{number}")
+            lines.numbers += [number] * (len(lines.ends) - len(lines.numbers))
     if not lines.ends:
         raise GraphError(f"{path}: holds no edge (EDGE_SE2 or EDGE2 lines); is it a g2o or TORO file?")
     return _assemble(lines, path)
@@ -67,8 +74,10 @@ def _parse(lines: _Lines, fields: list[str], where: str) -> None:
         lines.vertices[vertex] = _numbers(fields, 2, 3, where)
     elif "SE3" in tag or tag in ("VERTEX3", "EDGE3"):
         raise GraphError(f"{where}: {tag} is a 3-D record; only planar graphs (SE2) can be read")
-    elif tag not in _IGNORED:
-        known = ", ".join((*_VERTICES, *_EDGES))
+    elif tag == _FIX:
+        lines.fixed += _integers(fields, len(fields) - 1, where)
+    else:
+        known = ", ".join((*_VERTICES, *_EDGES, _FIX))
         raise GraphError(f"{where}: unknown record {tag[:40]!r}, expected one of {known}")
 
 
@@ -96,10 +105,10 @@ def _numbers(fields: list[str], start: int, count: int, where: str) -> list[floa
 def _assemble(lines: _Lines, path: Path) -> PoseGraph:
     names = sorted(lines.vertices) or sorted({end for ends in lines.ends for end in ends})
     index = {name: i for i, name in enumerate(names)}
-    for source, target in lines.ends:
+    for number, (source, target) in zip(lines.numbers, lines.ends, strict=True):
         for end in (source, target):
             if end not in index:
-                raise GraphError(f"{path}: edge {source} -> {target} names vertex {end}, which the file does not give")
+                raise GraphError(f"{path}:{number}: edge {source} -> {target} names vertex {end}, which the file does not give")
     sources = np.array([index[s] for s, _ in lines.ends], dtype=np.int64)
     targets = np.array([index[t] for _, t in lines.ends], dtype=np.int64)
     kinds = np.where(np.abs(sources - targets) == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP).astype(np.int8)
@@ -112,16 +121,40 @@ def _assemble(lines: _Lines, path: Path) -> PoseGraph:
         information=np.array(lines.upper)[:, _UPPER],
         kinds=kinds,
         edge_ids=np.arange(len(sources), dtype=np.int64),
+        file=GraphFile(
+            path, np.array(names, dtype=np.int64), np.array(lines.numbers, dtype=np.int64), _held(lines, index, path)
+        ),
     )
     return graph if lines.vertices else chain(graph)
 
 
+def _held(lines: _Lines, index: dict[int, int], path: Path) -> int | None:
+    unknown = [vertex for vertex in lines.fixed if vertex not in index]
+    if unknown:
+        raise GraphError(f"{path}: FIX names vertex {unknown[0]}, which the file does not give")
+    if len(set(lines.fixed)) > 1:
+        log.warning("%s: FIX names %d vertices; vertex %d is held, the others may move", path, len(lines.fixed), lines.fixed[0])
+    return index[lines.fixed[0]] if lines.fixed else None
+
+
+def held(graph: PoseGraph, poses: Array) -> Array:
+    """Poses (N, 3) moved as a whole, so that the node that the graph's file holds is where the file has it."""
+    node = None if graph.file is None else graph.file.held
+    if not node:
+        return poses
+    moved = compose(graph.initial[node], between(poses[node], poses))
+    moved[node] = graph.initial[node]
+    return moved
+
+
 def write_g2o(path: Path, graph: PoseGraph, poses: Array) -> None:
-    """Write nodes at `poses` (N, 3) and all edges as g2o with 17 significant digits, in one move.
+    """Write nodes at `poses` (N, 3), the one held, and all edges as g2o with 17 significant digits, in one move.
 
     The format carries no kinds: read back, every edge between non-consecutive nodes is a loop.
     """
     rows = [f"VERTEX_SE2 {i} {_row(pose)}\n" for i, pose in enumerate(poses)]
+    if graph.file is not None and graph.file.held is not None:
+        rows.append(f"{_FIX} {graph.file.held}\n")
     upper = graph.information[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     ends = zip(graph.sources, graph.targets, graph.deltas, upper, strict=True)
     rows += [f"EDGE_SE2 {s} {t} {_row(delta)} {_row(info)}\n" for s, t, delta, info in ends]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +28,23 @@ class EdgeKind(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class GraphFile:
+    """The file that a graph was read from, so that errors can name what stands there.
+
+    Attributes:
+        path: the file.
+        vertices: (N,) int64, the file's own number of each node.
+        lines: (E,) int64, line of each edge, by its `edge_ids`; edges that came later have none.
+        held: the node that the file holds where it is; None: node 0, as it names none.
+    """
+
+    path: Path
+    vertices: NDArray[np.int64]
+    lines: NDArray[np.int64]
+    held: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class PoseGraph:
     """Nodes and accepted edges.
 
@@ -38,6 +56,7 @@ class PoseGraph:
         kinds: (E,) int8, `EdgeKind`.
         edge_ids: (E,) int64, number of the edge in the log that it comes from; strictly increasing.
         entered: (E,) int64, newest node when the edge entered the graph; None: as soon as both its ends were there.
+        file: where it was read from; None where it was not.
     """
 
     initial: Array
@@ -48,6 +67,7 @@ class PoseGraph:
     kinds: NDArray[np.int8]
     edge_ids: NDArray[np.int64]
     entered: NDArray[np.int64] | None = None
+    file: GraphFile | None = None
 
     @property
     def entry_nodes(self) -> NDArray[np.int64]:
@@ -89,7 +109,25 @@ class PoseGraph:
             self.kinds[kept],
             self.edge_ids[kept],
             None if self.entered is None else self.entered[kept],
+            self.file,
         )
+
+    def node_name(self, node: int) -> str:
+        """What errors call a node, after `where`: in a file, the vertex of that number."""
+        return f"node {node}" if self.file is None else f"vertex {self.file.vertices[node]}"
+
+    @property
+    def where(self) -> str:
+        """What errors about the graph begin with."""
+        return "graph" if self.file is None else str(self.file.path)
+
+    def edge_name(self, edge: int) -> str:
+        """What errors begin with that are about an edge (by index): in a file its line and vertices, else its `edge_ids`."""
+        name, source, target = int(self.edge_ids[edge]), int(self.sources[edge]), int(self.targets[edge])
+        if self.file is None or name >= len(self.file.lines):
+            return f"{self.where}: edge {name} ({source} -> {target})"
+        vertices = self.file.vertices
+        return f"{self.file.path}:{self.file.lines[name]}: edge {vertices[source]} -> {vertices[target]}"
 
     def validate(self) -> None:
         """Refuse a graph that no solver could take.
@@ -103,7 +141,7 @@ class PoseGraph:
         near = (np.abs(self.initial) <= _FARTHEST).all(axis=1)  # which NaN is not
         if not near.all():
             node = int(np.flatnonzero(~near)[0])
-            raise GraphError(f"graph: node {node} has a pose with NaN, Inf or a number beyond {_FARTHEST:g}")
+            raise GraphError(f"{self.where}: {self.node_name(node)} has a pose with NaN, Inf or a number beyond {_FARTHEST:g}")
         lowest, highest = np.minimum(self.sources, self.targets), np.maximum(self.sources, self.targets)
         self._refuse((lowest < 0) | (highest >= self.n_nodes), "names a node that does not exist")
         self._refuse(self.sources == self.targets, "leads from a node to itself")
@@ -122,8 +160,7 @@ class PoseGraph:
 
     def _refuse(self, bad: ArrayLike, what: str) -> None:
         if np.any(bad):
-            e = int(np.flatnonzero(bad)[0])
-            raise GraphError(f"graph: edge {int(self.edge_ids[e])} ({self.sources[e]} -> {self.targets[e]}) {what}")
+            raise GraphError(f"{self.edge_name(int(np.flatnonzero(bad)[0]))} {what}")
 
 
 def _positive_definite(matrices: Array) -> NDArray[np.bool_]:

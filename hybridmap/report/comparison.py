@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -19,7 +20,7 @@ from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 from hybridmap.report import comparison_figures as figures
 from hybridmap.report import tables
 from hybridmap.report.template import rendered
-from hybridmap.trajectory import write_text_atomic
+from hybridmap.trajectory import write_bytes_atomic, write_text_atomic
 
 PICTURE, PAGE = "maps.png", "comparison.html"
 _TEMPLATE = "comparison.html.j2"
@@ -54,6 +55,7 @@ class Compared:
 def write_comparison(folder: Path, compared: Compared) -> Path:
     """Write `maps.png` and `comparison.html` into a folder, which is made; returns the page."""
     graph, rows = compared.graph, compared.rows
+    picture = figures.panels(graph, rows, compared.start)
     page = rendered(
         _TEMPLATE,
         title=compared.title,
@@ -63,11 +65,11 @@ def write_comparison(folder: Path, compared: Compared) -> Path:
         tiles=[(compared.head[key], key) for key in ("nodes", "edges", "loops")],
         columns=compared.cells[0],
         rows=[{"cells": line, "bad": not figures.has_map(row)} for row, line in zip(rows, compared.cells[1:], strict=True)],
-        messages=[(row.title, row.message) for row in rows],
+        messages=[(row.title, row.verdict) for row in rows],
         ways={str(row.way) for row in rows},
         of_truth=compared.truth is not None,
         overlay=figures.overlay(rows, compared.truth),
-        panels=figures.save_panels(folder / PICTURE, graph, rows, compared.start),
+        panels="data:image/png;base64," + base64.b64encode(picture).decode("ascii"),
         convergence=figures.convergence(rows),
         weights=figures.weights(graph, rows),
         residuals=figures.residuals(graph, rows),
@@ -76,6 +78,7 @@ def write_comparison(folder: Path, compared: Compared) -> Path:
         settings=yaml.safe_dump(compared.settings.model_dump(mode="json", exclude={"names"}), sort_keys=False),
         version=version("hybridmap"),
     )
+    write_bytes_atomic(folder / PICTURE, picture)
     write_text_atomic(folder / PAGE, page)
     return folder / PAGE
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import base64
+import io
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -58,11 +57,10 @@ def overlay(rows: Sequence[Row], truth: Array | None) -> str:
         return style.svg_uri(picture)
 
 
-def save_panels(path: Path, graph: PoseGraph, rows: Sequence[Row], start: str) -> str:
-    """Each map with its loops and its rejected loops, side by side, as a PNG file and as a `data:` URI of it.
+def panels(graph: PoseGraph, rows: Sequence[Row], start: str) -> bytes:
+    """Each map with its loops and its rejected loops, side by side, as PNG; the same figure gives the same bytes.
 
     Args:
-        path: the file; the same figure gives the same bytes.
         graph: the edges.
         rows: the maps.
         start: what the graph's own poses are.
@@ -74,15 +72,15 @@ def save_panels(path: Path, graph: PoseGraph, rows: Sequence[Row], start: str) -
     columns = max(1, min(_COLUMNS, len(maps)))
     lines = -(-len(maps) // columns)
     with style.figure(style.PAGE_WIDTH_IN, 0.4 + 3.1 * lines) as picture:
-        panels = picture.subplots(lines, columns, squeeze=False).ravel()
-        for axes, (title, poses) in zip(panels, maps.items(), strict=False):
+        places = picture.subplots(lines, columns, squeeze=False).ravel()
+        for axes, (title, poses) in zip(places, maps.items(), strict=False):
             _draw_map(axes, graph, poses, rejected.get(title, ()))
             axes.set_title(title)
-        for axes in panels[len(maps) :]:
+        for axes in places[len(maps) :]:
             axes.set_axis_off()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        picture.savefig(path, dpi=160, metadata={"Software": None})
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+        content = io.BytesIO()
+        picture.savefig(content, format="png", dpi=160, metadata={"Software": None})
+    return content.getvalue()
 
 
 def convergence(rows: Sequence[Row]) -> str:

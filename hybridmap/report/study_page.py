@@ -22,7 +22,7 @@ from hybridmap.study.study import Study
 from hybridmap.trajectory import write_text_atomic
 
 _TEMPLATE = "study.html.j2"
-_SOLVED = ("converged", "max-iterations")
+_SOLVED = ("converged", "waiting", "max-iterations")
 SHOWN_M = 5e-7
 """Differences below it are shown as 0."""
 _NAMED = 4  # places or back-ends that a remark names

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -18,36 +17,6 @@ from hybridmap.trajectory import write_text_atomic
 
 PAGE, METRICS = "verify.html", "metrics.json"
 _TEMPLATE = "verify.html.j2"
-
-
-def prepare_folder(folder: Path, *, overwrite: bool = False) -> None:
-    """Check that a verification may be written into a folder, before anything is run; leaves nothing.
-
-    Raises:
-        StoreError: it is a file, holds something else, or holds a verification and `overwrite` is not given,
-            or it cannot be written to.
-    """
-    if not folder.exists():
-        _try_to_write(folder)
-        return
-    if not folder.is_dir():
-        raise StoreError(f"{folder}: is a file; expected a folder that is empty or does not exist")
-    found = sorted(entry.name for entry in folder.iterdir())
-    other = [name for name in found if name not in (PAGE, METRICS)]
-    if other:
-        raise StoreError(f"{folder}: not empty and no verification (it holds {other[0]!r}); choose another folder")
-    if found and not overwrite:
-        raise StoreError(f"{folder}: holds a verification already; choose another folder or give --overwrite")
-    _try_to_write(folder)
-
-
-def _try_to_write(folder: Path) -> None:
-    """Make a folder beside what will be written, and take it away again."""
-    beside = next((place for place in (folder, *folder.absolute().parents) if place.exists()), Path())
-    try:
-        Path(tempfile.mkdtemp(prefix=".hybridmap-", dir=beside)).rmdir()
-    except OSError as error:
-        raise StoreError(f"{folder}: cannot be written to: {error.strerror}") from None
 
 
 def write_verification(folder: Path, head: dict[str, Any], rows: Sequence[Metric], result: Verification) -> Path:

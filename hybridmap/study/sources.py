@@ -25,7 +25,7 @@ from hybridmap.study.model import SettingConfig, SourceConfig, SyntheticConfig
 from hybridmap.trajectory import Trajectory
 
 _REFEREE = "gtsam-lm"
-_ARRAYS = tuple(field.name for field in fields(PoseGraph))
+_ARRAYS = tuple(field.name for field in fields(PoseGraph) if field.name != "file")
 
 
 @dataclass(frozen=True, slots=True)

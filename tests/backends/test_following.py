@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from graphs_for_tests import laps
+from graphs_for_tests import graph_of, laps
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridmap import backends
+from hybridmap.backends.base import SolveStatus
 from hybridmap.backends.following import difference, prefix
 from hybridmap.backends.objective import chi2
 from hybridmap.config.backends import BackendsConfig, Isam2Config
@@ -155,6 +156,33 @@ def test_a_second_chain_edge_of_a_new_node_waits_for_the_next_closure():
         edge_ids=np.append(chain_only.edge_ids, 999),
     )
     assert not difference(prefix(graph, 17), both).closes
+
+
+def twice_measured(nodes=20):
+    """A chain of odometry with a registration beside each edge, which say different things; no loop."""
+    truth = [np.zeros(3)]
+    for _ in range(nodes - 1):
+        truth.append(compose(truth[-1], [0.5, 0.05, 0.1]))
+    pairs = [(k - 1, k, kind) for k in range(1, nodes) for kind in (EdgeKind.ODOMETRY, EdgeKind.REGISTRATION)]
+    return graph_of(np.array(truth), pairs, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("name", [name for name in backends.names() if name.startswith("gtsam")])
+def test_what_waits_for_a_closure_is_not_called_converged_and_counts_at_the_end_of_the_drive(name):
+    graph = twice_measured()
+    backend = backends.create(name)
+    *_, last = backends.replay(backend, graph)
+    assert last.report.status is SolveStatus.WAITING
+    assert "19 measurements beside the chain wait" in last.report.message
+    end, whole = backend.finish(graph), backends.create(name).solve(graph)
+    assert end.report.status is SolveStatus.CONVERGED
+    assert end.report.chi2 < 0.9 * last.report.chi2
+    assert end.report.chi2 == pytest.approx(whole.report.chi2, rel=1e-6)
+
+
+def test_odometry_waits_for_nothing():
+    *_, last = backends.replay(backends.create("odometry"), twice_measured())
+    assert last.report.status is SolveStatus.CONVERGED
 
 
 def test_a_loop_committed_late_is_replayed_late():

@@ -1,6 +1,7 @@
 """`hybridmap compare`: one table, one referee, and a back-end that fails is a row."""
 
 import json
+import logging
 import sys
 
 import numpy as np
@@ -164,3 +165,69 @@ def test_a_curve_leads_from_the_start_to_the_solution():
         assert np.all(np.diff(effort) > 0)
         assert np.all(np.diff(cost) <= 2e-3 * cost[:-1])  # relaxation's own objective is another one
         assert len(cost) >= 3
+
+
+def test_what_is_at_no_optimum_has_no_gap_and_says_why(monkeypatch, capsys, square):
+    words = ("compare", square, "--backends", "odometry,gtsam-lm")
+    _, printed, _ = run(monkeypatch, capsys, *words, "--json")
+    gaps = [row["name"] for row in json.loads(printed)["metrics"] if row["name"].startswith("certificate_gap")]
+    assert gaps == ["certificate_gap/gtsam-lm"]
+    _, printed, _ = run(monkeypatch, capsys, *words)
+    assert "odometry: dead reckoning; not certified: this solution is not at an optimum" in printed
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_an_earlier_comparison_goes_only_where_that_was_asked_for(monkeypatch, capsys, square, tmp_path):
+    out = tmp_path / "compared"
+    words = ("compare", square, "--out", out, "--backends")
+    assert run(monkeypatch, capsys, *words, "odometry")[0] == 0
+    before = contents(out)
+    code, printed, error = run(monkeypatch, capsys, *words, "gtsam-lm")
+    assert (code, printed, error.count("\n")) == (2, "", 1)
+    assert "holds a comparison already; choose another folder or give --overwrite" in error
+    assert contents(out) == before
+    assert run(monkeypatch, capsys, *words, "gtsam-lm", "--overwrite")[0] == 0
+    assert set(contents(out)) == set(before)
+    assert contents(out)["comparison.html"] != before["comparison.html"]
+
+
+@pytest.mark.parametrize("name", ["maps.png", "comparison.html", "notes.txt"])
+def test_a_file_of_somebody_else_is_never_lost(monkeypatch, capsys, square, tmp_path, name):
+    out = tmp_path / "mine"
+    out.mkdir()
+    (out / name).write_text("mine")
+    code, printed, error = run(monkeypatch, capsys, "compare", square, "--backends", "odometry", "--out", out, "--overwrite")
+    assert (code, printed) == (2, "")
+    assert f"not empty and no comparison (it holds '{name}')" in error
+    assert contents(out) == {name: b"mine"}
+
+
+def test_a_back_end_named_twice_is_refused(monkeypatch, capsys, square):
+    code, printed, error = run(monkeypatch, capsys, "compare", square, "--backends", "gtsam-lm, gtsam-lm")
+    assert (code, printed) == (2, "")
+    assert "back-end 'gtsam-lm' is named twice" in error
+
+
+def test_the_words_over_the_table_say_what_was_done(monkeypatch, capsys, square):
+    for way, said, unsaid in (("--incremental", "incremental from", "batch"), ("--batch", "batch from", "incremental")):
+        _, printed, _ = run(monkeypatch, capsys, "compare", square, "--backends", "odometry", way)
+        title = printed.splitlines()[0]
+        assert said in title
+        assert unsaid not in title
+
+
+def test_the_message_of_a_drive_says_what_its_iterations_are():
+    graph, _ = laps(np.random.default_rng(0), nodes=40)
+    (row,) = comparison.compare(graph, ["relaxation-ratslam"], ways=[Way.INCREMENTAL])
+    report = row.solution.report
+    assert report.iterations > 20
+    assert row.message.startswith(f"{report.iterations} iterations over 40 nodes; at the end: ")
+
+
+def test_matplotlib_says_nothing_of_its_cache(monkeypatch, capsys, square):
+    run(monkeypatch, capsys, "compare", square, "--backends", "odometry")
+    logging.getLogger("matplotlib").warning("mkdir -p failed")
+    assert capsys.readouterr().err == ""

@@ -54,10 +54,15 @@ def test_json_holds_the_figures_and_the_file_has_the_poses_they_are_of(monkeypat
     assert figures["chi2/gtsam-lm"] < 1e-2 * figures["chi2_initial/gtsam-lm"]
 
 
-def test_without_json_there_is_a_table(monkeypatch, capsys, square):
-    code, printed, _ = run(monkeypatch, capsys, "optimize", square)
+@pytest.mark.parametrize("name", ["gtsam-lm", "odometry"])
+def test_without_json_there_is_one_table_under_one_line(monkeypatch, capsys, tmp_path, name):
+    square = tmp_path / f"{'long' * 30}.g2o"
+    square.write_text(SQUARE)
+    code, printed, _ = run(monkeypatch, capsys, "optimize", square, "--backend", name)
     assert code == 0
-    assert "chi2/gtsam-lm" in printed
+    assert printed.splitlines()[0] == f"{square}: {name}: converged"
+    assert f"chi2/{name}" in printed
+    assert "meaning" in printed
 
 
 def test_a_back_end_that_diverged_is_exit_code_1_and_no_file(monkeypatch, capsys, tmp_path):
@@ -105,10 +110,14 @@ def test_bad_input_is_one_line_and_exit_code_2(monkeypatch, capsys, square, tmp_
 BAD_LINES = {
     "found NaN or Inf": ["EDGE_SE2 3 0 nan 0 1.57 100 0 0 100 0 400"],
     "not positive definite": ["EDGE_SE2 3 0 1 0 1.57 100 200 0 100 0 400"],
-    "edge 4 (3 -> 0) has an information matrix that is not positive definite": ["EDGE_SE2 3 0 1 0 1.57 100 0 0 100 0 0"],
+    "bad.g2o:9: edge 3 -> 0 has an information matrix that is not positive definite": ["EDGE_SE2 3 0 1 0 1.57 100 0 0 100 0 0"],
     "outside 1e-09 to 1e+15": ["EDGE_SE2 3 0 1 0 1.57 100 0 0 100 0 1e-300"],
     "beyond 1e+09": ["EDGE_SE2 3 0 1e200 0 1.57 100 0 0 100 0 400"],
-    "node 4 is not connected to node 0": ["VERTEX_SE2 7 0 0 0", "VERTEX_SE2 8 1 0 0", "EDGE_SE2 7 8 1 0 0 1 0 0 1 0 1"],
+    "bad.g2o: vertex 7 is not connected to vertex 0 (2 of 6 nodes are not)": [
+        "VERTEX_SE2 7 0 0 0",
+        "VERTEX_SE2 8 1 0 0",
+        "EDGE_SE2 7 8 1 0 0 1 0 0 1 0 1",
+    ],
     "names vertex 99, which the file does not give": ["EDGE_SE2 3 99 1 0 0 100 0 0 100 0 400"],
     "vertex 0 is given twice": ["VERTEX_SE2 0 0 0 0"],
     "leads from a node to itself": ["EDGE_SE2 3 3 1 0 0 100 0 0 100 0 400"],
@@ -161,3 +170,16 @@ def test_a_file_in_the_way_is_not_lost(monkeypatch, capsys, tmp_path):
     assert run(monkeypatch, capsys, *words, tmp_path)[0] == 2
     assert run(monkeypatch, capsys, *words, tmp_path / "out.g2o", "--overwrite")[0] == 0
     assert (tmp_path / "out.g2o").read_text().startswith("VERTEX_SE2")
+
+
+def test_the_vertex_that_a_file_fixes_stays_where_it_is(monkeypatch, capsys, square, tmp_path):
+    square.write_text(SQUARE + "FIX 2\n")
+    out = tmp_path / "out.g2o"
+    code, printed, _ = run(monkeypatch, capsys, "optimize", square, "--out", out, "--json")
+    assert code == 0
+    before, after = read_graph(square), read_graph(out)
+    assert np.array_equal(after.initial[2], before.initial[2])
+    assert not np.allclose(after.initial[0], before.initial[0], atol=1e-3)
+    assert after.file.held == 2
+    figures = {row["name"]: row["value"] for row in json.loads(printed)["metrics"]}
+    assert chi2(after, after.initial) == pytest.approx(figures["chi2/gtsam-lm"], rel=1e-9)

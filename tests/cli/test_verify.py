@@ -86,6 +86,10 @@ def test_small_figures_are_shown_as_they_are(capsys, as_json):
 
 def test_a_verification_is_replaced_only_when_asked(run, tmp_path):
     (tmp_path / "metrics.json").write_text("{}")
+    code, _, err = run("--out", tmp_path, "--overwrite")
+    assert code == 2
+    assert "no verification (it holds 'metrics.json')" in err
+    (tmp_path / "verify.html").write_text("hybridmap 1.0")
     code, _, err = run("--out", tmp_path)
     assert code == 2
     assert "--overwrite" in err

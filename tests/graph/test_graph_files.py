@@ -6,7 +6,7 @@ import pytest
 from hybridmap.errors import GraphError
 from hybridmap.geometry import between, compose, exp
 from hybridmap.graph.connectivity import chain, require_connected
-from hybridmap.graph.io import read_graph, write_g2o
+from hybridmap.graph.io import held, read_graph, write_g2o
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 
 G2O = """# a comment
@@ -112,7 +112,7 @@ def test_vertices_may_have_any_numbers(tmp_path):
         (("1.0 0.0 0.5  10", "1.0 x 0.5 10"), r"graph\.g2o:6: expected numbers"),
         (("1.0 0.0 0.5  10", "1.0 nan 0.5 10"), r"graph\.g2o:6: found NaN or Inf"),
         (("EDGE_SE2 0 1 1.0", "EDGE_SE2 0 one 1.0"), r"graph\.g2o:6: expected 2 whole"),
-        (("EDGE_SE2 2 0", "EDGE_SE2 2 7"), r"names vertex 7, which the file does not give"),
+        (("EDGE_SE2 2 0", "EDGE_SE2 2 7"), r"graph\.g2o:9: edge 2 -> 7 names vertex 7, which the file does not give"),
         (("VERTEX_SE2 2 2", "VERTEX_SE2 1 2"), r"graph\.g2o:4: vertex 1 is given twice"),
         (("FIX 0", "VERTEX_SE3:QUAT 3 0 0 0 0 0 0 1"), r"graph\.g2o:5: VERTEX_SE3:QUAT is a 3-D record"),
         (("FIX 0", "hello world"), r"graph\.g2o:5: unknown record 'hello'"),
@@ -121,6 +121,36 @@ def test_vertices_may_have_any_numbers(tmp_path):
 def test_damage_is_named_by_file_and_line(tmp_path, change, says):
     with pytest.raises(GraphError, match=says):
         read_graph(written(tmp_path, G2O.replace(*change)))
+
+
+def test_what_is_wrong_with_a_graph_is_told_in_the_numbers_of_its_file(tmp_path):
+    tens = "".join(f"VERTEX_SE2 {10 * k} {k} 0 0\n" for k in (3, 1, 2))
+    edges = "EDGE_SE2 10 20 1 0 0 9 0 0 9 0 9\nEDGE_SE2 20 30 1 0 0 9 0 0 9 0 {}\n"
+    graph = read_graph(written(tmp_path, tens + edges.format(-1)))
+    with pytest.raises(GraphError, match=r"graph\.g2o:5: edge 20 -> 30 has an information matrix that is not positive"):
+        graph.validate()
+    with pytest.raises(GraphError, match=r"graph\.g2o:5: edge 20 -> 30 has"):
+        graph.with_edges([1]).validate()
+    with pytest.raises(GraphError, match=r"graph\.g2o: vertex 30 has a pose with"):
+        read_graph(written(tmp_path, tens.replace("30 3", "30 3e99") + edges.format(9))).validate()
+    with pytest.raises(GraphError, match=r"graph\.g2o: vertex 20 is not connected to an earlier node"):
+        read_graph(written(tmp_path, "EDGE_SE2 10 30 1 0 0 9 0 0 9 0 9\nEDGE_SE2 20 30 1 0 0 9 0 0 9 0 9\n"))
+
+
+def test_the_first_fixed_vertex_is_held_and_written_again(tmp_path, caplog):
+    graph = read_graph(written(tmp_path, G2O.replace("FIX 0", "FIX 2\nFIX 1")))
+    assert "vertex 2 is held, the others may move" in caplog.text
+    moved = compose([3.0, 1.0, 0.7], graph.initial)
+    back = held(graph, moved)
+    assert np.array_equal(back[2], graph.initial[2])
+    assert np.allclose(between(back[:-1], back[1:]), between(moved[:-1], moved[1:]))
+    write_g2o(tmp_path / "out.g2o", graph, back)
+    again = read_graph(tmp_path / "out.g2o")
+    assert (again.file.held, "FIX 2\n" in (tmp_path / "out.g2o").read_text()) == (2, True)
+    with pytest.raises(GraphError, match=r"graph\.g2o: FIX names vertex 8, which the file does not give"):
+        read_graph(written(tmp_path, G2O.replace("FIX 0", "FIX 8")))
+    unfixed = read_graph(written(tmp_path, G2O.replace("FIX 0\n", "")))
+    assert held(unfixed, moved) is moved
 
 
 def test_files_without_edges_and_missing_files_are_refused(tmp_path):
@@ -133,9 +163,9 @@ def test_files_without_edges_and_missing_files_are_refused(tmp_path):
 def test_a_part_that_hangs_on_nothing_is_named(tmp_path):
     text = G2O + "VERTEX_SE2 3 0 0 0\nVERTEX_SE2 4 0 0 0\nEDGE_SE2 3 4 1 0 0 1 0 0 1 0 1\n"
     graph = read_graph(written(tmp_path, text))
-    with pytest.raises(GraphError, match=r"node 3 is not connected to node 0 \(2 of 5"):
+    with pytest.raises(GraphError, match=r"graph\.g2o: vertex 3 is not connected to vertex 0 \(2 of 5"):
         require_connected(graph)
-    with pytest.raises(GraphError, match="node 3 is not connected to an earlier node"):
+    with pytest.raises(GraphError, match=r"graph\.g2o: vertex 3 is not connected to an earlier node"):
         chain(graph)
 
 
