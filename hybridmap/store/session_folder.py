@@ -214,8 +214,10 @@ class SessionFolder:
     def merge_metrics(self, metrics: Iterable[Metric]) -> None:
         """Put figures into `metrics.json`: of the same name the new one counts, others stay; order is kept.
 
+        Where it may not be written, it stays as it is and a warning says so.
+
         Raises:
-            StoreError: the file is damaged or cannot be written.
+            StoreError: the file is damaged.
         """
         before = self.read_metrics()
         rows = {metric.name: metric for metric in before.metrics}
@@ -223,7 +225,7 @@ class SessionFolder:
         try:
             self.write_metrics(before.head, rows.values())
         except OSError as error:
-            raise StoreError(f"{self.metrics_json}: cannot be written: {error.strerror}") from None
+            log.warning("%s: cannot be written: %s; the figures are not kept", self.metrics_json, error.strerror)
 
     def write_trajectory(self, name: str, trajectory: Trajectory) -> None:
         """Write an estimate: `odometry`, `<backend>` or `<backend>_online`."""
