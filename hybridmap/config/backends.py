@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from hybridmap.config.section import Section
 
@@ -110,3 +110,11 @@ class BackendsConfig(Section):
     """Pairwise consistency of the loops."""
     isam2: Isam2Config = Isam2Config()
     """Incremental smoothing."""
+
+    @field_validator("names")
+    @classmethod
+    def _once_each(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        for position, name in enumerate(names):
+            if name in names[:position]:
+                raise ValueError(f"expected each back-end once, found {name!r} again")
+        return names

@@ -47,6 +47,7 @@ def test_every_command_explains_itself(command):
         (["map", "office", "--out", "s", "--set", "nodes.distanse_m=1"], "nodes.distanse_m"),
         (["map", "office", "--out", "s", "--set", "nodes.distance_m"], "KEY=VALUE"),
         (["map", "office", "--out", "s", "--backend", "gtsam-magic"], "gtsam-magic"),
+        (["map", "office", "--out", "s", "--backend", "odometry", "--backend", "odometry"], "found 'odometry' again"),
         (["map", "office", "--out", "s", "--start", "nan"], "--start"),
         (["map", "office", "--out", "s", "--start", "-5"], "--start"),
         (["map", "office", "--out", "s", "--end", "inf"], "--end"),
