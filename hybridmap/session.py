@@ -14,7 +14,7 @@ from hybridmap.backends import objective
 from hybridmap.backends.base import SolveReport
 from hybridmap.calibration.sessions import GAIN_CHANGES
 from hybridmap.config import Config
-from hybridmap.errors import HybridMapError, StreamError
+from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.carries import carries
 from hybridmap.graph.experience_map import Status
@@ -52,8 +52,8 @@ class Session:
 def run(stream: Stream, config: Config, out: Path, *, overwrite: bool = False, progress: Progress | None = None) -> Session:
     """Map a stream into a session folder.
 
-    The map file is written as the run proceeds: a run that is killed leaves a readable map up to its last node. When
-    the input turns out to be unusable, what this run wrote is removed and what an overwritten session held is put back.
+    The map file is written as the run proceeds: a run that is killed leaves a readable map up to its last node. On any
+    error what this run wrote is removed and what an overwritten session held is put back.
 
     Args:
         stream: the samples.
@@ -64,26 +64,17 @@ def run(stream: Stream, config: Config, out: Path, *, overwrite: bool = False, p
 
     Raises:
         StreamError: the stream is damaged or unordered, or gave nothing to map.
-        StoreError: the folder cannot be used.
+        StoreError: the folder cannot be used, or another run is writing there.
         ConfigError, BackendError: a sensor or back-end that there is not.
     """
     mapper = Mapper(config, stream.rig)
     folder = SessionFolder(out)
-    folder.prepare(overwrite=overwrite)
-    try:
+    with folder.writing(overwrite=overwrite):
         folder.write_config(config.to_yaml())
         with MapStore.create(folder.path, config.to_yaml(), stream.rig, stream.name) as store:
             recorder = _Recorder(mapper, store)
             _drive(stream, mapper, recorder, progress)
-            session = _conclude(stream, mapper, recorder, folder)
-    except HybridMapError:
-        folder.discard()
-        raise
-    except KeyboardInterrupt:
-        folder.restore_previous()
-        raise
-    folder.keep()
-    return session
+            return _conclude(stream, mapper, recorder, folder)
 
 
 def _drive(stream: Stream, mapper: Mapper, recorder: _Recorder, progress: Progress | None) -> None:
@@ -210,12 +201,12 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
             *_doubts(mapper),
         ],
     }
-    for key in ("graph_hash", "primary_backend"):
-        store.put_info(key, head[key])
     metrics = _figures(mapper, recorder, float(track.stamps_ns[-1] - track.stamps_ns[0]) / NS_PER_S)
     if free is not None:
         metrics.append(Metric("unobserved", free.sliding_m + free.blind_m, "m", str(free)))
     folder.write_metrics(head, metrics)
+    for key in ("graph_hash", "primary_backend"):
+        store.put_info(key, head[key])
     return Session(folder, head, metrics)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -107,6 +108,11 @@ def format_stamp(stamp_ns: int) -> str:
     return f"{stamp_ns // NS_PER_S}.{stamp_ns % NS_PER_S:09d}"
 
 
+def format_motion(moved_m: float, turned_deg: float) -> str:
+    """How far something went and turned, in words."""
+    return f"{moved_m:.3f} m and {turned_deg:.1f} deg"
+
+
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write the TUM format: stamps with 9 decimals, 17 significant digits, no half-written file on failure."""
     quaternions = quaternion_from_yaw(trajectory.poses[:, 2])
@@ -118,13 +124,22 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 
 
 def write_text_atomic(path: Path, text: str) -> None:
-    """Write a text file in one move, so that a reader or a crash never meets half of it."""
+    """Write a text file in one move, so that a reader or a crash never meets half of it.
+
+    Raises:
+        OSError: it cannot be written; names `path` itself.
+    """
     write_bytes_atomic(path, text.encode("utf-8"))
 
 
 def write_bytes_atomic(path: Path, content: bytes) -> None:
     """The same for any file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial")
-    partial.write_bytes(content)
-    partial.replace(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(content)
+        partial.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from None

@@ -135,6 +135,28 @@ def test_breaking_off_an_overwrite_brings_the_old_session_back(tmp_path):
         assert len(store.map()) > 1
 
 
+class TooLarge(RoomDrive):
+    """A drive during which the memory gives out."""
+
+    def __iter__(self):
+        for i, sample in enumerate(super().__iter__()):
+            if i > 60:
+                raise MemoryError
+            yield sample
+
+
+def test_a_failure_of_any_kind_brings_the_old_session_back(tmp_path):
+    config = Config.load("laser", {"vision.sensor": "none"})
+    kept = session.run(RoomDrive(laps=0.2, with_scans=False), config, tmp_path / "s").head["graph_hash"]
+    for folder in ("s", "new"):
+        with pytest.raises(MemoryError):
+            session.run(TooLarge(), config, tmp_path / folder, overwrite=True)
+    with MapStore.open(tmp_path / "s") as store:
+        assert graph_hash(store.map()) == kept
+        assert store.ended
+    assert [entry.name for entry in tmp_path.iterdir()] == ["s"]
+
+
 def test_nothing_to_map_is_said():
     class Empty(RoomDrive):
         def __iter__(self):
@@ -169,3 +191,4 @@ def test_a_killed_run_leaves_a_readable_map(tmp_path):
     process.wait()
     with MapStore.open(tmp_path / "s") as store:
         assert len(store.map()) >= 3
+        assert not store.ended

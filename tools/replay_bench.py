@@ -91,4 +91,4 @@ def _false_edges(clean: PoseGraph, name: str) -> Iterator[Metric]:
     what = f"{false.n_edges - clean.n_edges} false edges over {clean.n_nodes} nodes"
     chi2 = f"of the optimum without them; {ruined.last.report.chi2:.4g} before, {back.report.cpu_s:.2f} s of CPU"
     yield at_most(f"chi2_after_removal/{name}", back.report.chi2 / best.report.chi2, 1.0 + 1e-6, f"{what}: {chi2}")
-    yield at_most(f"off_after_removal/{name}", float(off[:, :2].max()), 1e-3, "largest distance from that optimum", "m")
+    yield Metric(f"off_after_removal/{name}", float(off[:, :2].max()), "m", "largest distance from that optimum")

@@ -21,6 +21,7 @@ from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array, between
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 from hybridmap.store import MapStore, SessionFolder
+from hybridmap.streams.base import Rig
 from hybridmap.trajectory import NS_PER_S, Trajectory
 
 log = logging.getLogger(__name__)
@@ -48,6 +49,7 @@ class Drive:
         poses: (N, 3) of the nodes by the primary back-end.
         config: of the session, as far as a calibration needs it: gains, delay and back-ends.
         config_tree: all of it, as it stands in the map file.
+        sensors: what it was mapped with, in words.
     """
 
     name: str
@@ -57,6 +59,7 @@ class Drive:
     poses: Array
     config: Config
     config_tree: dict[str, Any]
+    sensors: str
 
 
 def read_drive(folder: Path) -> Drive:
@@ -72,7 +75,7 @@ def read_drive(folder: Path) -> Drive:
         track, experiences, solutions = store.track(), store.map(), store.solutions()
         tree = yaml.safe_load(store.config_yaml) or {}
         config = _understood(tree, f"{store.path}: configuration")
-        changes, primary = store.info(GAIN_CHANGES) or [], store.primary
+        changes, primary, sensors = store.info(GAIN_CHANGES) or [], store.primary, _sensors(store.rig)
     if len(track) < 2:
         raise EvaluationError(f"{folder}: holds no odometry to calibrate")
     steps = between(track.poses_odom[:-1], track.poses_odom[1:])
@@ -80,7 +83,7 @@ def read_drive(folder: Path) -> Drive:
     graph = experiences.pose_graph()
     poses = solutions[primary].poses if primary in solutions else graph.initial
     stamps = np.array([node.stamp_ns for node in experiences.nodes], dtype=np.int64)
-    return Drive(str(folder), motion, graph, stamps, poses, config, tree)
+    return Drive(str(folder), motion, graph, stamps, poses, config, tree, sensors)
 
 
 def estimate_of(
@@ -90,6 +93,8 @@ def estimate_of(
     leg_m: float | None = None,
 ) -> Estimate:
     """Calibrate drives on references, one a drive, or without any on their own maps.
+
+    Drives with other sensors than the first are taken all the same, with a warning that they are hardly of one kind of robot.
 
     Args:
         drives: of one robot, or of robots of one kind, under the same gains and delay.
@@ -104,6 +109,12 @@ def estimate_of(
     """
     require_options(len(drives), len(references), estimator, leg_m)
     require_one_calibration(drives)
+    for drive in drives[1:]:
+        if drive.sensors != drives[0].sensors:
+            log.warning(
+                "%s has %s, %s has %s: hardly of one kind of robot, yet calibrated as one",
+                *(drives[0].name, drives[0].sensors, drive.name, drive.sensors),
+            )
     if references:
         return by_reference(drives, references, leg_m)
     return joint_of(drives) if estimator == "joint" else alternating(drives, leg_m)
@@ -258,6 +269,13 @@ def _understood(tree: dict[str, Any], origin: str) -> Config:
 
 def _in_use(config: Config) -> dict[str, float]:
     return {f"{section}.{key}": getattr(getattr(config, section), key) for section, keys in _IN_USE.items() for key in keys}
+
+
+def _sensors(rig: Rig) -> str:
+    laser, camera = rig.laser, rig.camera
+    found = [f"a laser of {len(laser.bearings_rad)} beams"] if laser is not None else []
+    found += [f"a camera of {camera.width_px} x {camera.height_px} pixels"] if camera is not None else []
+    return " and ".join(found) or "no sensor but odometry"
 
 
 def _same_recording(one: Motion, other: Motion) -> bool:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from collections.abc import Sequence
 from importlib.metadata import version
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -22,12 +23,14 @@ from hybridmap.cli.optimize import optimize
 from hybridmap.cli.simulate import simulate
 from hybridmap.cli.study import study
 from hybridmap.cli.verify import verify
-from hybridmap.errors import HybridMapError
+from hybridmap.errors import ConfigError, HybridMapError
+
+_INTERRUPTED = 130  # what typer makes of Ctrl-C
 
 app = typer.Typer(
     name="hybridmap",
     help="A factor-graph hybrid mapper: neural path integration, scanline loop closure, relaxation and GTSAM on one graph.",
-    no_args_is_help=True,
+    invoke_without_command=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -42,12 +45,16 @@ def _show_version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
+    context: typer.Context,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens, on standard error.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bars, no log below errors.")] = False,
     _version: Annotated[
         bool, typer.Option("--version", help="Show the version and exit.", callback=_show_version, is_eager=True)
     ] = False,
 ) -> None:
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help(), err=True)
+        raise typer.Exit(2)
     level = logging.INFO if verbose else logging.ERROR if quiet else logging.WARNING
     logging.basicConfig(level=level, format="hybridmap: %(levelname)s: %(message)s", stream=sys.stderr, force=True)
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where no home can be written to it warns of its own cache
@@ -73,21 +80,32 @@ def main() -> None:
     os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")  # pictures are small: a second thread costs more than it gives
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # a damaged picture is reported by our own line
     try:
+        _refuse_empty(sys.argv[1:])
         code = app(prog_name="hybridmap", standalone_mode=False)
-        raise SystemExit(code if isinstance(code, int) else 0)
     except OSError as error:
         _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except MemoryError as error:
+        _fail(f"not enough memory: {' '.join(str(error).split()) or 'none is left'}")
     except HybridMapError as error:
         _fail(" ".join(str(error).split()))
     except Exception as error:
         if not hasattr(error, "format_message"):  # click's usage errors, wherever typer has them from
             raise
         _fail(" ".join(error.format_message().split()))
-    except KeyboardInterrupt:
+    if code == _INTERRUPTED:
         print("hybridmap: interrupted", file=sys.stderr)  # noqa: T201
-        raise SystemExit(130) from None
+    raise SystemExit(code if isinstance(code, int) else 0)
 
 
-def _fail(message: str) -> None:
+def _refuse_empty(arguments: Sequence[str]) -> None:
+    """An empty path would be taken for the folder that one is in."""
+    for before, argument in zip(("", *arguments), arguments, strict=False):
+        option, given, value = argument.partition("=") if argument.startswith("--") else (before, "=", argument)
+        if given and not value:
+            name = option if option.startswith("--") else "an argument"
+            raise ConfigError(f"{name}: found nothing, expected a value")
+
+
+def _fail(message: str) -> NoReturn:
     print(f"hybridmap: error: {message}", file=sys.stderr)  # noqa: T201
     raise SystemExit(2)

@@ -127,6 +127,8 @@ def _done(opened: GraphSource, ways: Sequence[Way]) -> str:
 
 def _table(rows: Sequence[Row], judged: Sequence[Metric]) -> list[list[str]]:
     """Column titles, then a line of text a row."""
+    from hybridmap.report.tables import number
+
     by_name = {metric.name: f"{metric.value:.4f}" for metric in judged}
     errors = {name: title for name, title in _ERRORS.items() if any(key.startswith(f"{name}/") for key in by_name)}
     columns = ["back-end", "way", "chi2", "unit variance", *errors.values(), "status", "iterations", "CPU (s)"]
@@ -137,7 +139,7 @@ def _table(rows: Sequence[Row], judged: Sequence[Metric]) -> list[list[str]]:
             continue
         report = row.solution.report
         against = [by_name.get(f"{name}/{row.title}", "") for name in errors]
-        variance = "" if report.unit_variance is None else f"{report.unit_variance:.4g}"
+        variance = "" if report.unit_variance is None else number(report.unit_variance)
         figures = [f"{report.chi2:.7g}", variance, *against, row.status, str(report.iterations), f"{report.cpu_s:.2f}"]
         proof = row.certificate.word if row.certificate is not None else ""
         table.append([row.backend, str(row.way), *figures, str(len(report.rejected_edge_ids)), proof])

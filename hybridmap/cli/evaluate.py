@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+log = logging.getLogger(__name__)
 
 
 def evaluate(
@@ -34,12 +37,14 @@ def evaluate(
     """
     from hybridmap.cli.show import emit
     from hybridmap.evaluate import evaluate_session
-    from hybridmap.evaluate.loops import evaluate_loops
     from hybridmap.report import write_report
     from hybridmap.store import SessionFolder
 
-    candidates = evaluate_loops(folder, reference) if loops else []
-    metrics = evaluate_session(folder, reference, relations) + candidates
-    if SessionFolder(folder).report.is_file():
-        write_report(SessionFolder(folder))
-    emit(SessionFolder(folder).read_metrics().head, metrics, as_json=as_json, title=str(folder))
+    session = SessionFolder(folder)
+    metrics = evaluate_session(folder, reference, relations, loops=loops)
+    if session.report.is_file():
+        try:
+            write_report(session)
+        except OSError as error:
+            log.warning("%s: cannot be written: %s; the page stays as it was", session.report, error.strerror)
+    emit(session.read_metrics().head, metrics, as_json=as_json, title=str(folder))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hybridmap.errors import ConfigError
-from hybridmap.trajectory import format_stamp
+from hybridmap.trajectory import format_motion, format_stamp
 
 if TYPE_CHECKING:
     from hybridmap.evaluate.explain import Decision, FrameStory, NodeStory
@@ -54,7 +54,7 @@ def explain(
 
 def _frame_lines(story: FrameStory) -> Iterator[str]:
     yield f"frame at {story.time_s:.3f} s (stamp {format_stamp(story.stamp_ns)} s)"
-    yield f"  robot        {story.moved[0]:.3f} m and {story.moved[1]:.1f} deg from node {story.at_node}, the last one made"
+    yield f"  robot        {format_motion(*story.moved)} from node {story.at_node}, the last one made"
     if story.next_node is not None:
         yield f"               node {story.next_node} came at {story.next_time_s:.3f} s"
     yield from _pose_lines(story.poses, "believed")
@@ -71,7 +71,7 @@ def _node_lines(story: NodeStory) -> Iterator[str]:
     yield f"node {story.node} at {story.time_s:.3f} s (stamp {format_stamp(story.stamp_ns)} s)"
     yield f"  travel       {story.travel_m:.2f} m so far"
     if story.moved is not None:
-        yield f"  made         {story.moved[0]:.3f} m and {story.moved[1]:.1f} deg from node {story.node - 1}"
+        yield f"  made         {format_motion(*story.moved)} from node {story.node - 1}"
     if story.template >= 0:
         yield f"  view         template {story.template}" + (", which it founded" if story.founded else ", seen before")
     yield from _pose_lines(story.poses, "pose")

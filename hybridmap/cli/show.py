@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import sys
 from collections.abc import Iterable, Iterator
@@ -54,15 +53,10 @@ def _stage(row: Metric) -> str:
     return row.name.partition("/")[2]
 
 
-def _value(row: Metric | None) -> str:
-    if row is None:
-        return ""
-    verdict = "" if row.passed is None else " ✓" if row.passed else " ✗"
-    return "none" if math.isnan(row.value) else f"{row.value:.4g}{verdict}"
-
-
 def _plain_table(rows: list[Metric]) -> Table:
     from rich.table import Table
+
+    from hybridmap.report.tables import shown
 
     table = Table()
     table.add_column("figure", no_wrap=True)
@@ -70,12 +64,14 @@ def _plain_table(rows: list[Metric]) -> Table:
     table.add_column("unit")
     table.add_column("meaning")
     for row in rows:
-        table.add_row(row.name, _value(row), row.unit, row.description)
+        table.add_row(row.name, shown(row), row.unit, row.description)
     return table
 
 
 def _table_by_backend(rows: list[Metric], columns: list[str]) -> Table:
     from rich.table import Table
+
+    from hybridmap.report.tables import shown
 
     table = Table()
     table.add_column("figure", no_wrap=True)
@@ -86,7 +82,7 @@ def _table_by_backend(rows: list[Metric], columns: list[str]) -> Table:
     for measure in dict.fromkeys(row.name.partition("/")[0] for row in rows):
         cells = [by_name.get(f"{measure}/{column}") for column in columns]
         unit = next(cell.unit for cell in cells if cell is not None)
-        table.add_row(measure, unit, *(_value(cell) for cell in cells))
+        table.add_row(measure, unit, *("" if cell is None else shown(cell) for cell in cells))
     return table
 
 

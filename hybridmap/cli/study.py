@@ -88,7 +88,7 @@ def _show(done: Study) -> None:
 
 
 def _lines(done: Study) -> list[list[str]]:
-    from hybridmap.report.tables import interval
+    from hybridmap.report.tables import interval, number
 
     by_row: dict[tuple[str, str], dict[str, Any]] = {}
     for one in done.summaries:
@@ -99,6 +99,6 @@ def _lines(done: Study) -> list[list[str]]:
         ate, kept, lost = (found[name] for name in _HEADLINES)
         apart = ate.difference
         paired = "" if apart is None or not apart.count else interval(apart)
-        figures = [f"{one.median:.4g}" if one.solved else "" for one in (ate, kept, lost)]
+        figures = [number(one.median) if one.solved else "" for one in (ate, kept, lost)]
         lines.append([label, backend, f"{ate.solved}/{ate.cells}", figures[0], paired, figures[1], figures[2]])
     return lines

@@ -113,8 +113,8 @@ class BackendsConfig(Section):
 
     @field_validator("names")
     @classmethod
-    def _each_once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise ValueError(f"{twice!r} is there twice; name each back-end once")
+    def _once_each(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        for position, name in enumerate(names):
+            if name in names[:position]:
+                raise ValueError(f"expected each back-end once, found {name!r} again")
         return names

@@ -13,7 +13,7 @@ class ScanConfig(Section):
 
     range_max_m: float = Field(default=20.0, gt=0)
     """Returns farther away are left out, m."""
-    cell_m: float = Field(default=0.05, gt=0)
+    cell_m: float = Field(default=0.05, ge=0.005)
     """Points of one cell are merged into one, m."""
     profile_width: int = Field(default=64, ge=8)
     """Bearing columns of the scanline profile."""

@@ -14,7 +14,7 @@ from hybridmap.config.backends import BackendsConfig
 from hybridmap.config.calibration import CalibrationConfig
 from hybridmap.config.mapping import EdgesConfig, NodesConfig
 from hybridmap.config.neural import NeuralConfig
-from hybridmap.config.section import Section
+from hybridmap.config.section import Section, said
 from hybridmap.config.sensors import SensorsConfig
 from hybridmap.config.simulation import SimulationConfig
 from hybridmap.config.vision import VisionConfig
@@ -65,12 +65,7 @@ class Config(Section):
         try:
             return cls.model_validate(tree)
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
-            if first["type"] == "extra_forbidden":
-                raise ConfigError(f"{origin}: unknown key {where!r}") from None
-            found = repr(first.get("input"))[:80]
-            raise ConfigError(f"{origin}: {where}: {first['msg']}, found {found}") from None
+            raise ConfigError(f"{origin}: {said(error)}") from None
 
     def to_yaml(self) -> str:
         """The resolved configuration as YAML that `load` reads back to an equal one."""

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from hybridmap.errors import EvaluationError
 from hybridmap.evaluate.association import known_at
@@ -18,11 +19,12 @@ from hybridmap.geometry import Array, between
 from hybridmap.graph.experience_map import Edge, ExperienceMap
 from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.store import MapStore, SessionFolder
-from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
+from hybridmap.trajectory import NS_PER_S, Trajectory, format_motion, read_tum
 from hybridmap.vision.gating import GATE_FIELDS
 
 _AT_NODE_NS = 1_000
 _STAMPS_FROM_S = 1e6  # a time beyond it is a stamp, not seconds since the start
+_STAMPS_UP_TO_S = 9e9  # beyond it nanoseconds do not fit into 64 bits
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,10 +253,8 @@ class Explainer:
         stamps = track.stamps_ns
         if len(stamps) == 0:
             raise EvaluationError(f"{self._folder.path}: its map holds no frame")
-        wanted = round(time_s * NS_PER_S) if time_s >= _STAMPS_FROM_S else int(stamps[0]) + round(time_s * NS_PER_S)
-        at = int(np.argmin(np.abs(stamps - wanted)))
-        spacing = int(np.max(np.diff(stamps), initial=NS_PER_S))
-        if abs(int(stamps[at]) - wanted) > spacing:
+        at = _nearest_frame(stamps, time_s)
+        if at is None:
             span = self._since_start(int(stamps[-1]))
             raise EvaluationError(
                 f"{self._folder.path}: no frame at {time_s:g} s; expected 0..{span:.3f} s from the start, or a stamp in "
@@ -284,16 +284,17 @@ class Explainer:
             return "first experience"
         moved = _moved(between(self._map.node(number - 1).pose_odom, self._map.node(number).pose_odom))
         if setting(self._settings, "nodes.rule") == "novelty":
-            return f"a new place or view, {moved[0]:.2f} m and {moved[1]:.0f} deg since node {number - 1}"
-        return f"{moved[0]:.2f} m and {moved[1]:.0f} deg since node {number - 1}; {self._node_rule()}"
+            return f"a new place or view, {format_motion(*moved)} since node {number - 1}"
+        return f"{format_motion(*moved)} since node {number - 1}; {self._node_rule()}"
 
     def _why_no_node(self, moved: tuple[float, float]) -> str:
         if setting(self._settings, "nodes.rule") == "novelty":
             least = setting(self._settings, "nodes.place_threshold")
             return f"neither a new view template nor a place code {least} from every node's (nodes.place_threshold)"
-        return (
-            f"only {moved[0]:.2f} m and {moved[1]:.0f} deg since the last node, or no view at this instant; {self._node_rule()}"
-        )
+        limits = [setting(self._settings, f"nodes.{name}") for name in ("distance_m", "angle_deg")]
+        due = any(value >= limit for value, limit in zip(moved, limits, strict=True) if isinstance(limit, int | float))
+        why = f"no view at this instant, though {format_motion(*moved)}" if due else f"only {format_motion(*moved)}"
+        return f"{why} since the last node; {self._node_rule()}"
 
     def _node_rule(self) -> str:
         metres, degrees = (setting(self._settings, f"nodes.{name}") for name in ("distance_m", "angle_deg"))
@@ -371,6 +372,16 @@ class Explainer:
             return None
         poses = self._truth.at(stamps)
         return _moved(between(between(poses[0], poses[1]), edge.relative.delta))
+
+
+def _nearest_frame(stamps_ns: NDArray[np.int64], time_s: float) -> int | None:
+    """Which stamp is the nearest one; None where the recording does not reach so far, and for NaN."""
+    if not abs(time_s) <= _STAMPS_UP_TO_S:
+        return None
+    since_ns = 0 if time_s >= _STAMPS_FROM_S else int(stamps_ns[0])
+    apart = np.abs(stamps_ns - (since_ns + round(time_s * NS_PER_S)))
+    at = int(np.argmin(apart))
+    return at if apart[at] <= np.max(np.diff(stamps_ns), initial=NS_PER_S) else None
 
 
 def _plain(value: float) -> float | None:

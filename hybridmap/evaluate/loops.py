@@ -45,7 +45,7 @@ class ViewSettings:
 
 
 def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
-    """Judge the candidates of a session's own mode of matching, and put the figures into its `metrics.json`.
+    """Judge the candidates of a session's own mode of matching.
 
     Args:
         folder: the session folder.
@@ -79,9 +79,7 @@ def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
     )
     pairs = judge_pairs(stamps, truth, FROM_ANY_SIDE if circular else DEFAULT_LIMITS)
     errors = candidate_errors(score_matrix(profiles, pairs.queries, [reading])[0], pairs)
-    metrics = candidate_metrics(mode, errors)
-    SessionFolder(folder).merge_metrics(metrics)
-    return metrics
+    return candidate_metrics(mode, errors)
 
 
 def every_mode(

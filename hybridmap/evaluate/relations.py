@@ -93,6 +93,22 @@ def read_relations(path: Path) -> Relations:
     return Relations(np.array(stamps, dtype=np.int64), np.array(deltas))
 
 
+def relations_of(path: Path, trajectory: Trajectory) -> Relations:
+    """Read relations that a trajectory can be held against.
+
+    Raises:
+        EvaluationError: as `read_relations`, or the trajectory covers none of them.
+    """
+    relations = read_relations(path)
+    if relation_errors(trajectory, relations).all.used == 0:
+        first_s, last_s = trajectory.stamps_s[[0, -1]]
+        raise EvaluationError(
+            f"{path}: none of its {len(relations.deltas)} relations lies within the session, {first_s:.3f}..{last_s:.3f} s; "
+            f"are they of this recording and on the same clock?"
+        )
+    return relations
+
+
 def relation_errors(trajectory: Trajectory, relations: Relations, max_gap_s: float = MAX_GAP_S) -> RelationErrors:
     """Compare a trajectory with verified relations at the times that it covers."""
     first, second = relations.stamps_ns[:, 0], relations.stamps_ns[:, 1]

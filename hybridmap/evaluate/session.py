@@ -9,7 +9,8 @@ from hybridmap.errors import EvaluationError
 from hybridmap.evaluate.association import associate
 from hybridmap.evaluate.closures import ClosureErrors, closure_errors
 from hybridmap.evaluate.edges import EdgeErrors, edge_errors
-from hybridmap.evaluate.relations import ErrorStatistics, Relations, read_relations, relation_errors
+from hybridmap.evaluate.loops import evaluate_loops
+from hybridmap.evaluate.relations import ErrorStatistics, Relations, relation_errors, relations_of
 from hybridmap.evaluate.trajectory import absolute_error_of, drift_percent, relative_error_of
 from hybridmap.graph.carries import grounded
 from hybridmap.metrics import Metric
@@ -22,13 +23,18 @@ ODOMETRY = "odometry"
 _ONLINE = "_online"
 
 
-def evaluate_session(folder: Path, reference: Path | None = None, relations: Path | None = None) -> list[Metric]:
+def evaluate_session(
+    folder: Path, reference: Path | None = None, relations: Path | None = None, *, loops: bool = False
+) -> list[Metric]:
     """Evaluate odometry and every back-end of a session, final and online, and put the figures into its `metrics.json`.
+
+    Where that cannot be written a warning says so.
 
     Args:
         folder: the session folder.
         reference: true trajectory in the TUM format; without it the session's own, if there is one.
         relations: verified relative poses, `t1 t2 dx dy dyaw` a line.
+        loops: judge the candidates as well, see `evaluate_loops`.
 
     Returns:
         Figures named `<measure>/<back-end>`; NaN where the data do not give one.
@@ -36,7 +42,7 @@ def evaluate_session(folder: Path, reference: Path | None = None, relations: Pat
     Raises:
         StoreError: no session there.
         StreamError: the reference is damaged.
-        EvaluationError: nothing to compare with, or nothing in common.
+        EvaluationError: nothing to compare with, nothing in common, or no views to judge candidates by.
     """
     session = SessionFolder(folder)
     session.require()
@@ -44,9 +50,10 @@ def evaluate_session(folder: Path, reference: Path | None = None, relations: Pat
     if truth_file is None and relations is None:
         raise EvaluationError(f"{folder}: nothing to compare with; give --reference GT.tum or --relations FILE")
     truth = None if truth_file is None else read_tum(truth_file)
-    verified = None if relations is None else read_relations(relations)
+    candidates = evaluate_loops(folder, reference) if loops else []
     with MapStore.open(folder) as store:
         estimates = session_trajectories(session, store)
+        verified = None if relations is None else relations_of(relations, estimates[ODOMETRY])
         closures = {} if truth is None else _judge_closures(store, truth)
         edges = [] if truth is None else _judge_edges(store, truth)
     metrics: list[Metric] = []
@@ -57,7 +64,7 @@ def evaluate_session(folder: Path, reference: Path | None = None, relations: Pat
             metrics += against_relations(name, trajectory, verified)
     for name, errors in closures.items():
         metrics += _closure_metrics(name, errors)
-    metrics += edges
+    metrics += [*edges, *candidates]
     session.merge_metrics(metrics)
     return metrics
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from hybridmap.evaluate.relations import read_relations
+from hybridmap.evaluate.relations import relations_of
 from hybridmap.evaluate.session import ODOMETRY, against_relations, against_truth
 from hybridmap.evaluate.trajectory import absolute_error
 from hybridmap.geometry import Array, compose, inverse
@@ -47,9 +47,9 @@ def judge_solutions(
     own = SessionFolder(folder).groundtruth
     truth_file = reference or (own if own.is_file() else None)
     truth = None if truth_file is None else read_tum(truth_file)
-    verified = None if relations is None else read_relations(relations)
     with MapStore.open(folder) as store:
         track, experiences = store.track(), store.map()
+    verified = None if relations is None else relations_of(relations, track.odometry)
     ways = {name: track.odometry if name == ODOMETRY else trajectory_of(track, poses) for name, poses in solutions.items()}
     ways = {name: grounded(way, experiences) for name, way in ways.items()}
     metrics: list[Metric] = []

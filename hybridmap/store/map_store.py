@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
@@ -74,10 +75,15 @@ class MapStore:
         self.close()
 
     def close(self) -> None:
-        """Commit what was written and close; closing twice does no harm."""
+        """Commit what was written and close; closing twice does no harm.
+
+        Raises:
+            StoreError: it cannot be written.
+        """
         if self._writable:
             self._writable = False
-            schema.finish(self._connection)
+            with self._named_errors("write"):
+                schema.finish(self._connection)
         else:
             self._connection.close()
 
@@ -154,8 +160,13 @@ class MapStore:
         self._write("INSERT OR REPLACE INTO info VALUES (?, ?)", (key, json.dumps(value)))
 
     def commit(self) -> None:
-        """Make everything written so far survive a killed process."""
-        self._connection.commit()
+        """Make everything written so far survive a killed process.
+
+        Raises:
+            StoreError: it cannot be written.
+        """
+        with self._named_errors("write"):
+            self._connection.commit()
 
     # ------------------------------------------------------------------ reading
 
@@ -187,6 +198,11 @@ class MapStore:
             return str(recorded)
         names = ((yaml.safe_load(self.config_yaml) or {}).get("backends") or {}).get("names") or list(self.solutions())
         return str(names[0]) if names else "odometry"
+
+    @property
+    def ended(self) -> bool:
+        """Whether the run that wrote it came to its end: what it writes last is there."""
+        return self.info("graph_hash") is not None
 
     def info(self, key: str) -> Any:
         """The value under a key; None if there is none."""
@@ -250,16 +266,19 @@ class MapStore:
     # ------------------------------------------------------------------ plumbing
 
     def _write(self, statement: str, row: tuple[Any, ...]) -> None:
-        try:
+        with self._named_errors("write"):
             self._connection.execute(statement, row)
-        except sqlite3.Error as error:
-            raise StoreError(f"{self._path}: cannot write: {error}") from None
 
     def _rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-        try:
+        with self._named_errors("read"):
             return self._connection.execute(statement, values).fetchall()
+
+    @contextmanager
+    def _named_errors(self, what: str) -> Iterator[None]:
+        try:
+            yield
         except sqlite3.Error as error:
-            raise StoreError(f"{self._path}: cannot read: {error}") from None
+            raise StoreError(f"{self._path}: cannot {what}: {error}") from None
 
     def _one(self, statement: str, values: tuple[Any, ...]) -> Any:
         rows = self._rows(statement, values)

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hybridmap.errors import StoreError
 from hybridmap.metrics import Metric, to_json
+from hybridmap.store.lock import hold, is_being_written
+from hybridmap.store.map_store import MapStore
 from hybridmap.store.schema import MAP_NAME
 from hybridmap.trajectory import Trajectory, read_tum, write_text_atomic, write_tum
+
+log = logging.getLogger(__name__)
 
 _OURS = (
     MAP_NAME,
@@ -76,6 +82,36 @@ class SessionFolder:
         """The page."""
         return self.path / "report.html"
 
+    @contextmanager
+    def writing(self, *, overwrite: bool = False) -> Iterator[None]:
+        """Write a new session in the block, and nobody else meanwhile; an error takes it back, see `discard`.
+
+        So does Ctrl-C where a session was there before; where there was none, what is written so far stays.
+
+        Raises:
+            StoreError: as `prepare`, or another run is writing here.
+        """
+        with self._hold():
+            self.prepare(overwrite=overwrite)
+            try:
+                yield
+            except KeyboardInterrupt:
+                self.restore_previous()
+                raise
+            except BaseException:
+                self.discard()
+                raise
+            self.keep()
+
+    def _hold(self) -> ExitStack:
+        try:
+            if self.path.exists() and not self.path.is_dir():
+                raise StoreError(f"{self.path}: is a file; expected a folder that is empty or does not exist")
+            self.path.mkdir(parents=True, exist_ok=True)
+            return hold(self.path)
+        except OSError as error:
+            raise StoreError(f"{self.path}: cannot be used as output folder: {error.strerror}") from None
+
     def prepare(self, *, overwrite: bool = False) -> None:
         """Make the folder ready for a new session; what an old one left is set aside until `keep` or `discard`.
 
@@ -90,7 +126,7 @@ class SessionFolder:
     def _prepare(self, overwrite: bool) -> None:
         if self.path.exists() and not self.path.is_dir():
             raise StoreError(f"{self.path}: is a file; expected a folder that is empty or does not exist")
-        if overwrite:
+        if overwrite and not _ended(self.path):
             self.restore_previous()  # a run that was killed while it overwrote: the session set aside is the whole one
         found = sorted(entry.name for entry in self.path.iterdir()) if self.path.exists() else []
         session = MAP_NAME in found or (bool(found) and set(found) <= {*_OURS, _PREVIOUS})
@@ -132,7 +168,7 @@ class SessionFolder:
             self.path.rmdir()
 
     def require(self) -> None:
-        """Check that there is a session.
+        """Check that there is a session, and warn where its run did not end.
 
         Raises:
             StoreError: the folder is missing or holds no map.
@@ -140,6 +176,17 @@ class SessionFolder:
         if not self.map_db.is_file():
             what = "holds no session (no map.db)" if self.path.is_dir() else "no such session folder"
             raise StoreError(f"{self.path}: {what}; expected what `hybridmap map SOURCE --out DIR` writes")
+        if not _ended(self.path):
+            log.warning("%s: %s", self.path, self._why_unended())
+
+    def _why_unended(self) -> str:
+        if is_being_written(self.path):
+            return "is still being written: this is the map so far"
+        broken_off = "its run was broken off: this is the map up to there"
+        previous = self.path / _PREVIOUS
+        if not _ended(previous):
+            return broken_off
+        return f"{broken_off}; the finished session that it was to replace is {previous}: move it elsewhere to have it back"
 
     def write_config(self, config_yaml: str) -> None:
         """Write the resolved configuration."""
@@ -167,8 +214,10 @@ class SessionFolder:
     def merge_metrics(self, metrics: Iterable[Metric]) -> None:
         """Put figures into `metrics.json`: of the same name the new one counts, others stay; order is kept.
 
+        Where it may not be written, it stays as it is and a warning says so.
+
         Raises:
-            StoreError: the file is damaged or cannot be written.
+            StoreError: the file is damaged.
         """
         before = self.read_metrics()
         rows = {metric.name: metric for metric in before.metrics}
@@ -176,7 +225,7 @@ class SessionFolder:
         try:
             self.write_metrics(before.head, rows.values())
         except OSError as error:
-            raise StoreError(f"{self.metrics_json}: cannot be written: {error.strerror}") from None
+            log.warning("%s: cannot be written: %s; the figures are not kept", self.metrics_json, error.strerror)
 
     def write_trajectory(self, name: str, trajectory: Trajectory) -> None:
         """Write an estimate: `odometry`, `<backend>` or `<backend>_online`."""
@@ -189,6 +238,15 @@ class SessionFolder:
     def trajectories(self) -> dict[str, Trajectory]:
         """Name -> estimate, for every file in `trajectory/`, sorted by name."""
         return {path.stem: read_tum(path) for path in sorted(self.trajectory.glob("*.tum"))}
+
+
+def _ended(folder: Path) -> bool:
+    """Whether the run that wrote a map came to its end."""
+    try:
+        with MapStore.open(folder) as store:
+            return store.ended
+    except StoreError:
+        return False
 
 
 def _metric(row: dict[str, Any]) -> Metric:

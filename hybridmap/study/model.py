@@ -10,13 +10,23 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import BeforeValidator, Field, ValidationError
 
 from hybridmap.config.backends import BackendsConfig
-from hybridmap.config.section import Section
+from hybridmap.config.section import Section, said
 from hybridmap.errors import ConfigError
 
-Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
+
+def _counted(seeds: Any) -> Any:
+    """`seeds: 3` means 0, 1, 2."""
+    if not isinstance(seeds, int) or isinstance(seeds, bool):
+        return seeds
+    if seeds < 1:
+        raise ValueError(f"expected how many there are, 1 or more, or a list of them, found {seeds}")
+    return tuple(range(seeds))
+
+
+Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1), BeforeValidator(_counted)]
 _OF_WORLDS = ("config", "overrides", "start_s", "end_s")
 Rate = Annotated[float, Field(ge=0, lt=1)]
 
@@ -236,17 +246,6 @@ def backend_settings(variant: BackendVariant) -> BackendsConfig:
         raise ConfigError(f"backends: {variant.title}: settings: {said(error)}") from None
 
 
-def said(error: ValidationError) -> str:
-    """The first of pydantic's complaints in one line: where, what, found."""
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden":
-        return f"unknown key {where!r}"
-    if first["type"] == "missing":
-        return f"{where}: is missing"
-    return f"{where}: {first['msg']}, found {repr(first.get('input'))[:80]}"
-
-
 def nested(dotted: str, value: Any) -> dict[str, Any]:
     """`("a.b", 1)` -> `{"a": {"b": 1}}`."""
     for key in reversed(dotted.split(".")):
@@ -274,10 +273,8 @@ def _find(source: str | Path) -> Path:
 
 
 def _spelt_out(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Short forms made long: `seeds: 3` means 0, 1, 2; a back-end or source may be just its name."""
+    """Short forms made long: a back-end or source may be just its name."""
     out = dict(tree)
-    if isinstance(out.get("seeds"), int) and not isinstance(out["seeds"], bool):
-        out["seeds"] = list(range(out["seeds"]))
     for key, field in (("backends", "backend"), ("sources", "world")):
         if isinstance(out.get(key), Sequence) and not isinstance(out[key], str):
             out[key] = [{field: entry} if isinstance(entry, str) else entry for entry in out[key]]

@@ -10,6 +10,7 @@ from hybridmap.errors import EvaluationError
 from hybridmap.geometry import between
 from hybridmap.trajectory import Trajectory
 from tests.calibration.drives import GAINS, drive, experience_map, write_session
+from tests.store.sessions import RIG
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +91,19 @@ def test_drives_under_other_gains_or_delays_are_refused(one, tmp_path):
         estimate_of([first, regained])
     with pytest.raises(EvaluationError, match=r"/c: was mapped with sensors\.odometry_delay_s 0\.1, .*/a with 0"):
         estimate_of([first, delayed])
+
+
+def test_drives_of_other_sensors_are_pooled_with_a_warning(one, tmp_path, caplog):
+    other = drive(np.random.default_rng(6))
+    first, same = (
+        read_drive(write_session(tmp_path / name, it, np.random.default_rng(0))) for name, it in (("a", one), ("b", other))
+    )
+    estimate_of([first, same])
+    assert caplog.text == ""
+    unlike = read_drive(write_session(tmp_path / "c", other, np.random.default_rng(0), rig=RIG))
+    estimate_of([first, unlike])
+    assert "a has no sensor but odometry, " in caplog.text
+    assert "c has a laser of 181 beams and a camera of 32 x 24 pixels: hardly of one kind of robot" in caplog.text
 
 
 def test_drives_of_two_configurations_have_none_in_common(one, tmp_path):

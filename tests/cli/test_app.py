@@ -8,6 +8,8 @@ from importlib.metadata import version
 
 import pytest
 
+from hybridmap.cli import main
+
 COMMANDS = ("demo", "simulate", "inspect", "map", "evaluate", "optimize", "compare", "export")
 
 
@@ -45,10 +47,15 @@ def test_every_command_explains_itself(command):
         (["map", "office", "--out", "s", "--set", "nodes.distanse_m=1"], "nodes.distanse_m"),
         (["map", "office", "--out", "s", "--set", "nodes.distance_m"], "KEY=VALUE"),
         (["map", "office", "--out", "s", "--backend", "gtsam-magic"], "gtsam-magic"),
+        (["map", "office", "--out", "s", "--backend", "odometry", "--backend", "odometry"], "found 'odometry' again"),
         (["map", "office", "--out", "s", "--start", "nan"], "--start"),
         (["map", "office", "--out", "s", "--start", "-5"], "--start"),
         (["map", "office", "--out", "s", "--end", "inf"], "--end"),
         (["map", "office", "--out", "/proc/no/such"], "/proc/no"),
+        (["map", "office", "--out", "s", "--set", "vision.laser.scan.cell_m=1e-6"], "vision.laser.scan.cell_m"),
+        (["map", "office", "--out", ""], "--out: found nothing"),
+        (["map", "office", "--out="], "--out: found nothing"),
+        (["map", "", "--out", "s"], "an argument: found nothing"),
         (["evaluate", "no-such-folder"], "no-such-folder"),
         (["optimize", "no-such.g2o", "--backend", "gtsam-lm"], "no-such.g2o"),
         (["compare", "no-such.g2o", "--backends", "gtsam-lm"], "no-such.g2o"),
@@ -65,3 +72,28 @@ def test_an_error_is_one_line_and_exit_code_2(arguments, expected, tmp_path):
     assert done.stderr.count("\n") == 1
     assert expected in done.stderr
     assert not list(tmp_path.iterdir()), "an error leaves no output behind"
+
+
+def test_without_a_command_the_help_is_shown():
+    done = run()
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == run("--help").stdout
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (KeyboardInterrupt(), 130, "hybridmap: interrupted\n"),
+        (MemoryError("Unable to allocate\n2 TiB"), 2, "hybridmap: error: not enough memory: Unable to allocate 2 TiB\n"),
+        (MemoryError(), 2, "hybridmap: error: not enough memory: none is left\n"),
+    ],
+)
+def test_what_ends_a_command_is_one_line(monkeypatch, capsys, tmp_path, error, code, said):
+    def choose(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr("hybridmap.cli.choose.choose", choose)
+    monkeypatch.setattr(sys, "argv", ["hybridmap", "map", "lab", "--out", str(tmp_path / "s")])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert (stopped.value.code, capsys.readouterr().err) == (code, said)

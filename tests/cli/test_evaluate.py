@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from hybridmap.store import SessionFolder
 from tests.store.sessions import ring_map, write_session
 
@@ -56,3 +58,30 @@ def test_loops_needs_a_truth_and_views(tmp_path):
     assert (done.returncode, done.stdout) == (2, "")
     assert "--reference" in done.stderr
     assert blind.read_metrics().metrics == []
+
+
+@pytest.mark.parametrize("more", [(), ("--loops",)])
+def test_relations_of_another_recording_are_refused_and_nothing_is_kept(tmp_path, more):
+    session = write_session(tmp_path / "s", ring_map())
+    before = session.metrics_json.read_bytes()
+    (tmp_path / "alien.relations").write_text("1000.0 1001.0 0.3 0.0 0.1\n1002.0 1003.0 0.3 0.0 0.1\n")
+    done = run("evaluate", tmp_path / "s", "--relations", tmp_path / "alien.relations", *more)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert "alien.relations: none of its 2 relations lies within the session, 0.000..59.400 s" in done.stderr
+    assert session.metrics_json.read_bytes() == before
+
+
+def test_figures_that_cannot_be_kept_are_shown_with_a_warning(tmp_path):
+    session = write_session(tmp_path / "s", ring_map(), keyframes=False)
+    session.report.write_text("the page")
+    before = session.metrics_json.read_bytes()
+    for name in (".metrics.json.partial", ".report.html.partial"):
+        (tmp_path / "s" / name).mkdir()  # nothing can be written there, whoever runs the test
+    done = run("evaluate", tmp_path / "s", "--json")
+    assert done.returncode == 0
+    assert "ate_rmse/gtsam-lm" in {row["name"] for row in json.loads(done.stdout)["metrics"]}
+    assert "metrics.json: cannot be written: " in done.stderr
+    assert "report.html: cannot be written: " in done.stderr
+    assert done.stderr.count("\n") == 2
+    assert session.metrics_json.read_bytes() == before
+    assert session.report.read_text() == "the page"

@@ -1,12 +1,15 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 import sys
 
 import pytest
 
 from hybridmap.cli import main
 from tests.store.sessions import ring_map, write_session
+
+NODES_BY_TRAVEL = "nodes: {rule: travel, distance_m: 0.1, angle_deg: 15.0}"
 
 
 @pytest.fixture
@@ -51,6 +54,19 @@ def test_a_frame_between_nodes_says_why_none_was_made(run, session):
     assert "loops to older" in run(session, "--frame", 12.0)[1]
 
 
+def test_a_frame_says_in_the_same_figures_what_kept_a_node_from_being_made(run, tmp_path):
+    session = write_session(tmp_path / "s", ring_map(), keyframes=False)
+    with sqlite3.connect(session.map_db) as connection:
+        connection.execute("UPDATE info SET value = ? WHERE key = 'config_yaml'", (json.dumps(NODES_BY_TRAVEL),))
+    connection.close()
+    far, near = (run(session.path, "--frame", time_s)[1] for time_s in (12.5, 12.1))
+    moved = "0.157 m and 4.8 deg"
+    assert far.count(moved) == 2
+    assert f"no view at this instant, though {moved} since the last node" in far
+    assert "only 0.031 m and 1.0 deg since the last node; a node is made every 0.1 m" in near
+    assert "no view" not in near
+
+
 def test_json_is_one_object(run, session):
     code, out, _ = run(session, "--frame", 59, "--json")
     tree = json.loads(out)
@@ -67,6 +83,9 @@ def test_json_is_one_object(run, session):
     [
         (["--node", 60], "node 60 does not exist; expected one of 0..59"),
         (["--frame", 90], "no frame at 90 s; expected 0..59.400 s"),
+        (["--frame", "nan"], "no frame at nan s; expected 0..59.400 s"),
+        (["--frame", "inf"], "no frame at inf s; expected 0..59.400 s"),
+        (["--frame", "1e200"], "no frame at 1e+200 s; expected 0..59.400 s"),
         ([], "either --node N or --frame T"),
         (["--node", 1, "--frame", 2], "either --node N or --frame T"),
         (["--node", "x"], "--node"),

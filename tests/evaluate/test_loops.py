@@ -10,6 +10,7 @@ import pytest
 from hybridmap.config import Config
 from hybridmap.errors import EvaluationError
 from hybridmap.evaluate.loops import evaluate_loops, every_mode, profiles_again, stored_profiles, view_settings
+from hybridmap.evaluate.session import evaluate_session
 from hybridmap.geometry import wrap_angle
 from hybridmap.session import run
 from hybridmap.store import MapStore, SessionFolder
@@ -44,7 +45,7 @@ def ring_profile(node: int, _truth: np.ndarray) -> dict[str, np.ndarray]:
 def test_stored_profiles_are_judged(tmp_path, monkeypatch):
     monkeypatch.setattr(sessions, "keyframe_of", ring_profile)
     write_session(tmp_path / "s", ring_map(1.9))
-    values = {metric.name: metric.value for metric in evaluate_loops(tmp_path / "s")}
+    values = {metric.name: metric.value for metric in evaluate_session(tmp_path / "s", loops=True)}
     assert values["pair_auc/four-band"] > 0.8
     assert values["candidate_top1/four-band"] > 0.9
     assert {metric.name for metric in SessionFolder(tmp_path / "s").read_metrics().metrics} == set(values)

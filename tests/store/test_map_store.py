@@ -198,6 +198,15 @@ def test_reading_changes_nothing(tmp_path):
         store.put_info("x", 1)
 
 
+def test_a_map_file_that_is_gone_while_it_is_written_is_named(tmp_path):
+    store = MapStore.create(tmp_path, "{}", Rig(), "x")
+    store.put_info("x", 1)
+    for file in tmp_path.iterdir():
+        file.unlink()
+    with pytest.raises(StoreError, match=r"map\.db: cannot write: "):
+        store.close()
+
+
 def test_anchors_come_back_exactly_and_a_later_set_replaces_the_earlier(tmp_path):
     poses = np.array([[0.0, 0, 0], [1.0, 0.2, 0.1]])
     stamps, nodes = np.array([10, 20, 30]), np.array([0, 0, 1])

@@ -35,12 +35,80 @@ def test_a_failed_overwrite_brings_the_old_session_back(tmp_path):
     assert not (session.path / ".previous").exists()
 
 
-def test_a_failed_run_leaves_nothing(tmp_path):
-    session = SessionFolder(tmp_path / "new")
-    session.prepare()
+def write_and_fail(session, error):
     session.write_config("{}")
-    session.discard()
+    MapStore.create(session.path, "{}", Rig(), "new").close()
+    raise error
+
+
+@pytest.mark.parametrize("error", [MemoryError, ZeroDivisionError, StoreError])
+def test_a_failed_run_leaves_nothing_and_loses_nothing(tmp_path, error):
+    old, new = write_session(tmp_path / "old", ring_map()), SessionFolder(tmp_path / "new")
+    before = old.map_db.read_bytes()
+    for session in (old, new):
+        with pytest.raises(error), session.writing(overwrite=True):
+            write_and_fail(session, error)
+    assert old.map_db.read_bytes() == before
     assert not (tmp_path / "new").exists()
+
+
+def test_two_runs_do_not_write_one_folder(tmp_path):
+    session = SessionFolder(tmp_path / "s")
+    with session.writing():
+        for overwrite in (False, True):
+            with pytest.raises(StoreError, match="is being written by another run"), session.writing(overwrite=overwrite):
+                pass
+        session.write_config("{}")
+    with session.writing(overwrite=True):
+        assert list(session.path.iterdir()) == [session.path / ".previous"]
+
+
+def killed_while_it_overwrote(folder):
+    """What such a run leaves, and the map of the session that was there before."""
+    session = write_session(folder, ring_map())
+    before = session.map_db.read_bytes()
+    session.prepare(overwrite=True)
+    MapStore.create(session.path, "{}", Rig(), "new").close()
+    return session, before
+
+
+def test_a_session_that_did_not_end_says_so_and_where_the_one_before_is(tmp_path, caplog):
+    session, before = killed_while_it_overwrote(tmp_path / "s")
+    session.require()
+    assert "broken off" in caplog.text
+    assert f"{tmp_path}/s/.previous: move it" in caplog.text
+    (tmp_path / "s" / ".previous").rename(tmp_path / "back")
+    caplog.clear()
+    back = SessionFolder(tmp_path / "back")
+    back.require()
+    assert caplog.text == ""
+    assert back.map_db.read_bytes() == before
+    session.require()
+    assert "broken off" in caplog.text
+    assert ".previous" not in caplog.text
+    caplog.clear()
+    with session.writing(overwrite=True):
+        MapStore.create(session.path, "{}", Rig(), "new").close()
+        session.require()
+    assert "is still being written" in caplog.text
+
+
+def test_the_next_run_puts_a_finished_session_back_first(tmp_path):
+    session, before = killed_while_it_overwrote(tmp_path / "s")
+    with pytest.raises(MemoryError), session.writing(overwrite=True):
+        raise MemoryError
+    assert session.map_db.read_bytes() == before
+
+
+def test_what_a_finished_session_replaced_does_not_come_back(tmp_path):
+    """Killed between the end of its run and the removal of the session set aside."""
+    session = write_session(tmp_path / "s", ring_map())
+    before = session.map_db.read_bytes()
+    (tmp_path / "s" / ".previous").mkdir()
+    (tmp_path / "s" / ".previous" / "config.yaml").write_text("{}")
+    with pytest.raises(MemoryError), session.writing(overwrite=True):
+        raise MemoryError
+    assert session.map_db.read_bytes() == before
 
 
 def test_a_folder_of_something_else_is_refused_even_with_overwrite(tmp_path):

@@ -59,7 +59,9 @@ def test_the_resolved_study_reads_back_to_an_equal_one(tmp_path, monkeypatch):
         ({"settings": [{"name": "a", "overrides": {"seed": 1}}]}, "overrides need a world to map"),
         ({"false_loops": {"rates": [1.0]}}, "false_loops.rates.0: .*less than 1"),
         ({"seeds": [1, 1]}, "seeds: '1' is there twice"),
-        ({"seeds": 0}, "seeds: "),
+        ({"seeds": 0}, "seeds: expected how many there are, 1 or more, or a list of them, found 0"),
+        ({"seeds": -1}, "seeds: expected how many there are, 1 or more, or a list of them, found -1"),
+        ({"seeds": []}, r"seeds: expected at least 1 of them, found \[\]"),
     ],
 )
 def test_refusals_name_the_key(changes, expected):

@@ -1,0 +1,23 @@
+from __future__ import annotations
+
+import math
+
+from hybridmap.cli.show import emit
+from hybridmap.metrics import Metric
+
+
+def test_tables_show_counts_as_whole_numbers_and_figures_with_four_digits(capsys):
+    plain = [
+        Metric("poses", 13880.0, "1", "many"),
+        Metric("size/grid", 312448.0, "1", "more"),
+        Metric("none", math.nan, "m", ""),
+    ]
+    by_backend = [Metric("ate_poses/odometry", 49240.0, "1", "poses"), Metric("ate_rmse/odometry", 0.123456, "m", "error")]
+    emit({"backends": ["odometry"]}, [*plain, *by_backend], as_json=False)
+    rows = [[cell.strip() for cell in line.strip("│ ").split("│")] for line in capsys.readouterr().out.splitlines()]
+    found = {row[0]: row[1:] for row in rows}
+    assert found["poses"][0] == "13880"
+    assert found["size/grid"][0] == "312448"
+    assert found["none"][0] == "–"
+    assert found["ate_poses"] == ["1", "49240"]
+    assert found["ate_rmse"] == ["m", "0.1235"]
