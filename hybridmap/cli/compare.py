@@ -60,13 +60,10 @@ def compare(
     names = [name.strip() for name in backends.split(",") if name.strip()]
     if not names:
         raise BackendError("--backends: found no name, expected back-ends separated by commas")
-    if out is not None:
-        from hybridmap.report.comparison import PAGE, PICTURE
-        from hybridmap.report.folder import prepare_folder
-
-        prepare_folder(out, "comparison", (PAGE, PICTURE), overwrite=overwrite)
     if not opened.is_session and (reference or relations):
         raise EvaluationError(f"{source}: a graph file has no stamps; --reference and --relations are for session folders")
+    if out is not None:
+        _prepare(out, overwrite=overwrite)
     ways = _ways(opened, batch=batch, incremental=incremental)
     with progress(f"comparing on {source}") as advance:
         rows = comparison.compare(
@@ -83,6 +80,14 @@ def compare(
         _emit(opened, ways, rows, judged.metrics)
     else:
         _show(cells, rows, f"{source}: {opened.graph.n_nodes} nodes, {opened.graph.n_edges} edges; {_done(opened, ways)}")
+
+
+def _prepare(out: Path, *, overwrite: bool) -> None:
+    """Before anything is solved, make sure that the page will lose nothing that is in its folder."""
+    from hybridmap.report.comparison import PAGE, PICTURE
+    from hybridmap.report.folder import prepare_folder
+
+    prepare_folder(out, "comparison", (PAGE, PICTURE), overwrite=overwrite)
 
 
 def _judged(opened: GraphSource, rows: Sequence[Row], reference: Path | None, relations: Path | None) -> Judged:
