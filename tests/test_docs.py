@@ -121,3 +121,8 @@ def test_every_table_and_column_of_the_map_file_is_described() -> None:
         assert f"| `{table}` |" in text
         for column in re.findall(r"(?:^|,)\s*([a-z]\w*) [A-Z]", columns):
             assert f"`{column}`" in text, f"{table}.{column}"
+
+
+def test_no_page_holds_a_place_that_was_to_be_filled() -> None:
+    for page in (ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")):
+        assert re.findall(r"^[A-Z]+(?:_[A-Z]+)*$", page.read_text(), re.MULTILINE) == [], page.name

@@ -53,13 +53,11 @@ def compare(
     from hybridmap.backends import comparison
     from hybridmap.cli.graphs import open_graph, settings_of
     from hybridmap.cli.show import progress
-    from hybridmap.errors import BackendError, EvaluationError
+    from hybridmap.errors import EvaluationError
 
     opened = open_graph(source)
     settings = settings_of(opened, config, setting)
-    names = [name.strip() for name in backends.split(",") if name.strip()]
-    if not names:
-        raise BackendError("--backends: found no name, expected back-ends separated by commas")
+    names = _names(backends)
     if not opened.is_session and (reference or relations):
         raise EvaluationError(f"{source}: a graph file has no stamps; --reference and --relations are for session folders")
     if out is not None:
@@ -80,6 +78,15 @@ def compare(
         _emit(opened, ways, rows, judged.metrics)
     else:
         _show(cells, rows, f"{source}: {opened.graph.n_nodes} nodes, {opened.graph.n_edges} edges; {_done(opened, ways)}")
+
+
+def _names(backends: str) -> list[str]:
+    from hybridmap.errors import BackendError
+
+    names = [name.strip() for name in backends.split(",") if name.strip()]
+    if not names:
+        raise BackendError("--backends: found no name, expected back-ends separated by commas")
+    return names
 
 
 def _prepare(out: Path, *, overwrite: bool) -> None:
