@@ -15,6 +15,7 @@ from hybridmap.geometry import Array
 _FARTHEST = 1e9  # m and rad: beyond it metres have no millionths left
 _LOOSEST, _TIGHTEST = 1e-9, 1e15  # information of standard deviations of some 30 km and 30 nm: beyond, solvers stand still
 _UPPER, _LOWER = ([0, 0, 1], [1, 2, 2]), ([1, 2, 2], [0, 0, 1])
+_WEAK = 0.5  # squared correlations of an information matrix: with a sum below, its determinant is at least a third
 _CLEAR = 1e-6  # determinant of correlations from which rounding cannot make it positive
 
 
@@ -136,6 +137,25 @@ class PoseGraph:
             GraphError: NaN, unknown node, edge onto itself, information not symmetric positive definite, no node, numbers so
                 large or small that their squares are lost. The message names the edge, what was found and what was expected.
         """
+        if not self._plainly_sound():
+            self._judge()
+
+    def _plainly_sound(self) -> bool:
+        """A quick look, as every update of a drive takes it: true for edges without strong correlations that can be solved."""
+        if self.n_nodes == 0 or self.n_edges == 0:
+            return False
+        flat = self.information.reshape(-1, 9)
+        own, upper, lower = flat[:, ::4], flat[:, [1, 2, 5]], flat[:, [3, 6, 7]]
+        ends = np.stack([self.sources, self.targets])
+        if not (own.min() >= _LOOSEST and own.max() <= _TIGHTEST and (upper == lower).all()):
+            return False
+        if not (ends.min() >= 0 and ends.max() < self.n_nodes and (ends[0] != ends[1]).all()):
+            return False
+        squared = upper**2 / (own[:, [0, 0, 1]] * own[:, [1, 2, 2]])
+        weak = squared.sum(axis=1).max() <= _WEAK
+        return bool(weak and np.abs(self.deltas).max() <= _FARTHEST and np.abs(self.initial).max() <= _FARTHEST)
+
+    def _judge(self) -> None:
         if self.n_nodes == 0:
             raise GraphError("graph: holds no node")
         near = (np.abs(self.initial) <= _FARTHEST).all(axis=1)  # which NaN is not
