@@ -83,12 +83,13 @@ def test_results_names_its_studies() -> None:
 
 def test_a_bar_has_a_side() -> None:
     barred, results, studies = (importlib.import_module(name) for name in ("barred", "results", "result_studies"))
-    few, many = barred.at_least("speed/x", 14.0, 15.0, "times"), barred.at_most("cost/x", 1.2, 1.15, "of bare")
+    few, many = barred.at_least("speed/x", np.float64(14.0), 15.0, "times"), barred.at_most("cost/x", 1.2, 1.15, "of bare")
     assert not few.passed
     assert not many.passed
     assert barred.at_least("speed/x", 15.0, 15.0, "times").passed
     assert barred.at_most("cost/x", 1.15, 1.15, "of bare").passed
-    rows = [results.own_row(studies.Step("x", own_bars=True), metric.to_json()) for metric in (few, many)]
+    written = json.loads(to_json({}, [few, many]))["metrics"]
+    rows = [results.own_row(studies.Step("x", own_bars=True), metric) for metric in written]
     assert [results.table_line(row) for row in rows] == [
         "| `speed/x` | 14 |  | >= 15 ✗ missed |",
         "| `cost/x` | 1.2 |  | <= 1.15 ✗ missed |",
