@@ -16,6 +16,7 @@ import pytest
 from hybridmap import session
 from hybridmap.config import Config
 from hybridmap.errors import StoreError, StreamError
+from hybridmap.evaluate.explain import Explainer
 from hybridmap.geometry import between
 from hybridmap.graph.hashing import graph_hash
 from hybridmap.store import MapStore
@@ -61,6 +62,21 @@ def test_the_same_input_gives_the_same_bytes(finished, tmp_path):
     again = session.run(RoomDrive(laps=2.2), Config.load("laser", OVERRIDES), tmp_path / "s")
     assert again.head["graph_hash"] == finished.head["graph_hash"]
     assert digests(tmp_path / "s") == digests(finished.folder.path)
+
+
+def test_at_the_stamp_of_a_node_the_frame_is_that_of_the_node(finished):
+    with Explainer(finished.folder.path) as explainer:
+        for number in (0, 1, 5, 20):
+            story = explainer.frame(explainer.node(number).time_s)
+            assert (story.at_node, story.made) == (number, True)
+            assert story.moved == pytest.approx((0.0, 0.0), abs=1e-12)
+
+
+def test_an_accepted_loop_shows_no_figure_that_would_have_refused_it(finished):
+    with MapStore.open(finished.folder.path) as store:
+        loops = [edge for edge in store.map().edges if edge.reason == "near on the optimised map"]
+    assert loops
+    assert all("second_mode" in edge.scores and "ambiguity" not in edge.scores for edge in loops)
 
 
 def test_scans_between_nodes_are_put_right_on_the_final_map(finished, tmp_path):

@@ -23,7 +23,7 @@ class Advance(Protocol):
 
 
 def emit(head: dict[str, Any], metrics: Iterable[Metric], *, as_json: bool, title: str = "") -> None:
-    """Print one JSON object, or tables with units, on standard output: one of plain figures, one by back-end."""
+    """Print one JSON object, or tables with units and the head's `remarks`, on standard output."""
     rows = list(metrics)
     if as_json:
         sys.stdout.write(to_json(head, rows) + "\n")
@@ -39,6 +39,8 @@ def emit(head: dict[str, Any], metrics: Iterable[Metric], *, as_json: bool, titl
         console.print(_plain_table(plain))
     if columns:
         console.print(_table_by_backend([row for row in rows if row not in plain], columns))
+    for remark in head.get("remarks", ()):
+        console.print(f"note: {remark}", soft_wrap=True, markup=False, highlight=False)
 
 
 def print_title(console: Console, title: str) -> None:

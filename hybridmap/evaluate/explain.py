@@ -261,9 +261,12 @@ class Explainer:
                 f"{stamps[0] / NS_PER_S:.3f}..{stamps[-1] / NS_PER_S:.3f} s"
             )
         stamp, node = int(stamps[at]), int(track.nodes[at])
-        made = abs(self._map.node(node).stamp_ns - stamp) <= _AT_NODE_NS
+        since = track.deltas[at]
+        if node + 1 < len(self._map) and self._is_of(node + 1, stamp):  # motion comes before the view at the same stamp
+            node, since = node + 1, np.zeros(3)
+        made = self._is_of(node, stamp)
         after = self._map.node(node + 1) if node + 1 < len(self._map) else None
-        moved = _moved(track.deltas[at])
+        moved = _moved(since)
         believed = {"odometry": track.poses_odom[at]}
         for name in self._store.online_backends():
             believed[name] = self._store.online(name).at(np.array([stamp]))[0]
@@ -278,6 +281,10 @@ class Explainer:
             next_time_s=None if after is None else self._since_start(after.stamp_ns),
             poses=believed,
         )
+
+    def _is_of(self, number: int, stamp_ns: int) -> bool:
+        """Whether a node was made at an instant."""
+        return abs(self._map.node(number).stamp_ns - stamp_ns) <= _AT_NODE_NS
 
     def _why_a_node(self, number: int) -> str:
         if number == 0:

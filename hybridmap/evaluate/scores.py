@@ -29,6 +29,7 @@ _WORDS: dict[str, tuple[str, str]] = {
     "off_deg": ("off the expected heading by", "deg"),
     "loosest_m": ("standard deviation in the loosest direction", "m"),
     "ambiguity": ("ambiguity: likelihood left when slid that way", ""),
+    "second_mode": ("likelihood left when slid along its loosest direction, in which it is held the looser", ""),
     "violation": ("share of points seen through", ""),
     "whole_map": ("sought in the whole map", ""),
     "mismatch": ("mismatch (0 fits perfectly)", ""),

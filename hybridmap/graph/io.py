@@ -150,13 +150,15 @@ def held(graph: PoseGraph, poses: Array) -> Array:
 def write_g2o(path: Path, graph: PoseGraph, poses: Array) -> None:
     """Write nodes at `poses` (N, 3), the one held, and all edges as g2o with 17 significant digits, in one move.
 
-    The format carries no kinds: read back, every edge between non-consecutive nodes is a loop.
+    A graph that was read from a file keeps the numbers of its vertices. The format carries no kinds: read back, every edge
+    between non-consecutive nodes is a loop.
     """
-    rows = [f"VERTEX_SE2 {i} {_row(pose)}\n" for i, pose in enumerate(poses)]
+    names = np.arange(graph.n_nodes) if graph.file is None else graph.file.vertices
+    rows = [f"VERTEX_SE2 {name} {_row(pose)}\n" for name, pose in zip(names, poses, strict=True)]
     if graph.file is not None and graph.file.held is not None:
-        rows.append(f"{_FIX} {graph.file.held}\n")
+        rows.append(f"{_FIX} {names[graph.file.held]}\n")
     upper = graph.information[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-    ends = zip(graph.sources, graph.targets, graph.deltas, upper, strict=True)
+    ends = zip(names[graph.sources], names[graph.targets], graph.deltas, upper, strict=True)
     rows += [f"EDGE_SE2 {s} {t} {_row(delta)} {_row(info)}\n" for s, t, delta, info in ends]
     write_text_atomic(path, "".join(rows))
 

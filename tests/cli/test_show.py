@@ -21,3 +21,9 @@ def test_tables_show_counts_as_whole_numbers_and_figures_with_four_digits(capsys
     assert found["none"][0] == "–"
     assert found["ate_poses"] == ["1", "49240"]
     assert found["ate_rmse"] == ["m", "0.1235"]
+
+
+def test_what_happened_on_the_way_stands_under_the_tables(capsys):
+    head = {"remarks": ["carried between nodes 3 and 4: [here]"]}
+    emit(head, [Metric("nodes", 12.0, "1", "made")], as_json=False)
+    assert capsys.readouterr().out.splitlines()[-1] == "note: carried between nodes 3 and 4: [here]"

@@ -137,6 +137,14 @@ def test_what_is_wrong_with_a_graph_is_told_in_the_numbers_of_its_file(tmp_path)
         read_graph(written(tmp_path, "EDGE_SE2 10 30 1 0 0 9 0 0 9 0 9\nEDGE_SE2 20 30 1 0 0 9 0 0 9 0 9\n"))
 
 
+def test_vertices_keep_the_numbers_of_their_file(tmp_path):
+    nodes = "".join(f"VERTEX_SE2 {vertex} {vertex} 0 0\n" for vertex in (10, 20, 30))
+    edges = "".join(f"EDGE_SE2 {a} {b} 10 0 0 9 0 0 9 0 9\n" for a, b in ((10, 20), (20, 30)))
+    graph = read_graph(written(tmp_path, f"{nodes}FIX 30\n{edges}"))
+    write_g2o(tmp_path / "out.g2o", graph, graph.initial)
+    assert (tmp_path / "out.g2o").read_text() == f"{nodes}FIX 30\n{edges}"
+
+
 def test_the_first_fixed_vertex_is_held_and_written_again(tmp_path, caplog):
     graph = read_graph(written(tmp_path, G2O.replace("FIX 0", "FIX 2\nFIX 1")))
     assert "vertex 2 is held, the others may move" in caplog.text

@@ -88,7 +88,7 @@ class Reviser:
         figures = {
             "near": float(alignment.near[0]),
             "fit": float(alignment.fit[0]),
-            "ambiguity": doubt,
+            "second_mode": doubt,
             "off_m": float(np.hypot(*(pose - expected)[:2])),
             "off_deg": float(np.rad2deg(abs(wrap_angle(pose[2] - expected[2])))),
         }
