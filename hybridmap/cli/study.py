@@ -68,6 +68,7 @@ def _show(done: Study) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from hybridmap.report.study_page import remarks
     from hybridmap.study.model import quoted
 
     console = Console()
@@ -85,6 +86,9 @@ def _show(done: Study) -> None:
     for line in _lines(done):
         table.add_row(*line)
     console.print(table)
+    for remark in remarks(done):
+        where = f"{remark.count} cells {remark.status}: {remark.where}, {remark.backend}"
+        console.print(f"note: {where}: {remark.message}", soft_wrap=True, markup=False, highlight=False)
 
 
 def _lines(done: Study) -> list[list[str]]:

@@ -114,7 +114,7 @@ def _render(study: Study) -> str:
         groups=shown,
         groups_without=len(groups) - len(shown),
         measures=[(name, unit, text) for name, (unit, text) in MEASURES.items()],
-        remarks=_remarks(study),
+        remarks=remarks(study),
         study_yaml=config.to_yaml(),
         version=version("hybridmap"),
     )
@@ -199,7 +199,7 @@ def _mean(found: Interval, cells: int) -> str:
     return tables.interval(found) if cells > 1 else tables.number(found.value)
 
 
-def _remarks(study: Study) -> list[Remark]:
+def remarks(study: Study) -> list[Remark]:
     """What did not end well; cells that say the same but for the numbers are one remark, with the words of the first."""
     found: dict[tuple[str, str], list[tuple[Cell, str]]] = {}
     for cell, result in study.rows:

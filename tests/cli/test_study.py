@@ -53,6 +53,21 @@ def test_a_study_is_run_and_gone_on_with(run, tmp_path, monkeypatch):
     assert (tmp_path / "again" / "cells.csv").read_bytes() == (out / "cells.csv").read_bytes()
 
 
+def test_why_cells_failed_stands_under_the_table(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(study_page, "_render", lambda _: "")
+    tree = TREE | {
+        "backends": ["gtsam-lm"],
+        "seeds": 1,
+        "sources": [{"name": "way", "synthetic": {"nodes": 20, "per_lap": 60}}],
+    }
+    (tmp_path / "way.yaml").write_text(yaml.safe_dump(tree))
+    code, printed, _ = run(tmp_path / "way.yaml", "--out", tmp_path / "out", "--workers", 0)
+    (note,) = [line for line in printed.splitlines() if line.startswith("note: ")]
+    assert code == 0
+    assert "cells failed: way/" in note
+    assert "loops" in note
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
