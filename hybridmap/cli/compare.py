@@ -73,7 +73,7 @@ def compare(
         from hybridmap.report.comparison import Compared, write_comparison
 
         facts = (f"Back-ends on {source.name}", opened.start, opened.head, opened.graph)
-        write_comparison(out, Compared(*facts, rows, cells, settings, judged.truth))
+        write_comparison(out, Compared(*facts, rows, cells, settings, judged.truth, opened.carried))
     if as_json:
         _emit(opened, ways, rows, judged.metrics)
     else:
@@ -102,7 +102,7 @@ def _judged(opened: GraphSource, rows: Sequence[Row], reference: Path | None, re
     from hybridmap.evaluate.solutions import Judged, judge_solutions
 
     if not opened.is_session:
-        return Judged((), None)
+        return Judged(())
     maps = {row.title: row.solution.poses for row in rows if row.solution is not None}
     return judge_solutions(opened.path, maps, reference, relations)
 

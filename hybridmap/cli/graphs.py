@@ -12,6 +12,7 @@ from hybridmap.cli.choose import parse_settings
 from hybridmap.config import Config
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import GraphError
+from hybridmap.graph.carries import Carry, carries
 from hybridmap.graph.hashing import graph_hash
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import PoseGraph
@@ -28,6 +29,7 @@ class GraphSource:
         is_session: whether `path` is a session folder.
         start: what the graph's own poses are.
         head: what a JSON object says about it.
+        carried: where the robot was carried; a file does not say.
     """
 
     path: Path
@@ -35,6 +37,7 @@ class GraphSource:
     is_session: bool
     start: str
     head: dict[str, Any] = field(default_factory=dict)
+    carried: tuple[Carry, ...] = ()
 
 
 def open_graph(path: Path) -> GraphSource:
@@ -54,7 +57,7 @@ def open_graph(path: Path) -> GraphSource:
     if graph.n_edges == 0:
         raise GraphError(f"{path}: the map has no accepted edge; there is nothing to optimise")
     head = _head(path, graph) | {"graph_hash": graph_hash(experiences)}
-    return GraphSource(path, graph, is_session=True, start="dead reckoning", head=head)
+    return GraphSource(path, graph, is_session=True, start="dead reckoning", head=head, carried=carries(experiences))
 
 
 def settings_of(source: GraphSource, config: str | None, setting: list[str] | None) -> BackendsConfig:

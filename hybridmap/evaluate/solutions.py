@@ -10,7 +10,7 @@ from hybridmap.evaluate.relations import relations_of
 from hybridmap.evaluate.session import ODOMETRY, against_relations, against_truth
 from hybridmap.evaluate.trajectory import absolute_error
 from hybridmap.geometry import Array, compose, inverse
-from hybridmap.graph.carries import grounded
+from hybridmap.graph.carries import grounded, pieces
 from hybridmap.metrics import Metric
 from hybridmap.store import MapStore, SessionFolder, trajectory_of
 from hybridmap.trajectory import read_tum
@@ -22,11 +22,12 @@ class Judged:
 
     Attributes:
         metrics: `<measure>/<title>`, as `evaluate` names them; empty where there is nothing to compare with.
-        truth: (P, 3) the true way, m and rad, moved onto the solution of the lowest ATE; None where it is not known.
+        truth: the true way, m and rad, moved onto the solution of the lowest ATE: a piece (P, 3) before, between and after
+            the carries that the map knows of; none where it is not known.
     """
 
     metrics: tuple[Metric, ...]
-    truth: Array | None
+    truth: tuple[Array, ...] = ()
 
 
 def judge_solutions(
@@ -57,6 +58,7 @@ def judge_solutions(
         metrics += [] if truth is None else against_truth(name, way, truth)
         metrics += [] if verified is None else against_relations(name, way, verified)
     if truth is None or not ways:
-        return Judged(tuple(metrics), None)
+        return Judged(tuple(metrics))
     best = min((absolute_error(way, truth) for way in ways.values()), key=lambda error: error.rmse_m)
-    return Judged(tuple(metrics), compose(inverse(best.pose_reference_estimate), truth.poses))
+    onto_best = inverse(best.pose_reference_estimate)
+    return Judged(tuple(metrics), tuple(compose(onto_best, piece.poses) for piece in pieces(truth, experiences)))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from hybridmap.geometry import Array
 from hybridmap.graph.experience_map import ExperienceMap, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 from hybridmap.trajectory import Trajectory
 
 
@@ -55,6 +58,18 @@ def pieces(trajectory: Trajectory, experiences: ExperienceMap) -> list[Trajector
         aloft |= (trajectory.stamps_ns > experiences.node(carry.before).stamp_ns) & ~down
     found = [np.flatnonzero((number == i) & ~aloft) for i in range(int(number.max(initial=0)) + 1)]
     return [Trajectory(trajectory.stamps_ns[rows], trajectory.poses[rows]) for rows in found if len(rows)]
+
+
+def parted(poses: Array, carried: Sequence[Carry]) -> Array:
+    """Poses (K, 3) of the first K nodes with a row of NaN in each carry, where a line through them ends and begins anew."""
+    return np.insert(poses, [carry.after for carry in carried if carry.after < len(poses)], np.nan, axis=0)
+
+
+def through_the_air(graph: PoseGraph, carried: Sequence[Carry]) -> NDArray[np.bool_]:
+    """(E,) which edges stand for a carry and not for a way that was driven."""
+    ends = np.stack([graph.sources, graph.targets], axis=1)
+    hung = [(ends == (carry.before, carry.after)).all(axis=1) for carry in carried]
+    return np.any(hung, axis=0) & graph.is_motion if hung else np.zeros(graph.n_edges, dtype=np.bool_)
 
 
 def grounded(trajectory: Trajectory, experiences: ExperienceMap) -> Trajectory:

@@ -16,6 +16,7 @@ from hybridmap.backends.comparison import Row
 from hybridmap.backends.objective import squared_norms
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
+from hybridmap.graph.carries import Carry
 from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
 from hybridmap.report import comparison_figures as figures
 from hybridmap.report import tables
@@ -39,7 +40,8 @@ class Compared:
         rows: the back-ends.
         cells: the table: a line of column titles, then one line a row of `rows`.
         settings: of the back-ends.
-        truth: (P, 3) the true way in the frame of the maps, m and rad; None where it is not known.
+        truth: pieces (P, 3) of the true way in the frame of the maps, m and rad; none where it is not known.
+        carried: where the robot was carried, so that no line is drawn there.
     """
 
     title: str
@@ -49,13 +51,14 @@ class Compared:
     rows: Sequence[Row]
     cells: Sequence[Sequence[str]]
     settings: BackendsConfig
-    truth: Array | None = None
+    truth: Sequence[Array] = ()
+    carried: Sequence[Carry] = ()
 
 
 def write_comparison(folder: Path, compared: Compared) -> Path:
     """Write `maps.png` and `comparison.html` into a folder, which is made; returns the page."""
     graph, rows = compared.graph, compared.rows
-    picture = figures.panels(graph, rows, compared.start)
+    picture = figures.panels(graph, rows, compared.start, compared.carried)
     page = rendered(
         _TEMPLATE,
         title=compared.title,
@@ -67,8 +70,9 @@ def write_comparison(folder: Path, compared: Compared) -> Path:
         rows=[{"cells": line, "bad": not figures.has_map(row)} for row, line in zip(rows, compared.cells[1:], strict=True)],
         messages=[(row.title, row.verdict) for row in rows],
         ways={str(row.way) for row in rows},
-        of_truth=compared.truth is not None,
-        overlay=figures.overlay(rows, compared.truth),
+        carried=compared.carried,
+        of_truth=bool(compared.truth),
+        overlay=figures.overlay(rows, compared.truth, compared.carried),
         panels="data:image/png;base64," + base64.b64encode(picture).decode("ascii"),
         convergence=figures.convergence(rows),
         weights=figures.weights(graph, rows),

@@ -12,6 +12,7 @@ from hybridmap.backends.base import SolveStatus
 from hybridmap.backends.comparison import Row, Way
 from hybridmap.backends.objective import squared_norms
 from hybridmap.geometry import Array
+from hybridmap.graph.carries import Carry, parted, through_the_air
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.report import style
 
@@ -33,8 +34,8 @@ def has_map(row: Row) -> bool:
     return row.solution is not None and row.solution.report.status not in (SolveStatus.FAILED, SolveStatus.DIVERGED)
 
 
-def overlay(rows: Sequence[Row], truth: Array | None) -> str:
-    """The chain of nodes of every row in one frame, over the truth (P, 3) where it is known; a `data:` URI.
+def overlay(rows: Sequence[Row], truth: Sequence[Array], carried: Sequence[Carry] = ()) -> str:
+    """The chain of nodes of every row in one frame, over the pieces (P, 3) of the truth where it is known; a `data:` URI.
 
     Empty where no row has a map.
     """
@@ -42,14 +43,15 @@ def overlay(rows: Sequence[Row], truth: Array | None) -> str:
     if not maps:
         return ""
     framed = [poses for title, poses in maps.items() if title != "odometry"] or list(maps.values())
-    low, high = _box(framed if truth is None else [*framed, truth])
+    low, high = _box([*framed, *truth])
     with style.figure(*style.fitted_size(high - low)) as picture:
         axes = picture.subplots()
-        if truth is not None:
-            axes.plot(*truth[:, :2].T, color=style.TRUTH, linewidth=3.2, alpha=0.28, label="ground truth", zorder=3)
+        for i, piece in enumerate(truth):
+            label = "" if i else "ground truth"
+            axes.plot(*piece[:, :2].T, color=style.TRUTH, linewidth=3.2, alpha=0.28, label=label, zorder=3)
         looks = _looks(rows)
         for title, poses in maps.items():
-            axes.plot(*poses[:, :2].T, label=title, **looks[title])
+            axes.plot(*parted(poses, carried)[:, :2].T, label=title, **looks[title])
         style.metric_axes(axes, "box")
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
@@ -57,24 +59,26 @@ def overlay(rows: Sequence[Row], truth: Array | None) -> str:
         return style.svg_uri(picture)
 
 
-def panels(graph: PoseGraph, rows: Sequence[Row], start: str) -> bytes:
+def panels(graph: PoseGraph, rows: Sequence[Row], start: str, carried: Sequence[Carry] = ()) -> bytes:
     """Each map with its loops and its rejected loops, side by side, as PNG; the same figure gives the same bytes.
 
     Args:
         graph: the edges.
         rows: the maps.
         start: what the graph's own poses are.
+        carried: where no line is drawn, as the robot did not drive there.
     """
     maps = solved(rows)
     if not any(np.allclose(poses, graph.initial) for poses in maps.values()):
         maps = {start: graph.initial} | maps
     rejected = {row.title: row.solution.report.rejected_edge_ids for row in rows if row.solution is not None}
+    driven = graph.with_edges(~through_the_air(graph, carried))
     columns = max(1, min(_COLUMNS, len(maps)))
     lines = -(-len(maps) // columns)
     with style.figure(style.PAGE_WIDTH_IN, 0.4 + 3.1 * lines) as picture:
         places = picture.subplots(lines, columns, squeeze=False).ravel()
         for axes, (title, poses) in zip(places, maps.items(), strict=False):
-            _draw_map(axes, graph, poses, rejected.get(title, ()))
+            _draw_map(axes, driven, poses, rejected.get(title, ()))
             axes.set_title(title)
         for axes in places[len(maps) :]:
             axes.set_axis_off()

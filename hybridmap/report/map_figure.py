@@ -6,14 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from hybridmap.graph.carries import pieces
+from hybridmap.graph.carries import carries, pieces
 from hybridmap.graph.experience_map import Edge, Status
 from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.report import style
 from hybridmap.report.outline import Raster
 from hybridmap.report.scene import Scene
+from hybridmap.trajectory import Trajectory
 
-_PALE = "#efbd97"
+_PALE, _GREY = "#efbd97", "#9a9a9a"
 _LEGEND_PT = 1.8
 _MANY = 200
 
@@ -32,27 +33,32 @@ def draw_trajectories(axes: Any, scene: Scene, building: Raster | None) -> None:
     """Draw every back-end's trajectory over the truth and the building."""
     style.draw_building(axes, building)
     if scene.truth is not None:
-        poses = style.thinned(scene.truth.poses)
-        axes.plot(poses[:, 0], poses[:, 1], color=style.TRUTH, linewidth=3.2, alpha=0.28, label="ground truth", zorder=3)
+        _draw_ways(axes, scene.truth, scene, color=style.TRUTH, linewidth=3.2, alpha=0.28, label="ground truth", zorder=3)
     styles = style.line_styles(scene.backends)
     for name in scene.backends:
         if name in scene.estimates:
             label = f"{name} (primary)" if name == scene.primary else name
-            for i, piece in enumerate(pieces(scene.estimates[name], scene.experiences)):
-                poses = style.thinned(piece.poses)
-                axes.plot(poses[:, 0], poses[:, 1], label="" if i else label, **styles[name])
+            _draw_ways(axes, scene.estimates[name], scene, label=label, **styles[name])
     start = scene.estimates.get(scene.primary, scene.estimates["odometry"]).poses[0]
     axes.plot(*start[:2], marker="o", markersize=7, color="white", markeredgecolor="black", zorder=8, label="start")
     style.metric_axes(axes)
 
 
+def _draw_ways(axes: Any, trajectory: Trajectory, scene: Scene, *, label: str, **looks: Any) -> None:
+    """What was driven of a trajectory: no line leads through the air."""
+    for i, piece in enumerate(pieces(trajectory, scene.experiences)):
+        axes.plot(*style.thinned(piece.poses)[:, :2].T, label="" if i else label, **looks)
+
+
 def graph_figure(scene: Scene, building: Raster | None) -> str:
-    """Nodes at the primary back-end's poses, chain, and loops by their fate; a `data:` URI."""
+    """Nodes at the primary back-end's poses, chain, carries, and loops by their fate; a `data:` URI."""
     with style.figure(*_size(scene.nodes[:, :2], building)) as picture:
         axes = picture.add_subplot()
         style.draw_building(axes, building, darkness=0.35)
-        chain = [e for e in scene.experiences.edges if e.kind is not EdgeKind.LOOP and e.status is Status.ACCEPTED]
-        _draw_edges(axes, scene, chain, color="#9a9a9a", linewidth=0.8, zorder=2)
+        chain, carried = chain_and_carries(scene)
+        _draw_edges(axes, scene, chain, color=_GREY, linewidth=0.8, zorder=2)
+        looks = {"color": _GREY, "linewidth": 0.8, "linestyle": (0, (4, 4)), "zorder": 2}
+        _draw_edges(axes, scene, carried, label=f"carried ({len(carried)})", **looks)
         loops = loops_by_fate(scene)
         for fate, looks in _FATES.items():
             many = len(loops[fate]) if fate == "loops rejected" else 0  # thousands of them would hide the building
@@ -86,6 +92,14 @@ def _draw_legend(picture: Any) -> None:
     for line in legend.get_lines():
         line.set_alpha(1.0)
         line.set_linewidth(max(line.get_linewidth(), _LEGEND_PT))
+
+
+def chain_and_carries(scene: Scene) -> tuple[list[Edge], list[Edge]]:
+    """The accepted edges that no loops are: those of ways driven, and those that stand for a way through the air."""
+    aloft = {(carry.before, carry.after) for carry in carries(scene.experiences)}
+    motion = [e for e in scene.experiences.edges if e.kind is not EdgeKind.LOOP and e.status is Status.ACCEPTED]
+    chain = [edge for edge in motion if (edge.source, edge.target) not in aloft]
+    return chain, [edge for edge in motion if (edge.source, edge.target) in aloft]
 
 
 def loops_by_fate(scene: Scene) -> dict[str, list[Edge]]:

@@ -7,6 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from hybridmap.graph.carries import carries
 from hybridmap.metrics import Metric
 from hybridmap.report import tables
 from hybridmap.report.closures import examples
@@ -63,7 +64,7 @@ def _content(scene: Scene, store: MapStore) -> dict[str, Any]:
         "trajectories": trajectories_figure(scene, building),
         "graph": graph_figure(scene, building),
         "errors": error_figure(scene),
-        "correction": None if correction is None else correction_figure(correction, points_of),
+        "correction": None if correction is None else correction_figure(correction, points_of, carries(scene.experiences)),
         "correction_shift": None if correction is None else " ".join(tables.length(correction.shift_m)),
         "correction_time": None if correction is None else tables.number(round((correction.stamp_ns - start_ns) / NS_PER_S, 1)),
         "examples": examples(scene, store, points_of),

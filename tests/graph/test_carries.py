@@ -1,9 +1,10 @@
 """Where the robot was carried, and a trajectory without it."""
 
 import numpy as np
+import pytest
 
 from hybridmap.geometry import RelativePose
-from hybridmap.graph.carries import carries, grounded, pieces
+from hybridmap.graph.carries import carries, grounded, parted, pieces, through_the_air
 from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
 from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.trajectory import Trajectory
@@ -45,3 +46,23 @@ def test_a_trajectory_has_no_pose_of_the_way_through_the_air():
     assert [len(piece) for piece in pieces(way, drive(hung))] == [5, 4]
     assert grounded(way, drive()) is way
     assert len(pieces(way, drive())) == 1
+
+
+def test_a_line_through_the_nodes_breaks_where_the_robot_was_carried():
+    experiences = drive((EdgeKind.REGISTRATION, Status.ACCEPTED, {"carried_m": 5.0}))
+    found = carries(experiences)
+    assert parted(experiences.initial, found)[:, 0].tolist() == pytest.approx(
+        [0.0, 0.5, 1.0, np.nan, 1.5, 2.0, 2.5], nan_ok=True
+    )
+    assert len(parted(experiences.initial[:3], found)) == 3  # nodes of before it alone
+    assert parted(experiences.initial, ()).tolist() == experiences.initial.tolist()
+
+
+def test_edges_through_the_air_are_those_of_motion_between_the_ends_of_a_carry():
+    accepted = Status.ACCEPTED
+    experiences = drive((EdgeKind.REGISTRATION, accepted, {"carried_m": 5.0}), (EdgeKind.LOOP, accepted, {}))
+    relative = RelativePose(np.array([0.5, 0.0, 0.0]), np.eye(3))
+    experiences.add_edge(Edge(3, 4, EdgeKind.REGISTRATION, accepted, "driven", relative))
+    graph = experiences.pose_graph()
+    assert through_the_air(graph, carries(experiences)).tolist() == [True, False, False]
+    assert not through_the_air(graph, ()).any()
