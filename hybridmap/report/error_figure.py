@@ -16,6 +16,7 @@ from hybridmap.trajectory import NS_PER_S
 
 _FLOOR_M, _FLOOR_DEG = 1e-3, 1e-2
 _INTERVALS = 400
+_GAP_S, _GAP = 3.0, 5.0  # a line ends where no error is taken for so long, and for so many times the usual spacing
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +77,7 @@ def draw_errors(axes: Any, scene: Scene, *, heading: bool) -> None:
         looks = dict(styles[name.removesuffix(ONLINE)])
         if name.endswith(ONLINE) and scene.truth is not None:
             looks |= {"linewidth": 0.8, "alpha": 0.6, "zorder": 3, "linestyle": "solid"}
-        drawn = over_intervals(errors, _INTERVALS)
+        drawn = with_gaps(over_intervals(errors, _INTERVALS), gaps(errors.time_s))
         error = np.maximum(drawn.heading_deg, _FLOOR_DEG) if heading else np.maximum(drawn.position_m, _FLOOR_M)
         axes.plot(drawn.time_s, error, label=name.replace(ONLINE, ", as believed at the time"), **looks)
     axes.set_yscale("log")
@@ -106,6 +107,22 @@ def over_intervals(errors: ErrorSeries, count: int) -> ErrorSeries:
     )]  # fmt: skip
     time, position, heading = (total / number[seen] for total in sums)
     return ErrorSeries(time, np.sqrt(position), np.sqrt(heading))
+
+
+def gaps(time_s: Array) -> Array:
+    """Middles (G,), s, of the times in which no error is taken, as where the robot was carried or the truth was lost."""
+    spacing = np.diff(time_s)
+    if not len(spacing):
+        return spacing
+    wide = np.flatnonzero(spacing > max(_GAP_S, _GAP * float(np.median(spacing))))
+    return np.asarray(0.5 * (time_s[wide] + time_s[wide + 1]))
+
+
+def with_gaps(errors: ErrorSeries, gaps_s: Array) -> ErrorSeries:
+    """The series with NaN at some times, where its lines end and begin anew."""
+    at = np.searchsorted(errors.time_s, gaps_s)
+    position, heading = (np.insert(values, at, np.nan) for values in (errors.position_m, errors.heading_deg))
+    return ErrorSeries(np.insert(errors.time_s, at, gaps_s), position, heading)
 
 
 def _mark_loops(scene: Scene, axes: Any) -> None:

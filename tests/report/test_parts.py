@@ -12,7 +12,7 @@ from hybridmap.geometry import compose, transform_points
 from hybridmap.metrics import Metric
 from hybridmap.report import closures, map_figure, style, tables
 from hybridmap.report.closures import examples, spread
-from hybridmap.report.error_figure import ErrorSeries, error_series, over_intervals
+from hybridmap.report.error_figure import ErrorSeries, draw_errors, error_series, gaps, over_intervals, with_gaps
 from hybridmap.report.map_figure import loops_by_fate
 from hybridmap.report.outline import outline, outlines, raster
 from hybridmap.report.scene import Scene, load_scene
@@ -63,6 +63,29 @@ def test_intervals_keep_the_root_mean_square() -> None:
     assert len(drawn.time_s) == 10
     np.testing.assert_allclose(drawn.position_m, [3.0] * 5 + [4.0] * 5, rtol=1e-2)
     assert over_intervals(drawn, 10) is drawn
+
+
+def test_a_gap_lies_where_no_error_is_taken() -> None:
+    time = np.concatenate([np.arange(0.0, 20.0, 0.1), np.arange(40.0, 60.0, 0.1)])
+    assert gaps(time) == pytest.approx([29.95])
+    assert not len(gaps(np.arange(0.0, 100.0, 10.0)))  # a truth that is known seldom
+    assert not len(gaps(time[:1]))
+    series = ErrorSeries(time, np.ones(400), np.ones(400))
+    drawn = with_gaps(over_intervals(series, 60), gaps(time))
+    (nan,) = np.flatnonzero(np.isnan(drawn.position_m))
+    assert drawn.time_s[nan - 1] < 20.0 < drawn.time_s[nan] < 40.0 <= drawn.time_s[nan + 1]
+    assert np.isnan(drawn.heading_deg[nan])
+
+
+def test_no_error_is_ruled_across_a_time_without_a_truth(scene: Scene) -> None:
+    pairs = scene.pairs["odometry"]
+    kept = (pairs.stamps_ns < 20 * 10**9) | (pairs.stamps_ns > 40 * 10**9)
+    left = replace(pairs, stamps_ns=pairs.stamps_ns[kept], estimate=pairs.estimate[kept], reference=pairs.reference[kept])
+    with style.figure(4.0, 3.0) as picture:
+        axes = picture.add_subplot()
+        draw_errors(axes, replace(scene, pairs={"odometry": left}), heading=False)
+        (line,) = axes.get_lines()
+    assert np.isnan(line.get_ydata()).sum() == 1
 
 
 def test_every_loop_has_one_fate(scene: Scene) -> None:
