@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from hybridmap import session
+from hybridmap.backends.base import SolveStatus
 from hybridmap.config import Config
 from hybridmap.errors import StoreError, StreamError
 from hybridmap.evaluate.explain import Explainer
@@ -50,6 +51,13 @@ def test_the_file_gives_back_the_map(finished):
         assert set(store.solutions()) == set(OVERRIDES["backends.names"])
         assert "ranges_m" in store.keyframe(0)
         assert set(store.snapshot(0)) >= {"grid_phases", "heading"}
+
+
+def test_the_words_of_a_figure_hold_for_every_back_end(finished):
+    words = {metric.name: metric.description for metric in finished.metrics}
+    said = {words["chi2/gtsam-gnc"], words["chi2/relaxation-ratslam"]}
+    assert len(said) == 1
+    assert not [status for status in SolveStatus if any(status in text for text in said)]
 
 
 def test_a_pose_for_every_distinct_stamp(finished):

@@ -172,18 +172,20 @@ def _relation_rows(prefix: str, errors: ErrorStatistics, which: str) -> list[tup
 
 
 def _closure_metrics(name: str, errors: ClosureErrors) -> list[Metric]:
-    kept = "accepted by the front-end" if name == "graph" else "that the back-end kept"
+    of_graph = name == "graph"  # back-ends share a line of the page, and its words; how many each kept is its own affair
+    kept = "accepted by the front-end" if of_graph else "that the back-end kept"
+    judged = f"the {errors.judged} loop edges {kept}" if of_graph else f"the loop edges {kept}"
     rows = [
         (
             "loop_precision",
             errors.precision,
             "1",
-            f"share of the {errors.judged} loop edges {kept} within 1 m and 15 deg of truth",
+            f"share of {judged} within 1 m and 15 deg of truth",
         ),
         ("loop_recall", errors.recall, "1", f"share of the {errors.revisits} revisits with a right loop edge {kept}"),
-        ("loops_right", float(errors.right), "1", f"right loop edges {kept}, of {errors.judged}"),
+        ("loops_right", float(errors.right), "1", f"right ones of {judged}"),
     ]
-    if name == "graph":
+    if of_graph:
         rows += [
             ("loop_trans_median", errors.trans_median_m, "m", "translational error of right loop edges, median"),
             ("loop_trans_p95", errors.trans_p95_m, "m", "translational error of right loop edges, 95 %"),
