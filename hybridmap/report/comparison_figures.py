@@ -153,7 +153,7 @@ def residuals(graph: PoseGraph, rows: Sequence[Row]) -> str:
 def _looks(rows: Sequence[Row]) -> Mapping[str, dict[str, Any]]:
     """Title -> how its line is drawn: a colour a back-end, dashes for the incremental way.
 
-    Each is thinner than those before and on top of them, so that lines which coincide can all be seen.
+    Each is thinner than those before and on top of them, so that of lines which coincide the last is seen with a rim of others.
     """
     colors = (style.PRIMARY, *style.OTHERS)
     names = [name for name in dict.fromkeys(row.backend for row in rows) if name != "odometry"]

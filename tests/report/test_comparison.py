@@ -1,4 +1,4 @@
-"""The page of a comparison: a row that diverged has no map, and lines that coincide can all be seen."""
+"""The page of a comparison: a row that diverged has no map, and what lines that coincide hide is said."""
 
 from dataclasses import replace
 
@@ -50,6 +50,14 @@ def test_a_page_without_any_map_shows_the_start_alone(graph, rows, tmp_path):
     page = page_of(tmp_path, graph, [diverged(row) for row in rows])
     assert page.count("data:image/") == 1
     assert "What the edges cost" not in page
+
+
+def test_the_page_says_what_its_pictures_hide_and_show(graph, rows, tmp_path):
+    page = " ".join(page_of(tmp_path, graph, rows).split())
+    assert "can all be seen" not in page
+    assert "of maps that coincide the last one is seen" in page
+    assert "isotropised: with noise of each edge's position" in page
+    assert "<h2>What the edges cost</h2> <p>The share of all edges" in page
 
 
 def test_later_lines_are_thinner_and_on_top(rows):
