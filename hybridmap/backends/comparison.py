@@ -61,6 +61,11 @@ class Row:
         return str(SolveStatus.FAILED if self.solution is None else self.solution.report.status)
 
     @property
+    def has_map(self) -> bool:
+        """Whether it came to a map of its own, and not to its start alone."""
+        return self.solution is not None and self.solution.report.status.has_map
+
+    @property
     def message(self) -> str:
         """One line for people."""
         return self.failure if self.solution is None else self.solution.report.summary

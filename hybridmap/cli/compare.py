@@ -103,7 +103,7 @@ def _judged(opened: GraphSource, rows: Sequence[Row], reference: Path | None, re
 
     if not opened.is_session:
         return Judged(())
-    maps = {row.title: row.solution.poses for row in rows if row.solution is not None}
+    maps = {row.title: row.solution.poses for row in rows if row.solution is not None and row.has_map}
     return judge_solutions(opened.path, maps, reference, relations)
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from hybridmap.backends.base import SolveStatus
 from hybridmap.backends.comparison import Row, Way
 from hybridmap.backends.objective import squared_norms
 from hybridmap.geometry import Array
@@ -26,12 +25,7 @@ _BAR_IN = 0.34  # height of a back-end's bar of weights
 
 def solved(rows: Sequence[Row]) -> dict[str, Array]:
     """Title -> poses (N, 3) of the rows that have a map: one that diverged has its start only."""
-    return {row.title: row.solution.poses for row in rows if has_map(row) and row.solution is not None}
-
-
-def has_map(row: Row) -> bool:
-    """Whether a row came to a map of its own."""
-    return row.solution is not None and row.solution.report.status not in (SolveStatus.FAILED, SolveStatus.DIVERGED)
+    return {row.title: row.solution.poses for row in rows if row.has_map and row.solution is not None}
 
 
 def overlay(rows: Sequence[Row], truth: Sequence[Array], carried: Sequence[Carry] = ()) -> str:
@@ -89,7 +83,7 @@ def panels(graph: PoseGraph, rows: Sequence[Row], start: str, carried: Sequence[
 
 def convergence(rows: Sequence[Row]) -> str:
     """Batch: chi2 over iterations; incremental: unit variance over nodes; a `data:` URI, empty where nothing was traced."""
-    traced = [row for row in rows if has_map(row) and row.curve is not None and row.backend != "odometry"]
+    traced = [row for row in rows if row.has_map and row.curve is not None and row.backend != "odometry"]
     ways = [way for way in Way if any(row.way is way for row in traced)]
     if not ways:
         return ""
@@ -111,7 +105,7 @@ def weights(graph: PoseGraph, rows: Sequence[Row]) -> str:
     ids = graph.edge_ids[graph.is_loop].tolist()
     bars: dict[str, list[float]] = {}
     for row in rows:
-        report = row.solution.report if row.solution is not None and has_map(row) else None
+        report = row.solution.report if row.solution is not None and row.has_map else None
         if report is not None and (report.weights or report.rejected_edge_ids):
             out = set(report.rejected_edge_ids)
             bars[row.title] = [0.0 if edge in out else report.weights.get(edge, 1.0) for edge in ids]

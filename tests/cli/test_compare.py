@@ -3,15 +3,19 @@
 import json
 import logging
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hybridmap.backends import comparison, odometry
+from hybridmap.backends.base import SolveStatus
 from hybridmap.backends.comparison import Way
 from hybridmap.backends.false_loops import inject
 from hybridmap.backends.objective import chi2
 from hybridmap.cli import main
+from hybridmap.cli.compare import _judged
+from hybridmap.cli.graphs import open_graph
 from hybridmap.errors import BackendError
 from hybridmap.geometry import between
 from hybridmap.graph.io import read_graph
@@ -231,3 +235,15 @@ def test_matplotlib_says_nothing_of_its_cache(monkeypatch, capsys, square):
     run(monkeypatch, capsys, "compare", square, "--backends", "odometry")
     logging.getLogger("matplotlib").warning("mkdir -p failed")
     assert capsys.readouterr().err == ""
+
+
+def test_a_row_without_a_map_is_not_judged(tmp_path):
+    path = tmp_path / "s"
+    write_session(path, ring_map(), keyframes=False)
+    opened = open_graph(path)
+    rows = comparison.compare(opened.graph, ["odometry", "gtsam-lm"])
+    assert rows[1].solution is not None
+    singular = replace(rows[1].solution, report=replace(rows[1].solution.report, status=SolveStatus.SINGULAR))
+    judged = _judged(opened, [rows[0], replace(rows[1], solution=singular)], None, None)
+    assert "ate_rmse/odometry" in {metric.name for metric in judged.metrics}
+    assert not [metric for metric in judged.metrics if metric.name.endswith("/gtsam-lm")]

@@ -25,8 +25,8 @@ def rows(graph):
     return comparison.compare(graph, NAMES)
 
 
-def diverged(row):
-    report = replace(row.solution.report, status=SolveStatus.DIVERGED, message="theta is too large")
+def ended(row, status):
+    report = replace(row.solution.report, status=status, message="theta is too large")
     return replace(row, solution=replace(row.solution, report=report))
 
 
@@ -36,8 +36,16 @@ def page_of(folder, graph, rows):
     return write_comparison(folder, Compared("laps", "the start", head, graph, rows, cells, BackendsConfig())).read_text()
 
 
+@pytest.mark.parametrize("status", list(SolveStatus))
+def test_a_row_has_a_map_where_its_status_says_so(rows, status):
+    row = ended(rows[2], status)
+    assert row.has_map is status.has_map
+    assert list(comparison_figures.solved([row])) == ([row.title] if status.has_map else [])
+    assert not replace(row, solution=None).has_map
+
+
 def test_a_row_that_diverged_is_in_the_table_and_in_no_picture(graph, rows, tmp_path):
-    some = [*rows[:2], diverged(rows[2])]
+    some = [*rows[:2], ended(rows[2], SolveStatus.DIVERGED)]
     assert list(comparison_figures.solved(some)) == ["gtsam-lm", "odometry"]
     page = page_of(tmp_path, graph, some)
     assert "Without a map, in the table alone: relaxation-ratslam." in page
@@ -47,7 +55,7 @@ def test_a_row_that_diverged_is_in_the_table_and_in_no_picture(graph, rows, tmp_
 
 
 def test_a_page_without_any_map_shows_the_start_alone(graph, rows, tmp_path):
-    page = page_of(tmp_path, graph, [diverged(row) for row in rows])
+    page = page_of(tmp_path, graph, [ended(row, SolveStatus.DIVERGED) for row in rows])
     assert page.count("data:image/") == 1
     assert "What the edges cost" not in page
 
