@@ -28,7 +28,7 @@ def solved(rows: Sequence[Row]) -> dict[str, Array]:
     return {row.title: row.solution.poses for row in rows if row.has_map and row.solution is not None}
 
 
-def overlay(rows: Sequence[Row], truth: Sequence[Array], carried: Sequence[Carry] = ()) -> str:
+def overlay(rows: Sequence[Row], truth: Sequence[Array], carried: Sequence[Carry]) -> str:
     """The chain of nodes of every row in one frame, over the pieces (P, 3) of the truth where it is known; a `data:` URI.
 
     Empty where no row has a map.
@@ -53,7 +53,7 @@ def overlay(rows: Sequence[Row], truth: Sequence[Array], carried: Sequence[Carry
         return style.svg_uri(picture)
 
 
-def panels(graph: PoseGraph, rows: Sequence[Row], start: str, carried: Sequence[Carry] = ()) -> bytes:
+def panels(graph: PoseGraph, rows: Sequence[Row], start: str, carried: Sequence[Carry]) -> bytes:
     """Each map with its loops and its rejected loops, side by side, as PNG; the same figure gives the same bytes.
 
     Args:

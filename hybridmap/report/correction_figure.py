@@ -14,7 +14,7 @@ from hybridmap.report.outline import raster
 from hybridmap.report.scene import Correction
 
 
-def correction_figure(correction: Correction, points_of: Mapping[int, Array], carried: Sequence[Carry] = ()) -> str:
+def correction_figure(correction: Correction, points_of: Mapping[int, Array], carried: Sequence[Carry]) -> str:
     """Two panels on the same axes: nodes and what they saw, before and after; a `data:` URI. The way ends at a carry."""
     both = np.concatenate([correction.before, correction.after])[:, :2]
     low, high = both.min(axis=0) - 1.5, both.max(axis=0) + 1.5
