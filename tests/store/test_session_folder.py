@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
+from pathlib import Path
 
 import pytest
 
@@ -98,6 +100,44 @@ def test_the_next_run_puts_a_finished_session_back_first(tmp_path):
     with pytest.raises(MemoryError), session.writing(overwrite=True):
         raise MemoryError
     assert session.map_db.read_bytes() == before
+
+
+class Killed(BaseException):
+    """Nothing that the run still tries comes to pass."""
+
+
+def overwritten_and_failed(folder):
+    with pytest.raises((MemoryError, Killed)), SessionFolder(folder).writing(overwrite=True):
+        write_and_fail(SessionFolder(folder), MemoryError)
+
+
+def test_a_kill_while_files_are_moved_loses_none(tmp_path, monkeypatch):
+    write_session(tmp_path / "s", ring_map(0.1))
+    before = contents(tmp_path / "s")
+    rename, done = Path.rename, []
+
+    def killed_at(last):
+        def renamed(path, target):
+            if len(done) == last:
+                raise Killed
+            done.append(target)
+            return rename(path, target)
+
+        return renamed
+
+    for last in range(14):  # six moves set it aside, six bring it back
+        shutil.copytree(tmp_path / "s", tmp_path / str(last))
+        done.clear()
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "rename", killed_at(last))
+            overwritten_and_failed(tmp_path / str(last))
+        overwritten_and_failed(tmp_path / str(last))
+        assert contents(tmp_path / str(last)) == before
+    assert len(done) < last  # the last of them was not killed at all
+
+
+def contents(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_what_a_finished_session_replaced_does_not_come_back(tmp_path):
