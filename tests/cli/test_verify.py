@@ -89,7 +89,7 @@ def test_a_verification_is_replaced_only_when_asked(run, tmp_path):
     code, _, err = run("--out", tmp_path, "--overwrite")
     assert code == 2
     assert "no verification (it holds 'metrics.json')" in err
-    (tmp_path / "verify.html").write_text("hybridmap 1.0")
+    (tmp_path / "verify.html").write_text('<meta name="generator" content="hybridmap 1.0">')
     code, _, err = run("--out", tmp_path)
     assert code == 2
     assert "--overwrite" in err
