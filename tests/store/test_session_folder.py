@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+import fcntl
 import json
 import math
+import os
 import shutil
+import threading
 from pathlib import Path
 
 import pytest
@@ -10,6 +13,7 @@ import pytest
 from hybridmap.errors import StoreError
 from hybridmap.metrics import Metric
 from hybridmap.store import MapStore, SessionFolder
+from hybridmap.store.lock import is_being_written
 from hybridmap.streams.base import Rig
 from tests.store.sessions import ring_map, write_session
 
@@ -63,6 +67,16 @@ def test_two_runs_do_not_write_one_folder(tmp_path):
         session.write_config("{}")
     with session.writing(overwrite=True):
         assert list(session.path.iterdir()) == [session.path / ".previous"]
+
+
+def test_a_look_at_a_folder_does_not_keep_a_run_from_starting(tmp_path):
+    looking = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(looking, fcntl.LOCK_SH)  # as one that asks whether it is being written
+    look = threading.Timer(0.05, os.close, [looking])
+    look.start()
+    with SessionFolder(tmp_path).writing():
+        assert is_being_written(tmp_path)
+    look.join()
 
 
 def killed_while_it_overwrote(folder):
