@@ -71,6 +71,8 @@ def run(stream: Stream, config: Config, out: Path, *, overwrite: bool = False, p
     folder = SessionFolder(out)
     with folder.writing(overwrite=overwrite):
         folder.write_config(config.to_yaml())
+        if stream.groundtruth is not None:
+            folder.write_groundtruth(stream.groundtruth)  # before the drive, so that a killed run can be evaluated
         with MapStore.create(folder.path, config.to_yaml(), stream.rig, stream.name) as store:
             recorder = _Recorder(mapper, store)
             _drive(stream, mapper, recorder, progress)
@@ -182,8 +184,6 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
             if name != "odometry":
                 folder.write_trajectory(name, trajectory_of(track, solution.poses))
             folder.write_trajectory(f"{name}_online", store.online(name))
-    if stream.groundtruth is not None:
-        folder.write_groundtruth(stream.groundtruth)
     free = unobserved(mapper.map, mapper.poses())
     head = {
         "graph_hash": graph_hash(mapper.map),

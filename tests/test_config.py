@@ -55,6 +55,16 @@ def test_refusals_name_the_key(tmp_path, text, expected):
         Config.load(path)
 
 
+def test_a_refusal_names_the_file_or_who_overrode_it(tmp_path):
+    (tmp_path / "a.yaml").write_text("seed: 3\n")
+    with pytest.raises(ConfigError, match=r"^command line: seed: .*found -1"):
+        Config.load(tmp_path / "a.yaml", {"seed": -1})
+    (tmp_path / "a.yaml").write_text("seed: -1\n")
+    with pytest.raises(ConfigError, match=r"^\S+a.yaml: seed: .*found -1"):
+        Config.load(tmp_path / "a.yaml", {"nodes.distance_m": -2})
+    assert Config.load(tmp_path / "a.yaml", {"seed": 2}).seed == 2
+
+
 def test_a_missing_configuration_lists_the_names():
     with pytest.raises(ConfigError, match="rgbd"):
         Config.load("no-such-thing")

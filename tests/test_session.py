@@ -17,6 +17,7 @@ from hybridmap import session
 from hybridmap.backends.base import SolveStatus
 from hybridmap.config import Config
 from hybridmap.errors import StoreError, StreamError
+from hybridmap.evaluate import evaluate_session
 from hybridmap.evaluate.explain import Explainer
 from hybridmap.geometry import between
 from hybridmap.graph.hashing import graph_hash
@@ -216,3 +217,4 @@ def test_a_killed_run_leaves_a_readable_map(tmp_path):
     with MapStore.open(tmp_path / "s") as store:
         assert len(store.map()) >= 3
         assert not store.ended
+    assert "ate_rmse/odometry" in {metric.name for metric in evaluate_session(tmp_path / "s")}

@@ -102,8 +102,17 @@ def _refuse_empty(arguments: Sequence[str]) -> None:
     for before, argument in zip(("", *arguments), arguments, strict=False):
         option, given, value = argument.partition("=") if argument.startswith("--") else (before, "=", argument)
         if given and not value:
-            name = option if option.startswith("--") else "an argument"
+            known = option in _options_with_values()
+            if argument and not known:
+                continue  # a flag, or no option at all: refused when it is read
+            name = option if known else "an argument"
             raise ConfigError(f"{name}: found nothing, expected a value")
+
+
+def _options_with_values() -> set[str]:
+    commands = vars(typer.main.get_command(app))["commands"].values()
+    options = [option for command in commands for option in command.params if not getattr(option, "is_flag", True)]
+    return {name for option in options for name in option.opts}
 
 
 def _fail(message: str) -> NoReturn:

@@ -34,6 +34,7 @@ def evaluate(
 
     Loop precision: share of the accepted loop edges within 1 m and 15 deg of the truth. Recall: share of the nodes that come
     within 1 m and 30 deg of one at least 10 s older, and have a right loop edge from a node at most 3 away.
+    The page is written anew.
     """
     from hybridmap.cli.show import emit
     from hybridmap.evaluate import evaluate_session
@@ -42,9 +43,9 @@ def evaluate(
 
     session = SessionFolder(folder)
     metrics = evaluate_session(folder, reference, relations, loops=loops)
-    if session.report.is_file():
-        try:
-            write_report(session)
-        except OSError as error:
-            log.warning("%s: cannot be written: %s; the page stays as it was", session.report, error.strerror)
+    try:
+        write_report(session)
+    except OSError as error:
+        kept = "; the page stays as it was" if session.report.is_file() else ""
+        log.warning("%s: cannot be written: %s%s", session.report, error.strerror, kept)
     emit(session.read_metrics().head, metrics, as_json=as_json, title=str(folder))

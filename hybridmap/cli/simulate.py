@@ -75,16 +75,17 @@ def _figures(stream: SimulatedStream, written: dict[str, int]) -> list[Metric]:
     from hybridmap.evaluate.trajectory import absolute_error
     from hybridmap.metrics import Metric
 
-    truth = stream.groundtruth
+    truth, carry = stream.groundtruth, stream.carry
+    driven = truth.poses if carry is None else carry.felt[: len(truth)]
     rows = [
         Metric("duration/simulation", float(truth.stamps_s[-1] - truth.stamps_s[0]), "s", "length of the drive"),
-        Metric("travel/simulation", float(travel(truth.poses)[-1]), "m", "way driven, of the ground truth"),
+        Metric("travel/simulation", float(travel(driven)[-1]), "m", "way driven, of the ground truth"),
         Metric("ate_rmse/odometry", absolute_error(stream.odometry, truth).rmse_m, "m", "error of the wheels, SE(2)-aligned"),
     ]
-    if stream.carry is not None:
-        up_s, down_s = (float(truth.stamps_s[step] - truth.stamps_s[0]) for step in (stream.carry.first, stream.carry.last))
+    if carry is not None:
+        up_s, down_s = (float(truth.stamps_s[step] - truth.stamps_s[0]) for step in (carry.first, carry.last))
         rows += [
-            Metric("carried/simulation", stream.carry.distance_m, "m", "how far the robot was carried, in a straight line"),
+            Metric("carried/simulation", carry.distance_m, "m", "how far the robot was carried, in a straight line"),
             Metric("picked_up/simulation", up_s, "s", "when, after the start of the drive"),
             Metric("put_down/simulation", down_s, "s", "when it was on the floor again"),
         ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from importlib import resources
 from pathlib import Path
 from typing import Any, Self
@@ -44,16 +45,28 @@ class Config(Section):
     """Odometry gains that follow the map while driving."""
 
     @classmethod
-    def load(cls, source: str | Path | None = None, overrides: Mapping[str, Any] | None = None) -> Self:
+    def load(
+        cls,
+        source: str | Path | None = None,
+        overrides: Mapping[str, Any] | None = None,
+        *,
+        overridden_by: str = "command line",
+    ) -> Self:
         """Read a configuration by name (`rgbd`) or path, with `overrides` (`{"nodes.distance_m": 0.3}`) on top.
 
         Raises:
-            ConfigError: no such file, not YAML, an unknown key (named with its path) or a value out of range.
+            ConfigError: no such file, not YAML, an unknown key (named with its path) or a value out of range. It names
+                the file, or `overridden_by` where the file by itself is sound.
         """
         tree: dict[str, Any] = {} if source is None else _read_tree(source, seen=())
+        changed = deepcopy(tree)
         for dotted, value in (overrides or {}).items():
-            _merge(tree, _nest(dotted, value))
-        return cls.from_tree(tree, str(source) if source is not None else "command line")
+            _merge(changed, _nest(dotted, value))
+        try:
+            return cls.from_tree(changed, overridden_by)
+        except ConfigError:
+            cls.from_tree(tree, str(source))
+            raise
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any], origin: str) -> Self:

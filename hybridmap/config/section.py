@@ -14,8 +14,11 @@ class Section(BaseModel):
 
 
 def said(error: ValidationError) -> str:
-    """The first of pydantic's complaints in the form of every other error: where, what was expected, what was found."""
-    first = error.errors()[0]
+    """The first of pydantic's complaints in the form of every other error: where, what was expected, what was found.
+
+    An unknown key comes before all others: one that is missing may be the same key, misspelt.
+    """
+    first = min(error.errors(), key=lambda complaint: complaint["type"] != "extra_forbidden")
     kind, message = first["type"], first["msg"]
     where = ".".join(str(part) for part in first["loc"])
     if kind == "extra_forbidden":

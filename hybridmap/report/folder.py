@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hybridmap.errors import StoreError
 
-_MARK = "hybridmap "  # every page of ours has it, before the version
+_MARK = '<meta name="generator" content="hybridmap '  # the head of every page of ours has it, before the version
 
 
 def prepare_folder(folder: Path, kind: str, files: Sequence[str], *, overwrite: bool = False) -> None:

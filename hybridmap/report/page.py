@@ -39,7 +39,7 @@ def write_report(folder: SessionFolder) -> Path:
         StoreError: there is no session, or its map or figures are damaged.
         StreamError: one of its trajectories is damaged.
     """
-    folder.require()
+    folder.require_map()
     with MapStore.open(folder.path) as store:
         scene = load_scene(folder, store)
         text = rendered(_TEMPLATE, **_content(scene, store))

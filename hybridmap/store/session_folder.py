@@ -6,7 +6,7 @@ import json
 import logging
 import math
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +32,7 @@ _OURS = (
     "report.html",
 )
 _PREVIOUS = ".previous"
+_MOVING = ".previous.partial"  # a kill may leave part of a session here, and so never in `_PREVIOUS`
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +127,7 @@ class SessionFolder:
     def _prepare(self, overwrite: bool) -> None:
         if self.path.exists() and not self.path.is_dir():
             raise StoreError(f"{self.path}: is a file; expected a folder that is empty or does not exist")
+        self._put_back()  # what a run that was killed while it moved files had not done
         if overwrite and not _ended(self.path):
             self.restore_previous()  # a run that was killed while it overwrote: the session set aside is the whole one
         found = sorted(entry.name for entry in self.path.iterdir()) if self.path.exists() else []
@@ -137,10 +139,27 @@ class SessionFolder:
         self.path.mkdir(parents=True, exist_ok=True)
         ours = [self.path / name for name in _OURS if name in found]
         if ours:
-            shutil.rmtree(self.path / _PREVIOUS, ignore_errors=True)
-            (self.path / _PREVIOUS).mkdir()
+            self._set_aside(ours)
+
+    def _set_aside(self, ours: Sequence[Path]) -> None:
+        moving, previous = self.path / _MOVING, self.path / _PREVIOUS
+        try:
+            moving.mkdir()
             for entry in ours:
-                entry.rename(self.path / _PREVIOUS / entry.name)
+                entry.rename(moving / entry.name)
+            shutil.rmtree(previous, ignore_errors=True)
+            moving.rename(previous)
+        except BaseException:
+            self._put_back()
+            raise
+
+    def _put_back(self) -> None:
+        """Move the files back that are between a session and the folder it is set aside in."""
+        moving = self.path / _MOVING
+        if moving.is_dir():
+            for entry in sorted(moving.iterdir()):
+                entry.rename(self.path / entry.name)
+            moving.rmdir()
 
     def keep(self) -> None:
         """The new session stands: drop the one set aside by `prepare`."""
@@ -161,9 +180,8 @@ class SessionFolder:
                 entry.unlink(missing_ok=True)
         previous = self.path / _PREVIOUS
         if previous.is_dir():
-            for entry in sorted(previous.iterdir()):
-                entry.rename(self.path / entry.name)
-            previous.rmdir()
+            previous.rename(self.path / _MOVING)
+            self._put_back()
         if self.path.is_dir() and not any(self.path.iterdir()):
             self.path.rmdir()
 
@@ -173,11 +191,19 @@ class SessionFolder:
         Raises:
             StoreError: the folder is missing or holds no map.
         """
+        self.require_map()
+        if not _ended(self.path):
+            log.warning("%s: %s", self.path, self._why_unended())
+
+    def require_map(self) -> None:
+        """Check that there is a session, whether or not its run ended.
+
+        Raises:
+            StoreError: as `require`.
+        """
         if not self.map_db.is_file():
             what = "holds no session (no map.db)" if self.path.is_dir() else "no such session folder"
             raise StoreError(f"{self.path}: {what}; expected what `hybridmap map SOURCE --out DIR` writes")
-        if not _ended(self.path):
-            log.warning("%s: %s", self.path, self._why_unended())
 
     def _why_unended(self) -> str:
         if is_being_written(self.path):

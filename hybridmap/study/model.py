@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -191,9 +192,14 @@ class StudyConfig(Section):
         if not isinstance(tree, dict):
             raise ConfigError(f"{path}: expected a mapping with `sources` and `backends`, found {type(tree).__name__}")
         tree = {"name": path.stem, **tree}
+        changed = deepcopy(tree)
         for dotted, value in (overrides or {}).items():
-            merge(tree, nested(dotted, value))
-        return cls.from_tree(tree, str(path), path.parent)
+            merge(changed, nested(dotted, value))
+        try:
+            return cls.from_tree(changed, str(path) if changed == tree else "command line", path.parent)
+        except ConfigError:
+            cls.from_tree(tree, str(path), path.parent)
+            raise
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any], origin: str, folder: Path) -> Self:

@@ -120,7 +120,8 @@ def task_of(source: SourceConfig, setting: SettingConfig, seed: int, read: Mappi
 
 
 def _world_task(source: SourceConfig, setting: SettingConfig, seed: int) -> SourceTask:
-    config = Config.load(source.config or source.world, {**source.overrides, **setting.overrides, "seed": seed})
+    overrides = {**source.overrides, **setting.overrides, "seed": seed}
+    config = Config.load(source.config or source.world, overrides, overridden_by=f"{source.title}: overrides")
     backends = config.backends.model_copy(update={"names": config.backends.names[:1]})  # the others leave no trace in a graph
     tree = config.model_copy(update={"backends": backends}).model_dump(mode="json")
     identity = {"world": source.world, "config": tree, "window": [source.start_s, source.end_s], "first": source.first_nodes}

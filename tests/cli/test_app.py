@@ -56,6 +56,12 @@ def test_every_command_explains_itself(command):
         (["map", "office", "--out", ""], "--out: found nothing"),
         (["map", "office", "--out="], "--out: found nothing"),
         (["map", "", "--out", "s"], "an argument: found nothing"),
+        (["map", "lab", "--out", "s", "--overwrite", ""], "an argument: found nothing"),
+        (["map", "lab", "--out", "s", "--overwrite="], "does not take a value"),
+        (
+            ["map", "lab", "--out", "s", "--set", "backends.names=[]"],
+            "error: command line: backends.names: expected at least 1",
+        ),
         (["evaluate", "no-such-folder"], "no-such-folder"),
         (["optimize", "no-such.g2o", "--backend", "gtsam-lm"], "no-such.g2o"),
         (["compare", "no-such.g2o", "--backends", "gtsam-lm"], "no-such.g2o"),

@@ -202,11 +202,11 @@ def test_an_earlier_comparison_goes_only_where_that_was_asked_for(monkeypatch, c
 def test_a_file_of_somebody_else_is_never_lost(monkeypatch, capsys, square, tmp_path, name):
     out = tmp_path / "mine"
     out.mkdir()
-    (out / name).write_text("mine")
+    (out / name).write_text("mine: of hybridmap 1.0")
     code, printed, error = run(monkeypatch, capsys, "compare", square, "--backends", "odometry", "--out", out, "--overwrite")
     assert (code, printed) == (2, "")
     assert f"not empty and no comparison (it holds '{name}')" in error
-    assert contents(out) == {name: b"mine"}
+    assert contents(out) == {name: b"mine: of hybridmap 1.0"}
 
 
 def test_a_back_end_named_twice_is_refused(monkeypatch, capsys, square):

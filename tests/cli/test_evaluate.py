@@ -28,6 +28,16 @@ def test_json_is_one_object_and_metrics_json_is_extended(tmp_path):
     assert stored.head["graph_hash"] == "0"
 
 
+@pytest.mark.parametrize("ended", [True, False])
+def test_a_page_that_is_missing_is_written(tmp_path, ended):
+    """Ctrl-C after the end of a session, while its page is made, leaves a whole session without one."""
+    session = write_session(tmp_path / "s", ring_map(), keyframes=False, solve=ended, ended=ended)
+    done = run("evaluate", tmp_path / "s")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("broken off") == (not ended)
+    assert "ATE of odometry" in session.report.read_text()
+
+
 def test_bad_input_is_one_line_and_code_two(tmp_path):
     for arguments in ((tmp_path / "gone",), (tmp_path,)):
         done = run("evaluate", *arguments)

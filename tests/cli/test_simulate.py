@@ -9,6 +9,7 @@ import pytest
 
 from hybridmap.cli import main
 from hybridmap.config import Config
+from hybridmap.evaluate.association import travel
 from hybridmap.streams import open_stream
 from hybridmap.streams.base import LaserScan
 from hybridmap.streams.simulated import world_names
@@ -102,6 +103,11 @@ def test_kidnap_says_when_and_how_far(run, tmp_path):
     assert code == 0
     values = {row["name"]: row["value"] for row in json.loads(out)["metrics"]}
     assert values["carried/simulation"] > 5
+    truth = open_stream(tmp_path / "t", Config()).groundtruth
+    since_s = truth.stamps_s - truth.stamps_s[0]
+    on_floor = (since_s < values["picked_up/simulation"], since_s > values["put_down/simulation"])
+    driven_m = sum(travel(truth.poses[part])[-1] for part in on_floor)
+    assert values["travel/simulation"] == pytest.approx(driven_m, abs=0.2)
     assert values["picked_up/simulation"] < values["put_down/simulation"] < values["duration/simulation"]
     code, out, err = run("simulate", "lab", "--kidnap", "--out", str(tmp_path / "short"), *SHORT)
     assert (code, out) == (2, "")

@@ -30,6 +30,7 @@ def test_verify_keeps_its_bars_and_writes_a_page_that_needs_nothing(run, tmp_pat
     assert shown["seed"] == 3
     assert json.loads((tmp_path / "cells" / "metrics.json").read_text()) == shown
     page = (tmp_path / "cells" / "verify.html").read_text()
+    assert '<meta name="generator" content="hybridmap ' in page  # by which --overwrite knows it
     assert page.count("data:image/svg+xml;base64,") == 9
     assert "http" not in page.replace("http-equiv", "")
     assert sorted(entry.name for entry in (tmp_path / "cells").iterdir()) == ["metrics.json", "verify.html"]
@@ -89,7 +90,7 @@ def test_a_verification_is_replaced_only_when_asked(run, tmp_path):
     code, _, err = run("--out", tmp_path, "--overwrite")
     assert code == 2
     assert "no verification (it holds 'metrics.json')" in err
-    (tmp_path / "verify.html").write_text("hybridmap 1.0")
+    (tmp_path / "verify.html").write_text('<meta name="generator" content="hybridmap 1.0">')
     code, _, err = run("--out", tmp_path)
     assert code == 2
     assert "--overwrite" in err

@@ -1,13 +1,19 @@
 from __future__ import annotations
 
+import fcntl
 import json
 import math
+import os
+import shutil
+import threading
+from pathlib import Path
 
 import pytest
 
 from hybridmap.errors import StoreError
 from hybridmap.metrics import Metric
 from hybridmap.store import MapStore, SessionFolder
+from hybridmap.store.lock import is_being_written
 from hybridmap.streams.base import Rig
 from tests.store.sessions import ring_map, write_session
 
@@ -63,6 +69,16 @@ def test_two_runs_do_not_write_one_folder(tmp_path):
         assert list(session.path.iterdir()) == [session.path / ".previous"]
 
 
+def test_a_look_at_a_folder_does_not_keep_a_run_from_starting(tmp_path):
+    looking = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(looking, fcntl.LOCK_SH)  # as one that asks whether it is being written
+    look = threading.Timer(0.05, os.close, [looking])
+    look.start()
+    with SessionFolder(tmp_path).writing():
+        assert is_being_written(tmp_path)
+    look.join()
+
+
 def killed_while_it_overwrote(folder):
     """What such a run leaves, and the map of the session that was there before."""
     session = write_session(folder, ring_map())
@@ -98,6 +114,44 @@ def test_the_next_run_puts_a_finished_session_back_first(tmp_path):
     with pytest.raises(MemoryError), session.writing(overwrite=True):
         raise MemoryError
     assert session.map_db.read_bytes() == before
+
+
+class Killed(BaseException):
+    """Nothing that the run still tries comes to pass."""
+
+
+def overwritten_and_failed(folder):
+    with pytest.raises((MemoryError, Killed)), SessionFolder(folder).writing(overwrite=True):
+        write_and_fail(SessionFolder(folder), MemoryError)
+
+
+def test_a_kill_while_files_are_moved_loses_none(tmp_path, monkeypatch):
+    write_session(tmp_path / "s", ring_map(0.1))
+    before = contents(tmp_path / "s")
+    rename, done = Path.rename, []
+
+    def killed_at(last):
+        def renamed(path, target):
+            if len(done) == last:
+                raise Killed
+            done.append(target)
+            return rename(path, target)
+
+        return renamed
+
+    for last in range(14):  # six moves set it aside, six bring it back
+        shutil.copytree(tmp_path / "s", tmp_path / str(last))
+        done.clear()
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "rename", killed_at(last))
+            overwritten_and_failed(tmp_path / str(last))
+        overwritten_and_failed(tmp_path / str(last))
+        assert contents(tmp_path / str(last)) == before
+    assert len(done) < last  # the last of them was not killed at all
+
+
+def contents(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_what_a_finished_session_replaced_does_not_come_back(tmp_path):

@@ -44,6 +44,7 @@ def test_the_resolved_study_reads_back_to_an_equal_one(tmp_path, monkeypatch):
     ("changes", "expected"),
     [
         ({"seads": 3}, "unknown key 'seads'"),
+        ({"backends": [{"backendd": "gtsam-lm"}]}, "unknown key 'backends.0.backendd'"),
         ({"backends": [{"backend": "gtsam-lm", "thata": 1}]}, "unknown key 'backends.0.thata'"),
         ({"backends": [{"backend": "gtsam-lm", "settings": {"relaxation": {"thata": 1}}}]}, "unknown key 'relaxation.thata'"),
         ({"backends": [{"backend": "gtsam-lm", "settings": {"relaxation.theta": 7}}]}, "relaxation.theta: .*found 7"),
