@@ -260,13 +260,11 @@ class Explainer:
                 f"{self._folder.path}: no frame at {time_s:g} s; expected 0..{span:.3f} s from the start, or a stamp in "
                 f"{stamps[0] / NS_PER_S:.3f}..{stamps[-1] / NS_PER_S:.3f} s"
             )
-        stamp, node = int(stamps[at]), int(track.nodes[at])
-        since = track.deltas[at]
+        stamp, node, since = int(stamps[at]), int(track.nodes[at]), track.deltas[at]
         if node + 1 < len(self._map) and self._is_of(node + 1, stamp):  # motion comes before the view at the same stamp
             node, since = node + 1, np.zeros(3)
-        made = self._is_of(node, stamp)
+        made, moved = self._is_of(node, stamp), _moved(since)
         after = self._map.node(node + 1) if node + 1 < len(self._map) else None
-        moved = _moved(since)
         believed = {"odometry": track.poses_odom[at]}
         for name in self._store.online_backends():
             believed[name] = self._store.online(name).at(np.array([stamp]))[0]
