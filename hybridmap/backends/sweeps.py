@@ -6,19 +6,19 @@ compiled. Without fast mathematics and without threads: the same input gives the
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from hybridmap.compiled import compiled
 from hybridmap.config.backends import RelaxationConfig
 from hybridmap.geometry import Array, wrap_angle
 from hybridmap.graph.pose_graph import PoseGraph
 
-_Kernel = TypeVar("_Kernel", bound=Callable[..., object])
+_LINKS = "int64[::1], int64[::1], float64[:, ::1], boolean[::1]"
+_RULE = "float64, float64, int64, float64, float64, float64, float64"
+_SIGNATURE = f"Tuple((int64, boolean))(float64[:, ::1], float64[:, ::1], {_LINKS}, {_RULE})"
 
 _TURN = 2.0 * np.pi
 _PER_RAD = 1.0 / _TURN
@@ -74,19 +74,7 @@ def relax_links(graph: PoseGraph, start: Array, sweeps: int, config: RelaxationC
     return Relaxed(poses, done, settled)
 
 
-def _compiled(kernel: _Kernel) -> _Kernel:
-    """The kernel as machine code, kept beside this file or in the user's cache if there is room for it."""
-    links = "int64[::1], int64[::1], float64[:, ::1], boolean[::1]"
-    rule = "float64, float64, int64, float64, float64, float64, float64"
-    signature = f"Tuple((int64, boolean))(float64[:, ::1], float64[:, ::1], {links}, {rule})"
-    try:
-        kept: _Kernel = njit(signature, cache=True)(kernel)
-    except Exception:  # noqa: BLE001  no folder to write to, a full disk, a torn file: numba raises what it meets
-        kept = njit(signature)(kernel)
-    return kept
-
-
-@_compiled
+@compiled(_SIGNATURE)
 def _sweep(
     poses: Array,
     before: Array,

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +20,7 @@ all of them were compared (1) because the robot was not sure where it was."""
 def nodes_within(poses: Array, node: int, radius_m: float | Array, turn_rad: float, before: int | None = None) -> Indices:
     """Nodes before one of them that lie near it and look nearly the same way.
 
-    A band of x is cut out first, so that a large map costs one comparison a node.
+    Every frame asks for it and looks at every node: the one loop over them is compiled.
 
     Args:
         poses: (N, 3) of all nodes, m and rad.
@@ -29,11 +32,28 @@ def nodes_within(poses: Array, node: int, radius_m: float | Array, turn_rad: flo
     Returns:
         (n,) node numbers, ascending.
     """
-    x, y, yaw = poses[node]
-    radius = np.asarray(radius_m, dtype=np.float64)
-    across = poses[: node if before is None else before, 0] - x
-    band = np.flatnonzero(np.abs(across) <= radius)
-    near = radius[band] if radius.ndim else radius
-    inside = across[band] ** 2 + (poses[band, 1] - y) ** 2 <= near**2
-    chosen = band[inside]
-    return np.asarray(chosen[np.abs(wrap_angle(poses[chosen, 2] - yaw)) <= turn_rad])
+    old = np.ascontiguousarray(poses[: node if before is None else before], dtype=np.float64)
+    x, y, yaw = (float(number) for number in poses[node])
+    found = np.empty(len(old), dtype=np.int64)
+    count = _scan()(old, x, y, np.atleast_1d(np.asarray(radius_m, dtype=np.float64)), found)
+    near = found[:count]
+    return near[np.abs(wrap_angle(old[near, 2] - yaw)) <= turn_rad]
+
+
+@cache
+def _scan() -> Callable[[Array, float, float, Array, Indices], int]:
+    """Writes the numbers of the nodes that lie near a point; compiled when it is first asked for, as few commands do."""
+    from hybridmap.compiled import compiled
+
+    return compiled("int64(float64[:, ::1], float64, float64, float64[::1], int64[::1])")(_near)
+
+
+def _near(poses: Array, x: float, y: float, radius_m: Array, found: Indices) -> int:
+    count = 0
+    for node in range(len(poses)):
+        across, along = poses[node, 0] - x, poses[node, 1] - y
+        radius = radius_m[node] if len(radius_m) > 1 else radius_m[0]
+        if across * across + along * along <= radius * radius:
+            found[count] = node
+            count += 1
+    return count

@@ -11,7 +11,7 @@ from graphs_for_tests import laps, star
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridmap import backends
+from hybridmap import backends, compiled
 from hybridmap.backends import sweeps
 from hybridmap.backends.false_loops import inject
 from hybridmap.backends.sweeps import relax_links
@@ -231,7 +231,7 @@ def test_another_process_gives_the_same_with_and_without_compiled_code(without):
 
 
 def test_compiled_code_that_cannot_be_kept_is_compiled_all_the_same(monkeypatch):
-    true_njit, asked = sweeps.njit, []
+    true_njit, asked = compiled.njit, []
 
     def unwritable(signature, cache=False):
         asked.append(cache)
@@ -239,9 +239,9 @@ def test_compiled_code_that_cannot_be_kept_is_compiled_all_the_same(monkeypatch)
             raise RuntimeError("cannot cache function '_sweep': no locator available for file")
         return true_njit(signature)
 
-    monkeypatch.setattr(sweeps, "njit", unwritable)
+    monkeypatch.setattr(compiled, "njit", unwritable)
     plain = getattr(sweeps._sweep, "py_func", sweeps._sweep)
-    monkeypatch.setattr(sweeps, "_sweep", sweeps._compiled(plain))
+    monkeypatch.setattr(sweeps, "_sweep", compiled.compiled(sweeps._SIGNATURE)(plain))
     assert asked == [True, False]
     graph = star(12)
     found = relax_links(graph, graph.initial, 3, RelaxationConfig()).poses
