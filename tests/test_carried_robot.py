@@ -11,8 +11,8 @@ from hybridmap.geometry import align, between, compose
 from hybridmap.graph.experience_map import Status
 from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.session import run
+from hybridmap.simulation import SimulatedStream
 from hybridmap.store import MapStore
-from hybridmap.streams.simulated import SimulatedStream
 
 
 @pytest.mark.slow

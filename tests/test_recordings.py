@@ -13,9 +13,9 @@ from hybridmap.evaluate import evaluate_session
 from hybridmap.geometry import between
 from hybridmap.graph.experience_map import Status
 from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.simulation import SimulatedStream
+from hybridmap.simulation.writers import write_rosbag1, write_rosbag2, write_tum
 from hybridmap.store import MapStore
-from hybridmap.streams.simulated import SimulatedStream
-from hybridmap.streams.writers import write_rosbag1, write_rosbag2, write_tum
 
 pytestmark = pytest.mark.slow
 

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.neural import NeuralConfig
-from hybridmap.evaluate.cells.path_error import wander
 from hybridmap.metrics import Metric, to_json
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.grid import kernel_spectrum
+from hybridmap.verification.path_error import wander
 
 ODOMETRY_HZ = 100.0
 STEP_M = 0.005  # 0.5 m/s

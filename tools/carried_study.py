@@ -33,9 +33,9 @@ from hybridmap.graph.experience_map import ExperienceMap, Status
 from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.mapper import Mapper
 from hybridmap.metrics import Metric, to_json
+from hybridmap.simulation import SimulatedStream
 from hybridmap.streams.base import Sample, SelfMotion
 from hybridmap.streams.open import open_stream, world_of
-from hybridmap.streams.simulated import SimulatedStream
 from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
 
 Floats = NDArray[np.float64]

@@ -27,9 +27,9 @@ from hybridmap.cli.choose import parse_settings
 from hybridmap.config import Config
 from hybridmap.config.simulation import WheelErrorConfig
 from hybridmap.metrics import Metric, to_json
+from hybridmap.simulation.wheels import wheel_odometry
 from hybridmap.streams.base import RgbdFrame, Rig, Sample, SelfMotion, Stream, StreamReport
 from hybridmap.streams.open import open_stream
-from hybridmap.streams.simulated.wheels import wheel_odometry
 from hybridmap.trajectory import NS_PER_S, Trajectory
 
 MAP = "ate_gtsam-gnc"

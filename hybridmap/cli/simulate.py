@@ -12,7 +12,7 @@ from hybridmap.errors import ConfigError
 
 if TYPE_CHECKING:
     from hybridmap.metrics import Metric
-    from hybridmap.streams.simulated import SimulatedStream
+    from hybridmap.simulation import SimulatedStream
 
 Format = Literal["rosbag1", "mcap", "db3", "tum"]
 CARRIED_M = 20.0
@@ -36,7 +36,7 @@ def simulate(
     """Render a drive with wheel odometry, RGB-D camera or laser, and its ground truth, into a bag or TUM folder."""
     from hybridmap.cli.choose import parse_settings
     from hybridmap.config import Config
-    from hybridmap.streams.simulated import SimulatedStream
+    from hybridmap.simulation import SimulatedStream
 
     _check_world(world)
     chosen = format_ or _FORMAT_OF_SUFFIX.get(out.suffix.lower(), "tum")
@@ -53,14 +53,14 @@ def simulate(
 
 
 def _check_world(world: str) -> None:
-    from hybridmap.streams.simulated import world_names
+    from hybridmap.simulation import world_names
 
     if world not in world_names():
         raise ConfigError(f"{world}: no such world; worlds: {', '.join(world_names())}")
 
 
 def _write(stream: SimulatedStream, out: Path, chosen: Format, *, overwrite: bool, advance: Advance) -> dict[str, int]:
-    from hybridmap.streams.writers import write_rosbag1, write_rosbag2, write_tum
+    from hybridmap.simulation.writers import write_rosbag1, write_rosbag2, write_tum
 
     if chosen == "rosbag1":
         return write_rosbag1(stream, out, overwrite=overwrite, progress=advance)

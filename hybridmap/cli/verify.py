@@ -22,9 +22,9 @@ def verify(
     from hybridmap.cli.choose import parse_settings
     from hybridmap.cli.show import emit, progress
     from hybridmap.config import Config
-    from hybridmap.evaluate.cells import Scale, rows_of, verify_cells
     from hybridmap.report.folder import prepare_folder
-    from hybridmap.report.verify_page import METRICS, PAGE, write_verification
+    from hybridmap.verification import Scale, rows_of, verify_cells
+    from hybridmap.verification.page import METRICS, PAGE, write_verification
 
     config = Config.load(None, parse_settings(setting))
     prepare_folder(out, "verification", (PAGE, METRICS), overwrite=overwrite)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from hybridmap.config.root import Config
 from hybridmap.errors import StreamError
@@ -12,6 +14,9 @@ from hybridmap.streams.order import Window
 from hybridmap.trajectory import Trajectory
 
 _Opener = Callable[[Path, Config, Window], Stream]
+
+_SIMULATOR = "hybridmap.simulation"
+"""A house of its own above this one, known by name alone."""
 
 EXPECTED = (
     "a simulated world, a ROS 1 bag (.bag), a ROS 2 bag (folder with metadata.yaml, .mcap, .db3), "
@@ -60,9 +65,7 @@ def world_of(source: str | Path) -> str | None:
     name = text.removeprefix("sim:")
     if not explicit and (isinstance(source, Path) or "/" in name or "." in name):
         return None
-    from hybridmap.streams.simulated import world_names
-
-    known = tuple(world_names())
+    known = tuple(_simulator().world_names())
     if name in known:
         return name
     if explicit:
@@ -108,13 +111,15 @@ def open_stream(source: str | Path, config: Config, *, start_s: float | None = N
     window = Window(start_s, end_s)
     world = world_of(source)
     if world is not None:
-        from hybridmap.streams.simulated import SimulatedStream
-
         simulation = config.simulation.model_copy(update={"world": world})
-        stream: Stream = SimulatedStream(simulation, config.seed)
+        stream: Stream = _simulator().SimulatedStream(simulation, config.seed)
         return stream if window == Window() else WindowedStream(stream, window)
     path = Path(source)
     return _OPENERS[kind_of(path)](path, config, window)
+
+
+def _simulator() -> Any:
+    return import_module(_SIMULATOR)
 
 
 class WindowedStream:

@@ -327,7 +327,7 @@ def _expanded(entry: BackendVariant, origin: str) -> list[BackendVariant]:
 def _check(study: StudyConfig, origin: str) -> None:
     """What pydantic cannot see: names given twice, back-ends and worlds that there are not, settings that cannot act."""
     from hybridmap.backends.registry import names
-    from hybridmap.streams.simulated import world_names
+    from hybridmap.simulation import world_names
 
     lists: dict[str, list[str]] = {
         "sources": [source.title for source in study.sources],

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 from hybridmap.cli.app import app
 from hybridmap.config import Config
 from hybridmap.errors import StreamError
+from hybridmap.simulation.writers import write_rosbag1, write_rosbag2, write_tum
 from hybridmap.streams import open_stream
 from hybridmap.streams.inspection import inspect_source
-from hybridmap.streams.writers import write_rosbag1, write_rosbag2, write_tum
 
 
 def _drive(sensors: str):

@@ -10,9 +10,9 @@ import pytest
 from hybridmap.cli import main
 from hybridmap.config import Config
 from hybridmap.evaluate.association import travel
+from hybridmap.simulation import world_names
 from hybridmap.streams import open_stream
 from hybridmap.streams.base import LaserScan
-from hybridmap.streams.simulated import world_names
 
 SHORT = ["--duration", "1", "--set", "simulation.camera.width_px=32", "--set", "simulation.camera.height_px=24"]
 

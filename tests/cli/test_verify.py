@@ -2,11 +2,11 @@ import json
 
 import pytest
 
+import hybridmap.verification as cells
 from hybridmap.cli import main
 from hybridmap.cli.show import emit
-from hybridmap.evaluate import cells
 from hybridmap.metrics import Metric
-from tests.cells_for_tests import TINY
+from tests.verification.cells_for_tests import TINY
 
 
 @pytest.fixture

@@ -16,8 +16,8 @@ from hybridmap.evaluate.candidates import (
     score_matrix,
 )
 from hybridmap.geometry import compose
-from hybridmap.streams.simulated import SimulatedStream
-from hybridmap.streams.simulated.camera import CameraModel
+from hybridmap.simulation import SimulatedStream
+from hybridmap.simulation.camera import CameraModel
 from hybridmap.trajectory import Trajectory
 from hybridmap.vision.profile import image_profile
 

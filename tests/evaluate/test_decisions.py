@@ -15,7 +15,7 @@ from hybridmap.geometry import RelativePose
 from hybridmap.graph.experience_map import Edge, Status
 from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.session import run
-from hybridmap.streams.simulated import SimulatedStream
+from hybridmap.simulation import SimulatedStream
 from tests.store.sessions import ring_map, write_session
 
 SETTINGS = Config.load("rgbd").model_dump(mode="json")

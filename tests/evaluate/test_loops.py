@@ -13,9 +13,9 @@ from hybridmap.evaluate.loops import evaluate_loops, every_mode, profiles_again,
 from hybridmap.evaluate.session import evaluate_session
 from hybridmap.geometry import wrap_angle
 from hybridmap.session import run
+from hybridmap.simulation import SimulatedStream
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.streams.base import Rig
-from hybridmap.streams.simulated import SimulatedStream
 from hybridmap.trajectory import Trajectory
 from tests.store import sessions
 from tests.store.sessions import LASER, SECOND, ring_map, write_session

@@ -1,0 +1,129 @@
+"""The simulated RGB-D camera: a pinhole whose depth has the noise, holes and limits of a structured-light sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.config.simulation import CameraConfig
+from hybridmap.geometry import Array, rotation_from_quaternion
+from hybridmap.simulation.paints import smooth_noise
+from hybridmap.simulation.scene import Hits, Scene
+from hybridmap.streams.base import Camera, RgbdFrame
+
+OPTICAL_QUATERNION_XYZW: tuple[float, float, float, float] = (-0.5, 0.5, -0.5, 0.5)
+"""A level camera that looks along x of `base_link`: optical frame with x right, y down, z forward."""
+_MM_PER_M = 1000.0
+_GRAZING_COSINE = 0.14
+_EDGE_JUMP = 0.06
+_SKY = 205.0
+
+
+def camera_of(config: CameraConfig) -> Camera:
+    """Intrinsics and mounting of the simulated camera."""
+    focal = 0.5 * config.width_px / float(np.tan(np.deg2rad(0.5 * config.field_of_view_deg)))
+    mounting = np.eye(4)
+    mounting[:3, :3] = rotation_from_quaternion(OPTICAL_QUATERNION_XYZW)
+    mounting[:3, 3] = config.forward_m, 0.0, config.height_m
+    center = 0.5 * (config.width_px - 1), 0.5 * (config.height_px - 1)
+    return Camera(config.width_px, config.height_px, focal, focal, *center, mounting)
+
+
+@dataclass(frozen=True, slots=True)
+class _Exposure:
+    """Slow change of brightness: a sum of sines drawn once, so that any frame can be rendered by itself."""
+
+    amplitude: float
+    frequencies_hz: Array
+    phases: Array
+
+    def at(self, time_s: float) -> float:
+        wave = np.sin(2.0 * np.pi * self.frequencies_hz * time_s + self.phases).mean()
+        return float(np.exp(1.6 * self.amplitude * wave))
+
+
+class CameraModel:
+    """Renders frames of one scene."""
+
+    def __init__(self, scene: Scene, config: CameraConfig, rng: np.random.Generator) -> None:
+        self._scene = scene
+        self._config = config
+        self.camera = camera_of(config)
+        columns, rows = np.meshgrid(np.arange(config.width_px), np.arange(config.height_px))
+        c = self.camera
+        ray = np.stack([(columns - c.cx_px) / c.fx_px, (rows - c.cy_px) / c.fy_px, np.ones(columns.shape)], axis=-1)
+        self._rays_base = ray @ c.T_base_camera[:3, :3].T
+        self._ray_length = np.linalg.norm(ray, axis=-1).astype(np.float32)
+        self._exposure = _Exposure(config.exposure_change, rng.uniform(0.02, 0.25, 4), rng.uniform(0, 2 * np.pi, 4))
+
+    def frame(self, stamp_ns: int, time_s: float, pose_world_base: Array, rng: np.random.Generator) -> RgbdFrame:
+        """What the camera sees from a pose.
+
+        Args:
+            stamp_ns: stamp that the frame is given, ns.
+            time_s: time since the drive began, s; the exposure follows it.
+            pose_world_base: (3,) true pose, m and rad.
+            rng: of this frame alone.
+        """
+        cos, sin = np.cos(pose_world_base[2]), np.sin(pose_world_base[2])
+        turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        origin = turn @ self.camera.T_base_camera[:3, 3] + [pose_world_base[0], pose_world_base[1], 0.0]
+        rays = (self._rays_base @ turn.T).astype(np.float32)
+        hits = self._scene.cast(origin, rays)
+        normals = self._scene.normals[hits.surface]
+        cosine = np.abs(np.einsum("hwc,hwc->hw", normals, rays)) / self._ray_length
+        color = self._color(hits, cosine, self._exposure.at(time_s), rng)
+        return RgbdFrame(stamp_ns, color, self._depth(hits, cosine, rng))
+
+    def _color(self, hits: Hits, cosine: NDArray[np.float32], gain: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+        depth = np.where(hits.hit, hits.length, np.float32(self._config.range_max_m))
+        # between the widths of the pixel's footprint along and across the slant
+        slant = 1.0 / np.sqrt(np.maximum(cosine, np.float32(0.03)))
+        footprint = (self._scene.px_per_m[hits.surface] * depth * slant / self.camera.fx_px).astype(np.float32)
+        seen = self._scene.atlas.sample(hits.surface, hits.across, hits.down, footprint)
+        seen[~hits.hit] = _SKY
+        seen *= np.float32(gain)
+        seen += np.float32(self._config.color_noise) * rng.standard_normal(seen.shape, dtype=np.float32)
+        return np.asarray(np.clip(seen + np.float32(0.5), 0, 255), dtype=np.uint8)
+
+    def _depth(self, hits: Hits, cosine: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+        """Depth (H, W) float32 in whole millimetres; axial noise after Nguyen et al. 2012, growing with z^2."""
+        config = self._config
+        z = np.where(hits.hit, hits.length, np.float32(99.0))
+        sigma = config.depth_noise_m + config.depth_noise_per_m * (z - 0.4) ** 2
+        noisy = z + sigma.astype(np.float32) * self._noise(z.shape, rng)
+        lost = (
+            ~hits.hit
+            | ~self._scene.in_depth[hits.surface]
+            | (cosine < _GRAZING_COSINE * rng.random(z.shape, dtype=np.float32) ** 0.5)
+        )
+        lost |= self._shadow(z, rng) | self._patches(z.shape, rng)
+        lost |= (noisy < config.range_min_m) | (noisy > config.range_max_m)
+        millimetres = np.where(lost, 0.0, np.rint(noisy.astype(np.float64) * _MM_PER_M))
+        return (millimetres / _MM_PER_M).astype(np.float32)
+
+    def _noise(self, shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float32]:
+        """Noise (H, W) of unit deviation, alike in neighbouring pixels because they share most of a matching window."""
+        white = rng.standard_normal(shape, dtype=np.float32)
+        width = self._config.depth_noise_width_px
+        if width <= 0.0:
+            return white
+        kernel = cv2.getGaussianKernel(2 * int(np.ceil(3.0 * width)) + 1, width, cv2.CV_32F)
+        kernel /= np.linalg.norm(kernel)
+        return np.asarray(cv2.sepFilter2D(white, -1, kernel, kernel), dtype=np.float32)
+
+    def _shadow(self, z: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bool_]:
+        """Pixels beside a jump in depth, where the projected pattern does not reach or is torn."""
+        low = cv2.erode(z, np.ones((3, 3), np.uint8))
+        torn = (z - low) > _EDGE_JUMP * z
+        return np.asarray(torn & (rng.random(z.shape, dtype=np.float32) < 0.75))
+
+    def _patches(self, shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.bool_]:
+        """Blobs without depth, as dark or shiny spots give."""
+        if self._config.hole_fraction <= 0.0:
+            return np.zeros(shape, dtype=np.bool_)
+        field = smooth_noise(rng, (shape[0], shape[1]), shape[1] / 28.0)
+        return np.asarray(field > np.quantile(field, 1.0 - self._config.hole_fraction))

@@ -1,0 +1,47 @@
+"""The simulated planar laser."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.config.simulation import LaserScannerConfig
+from hybridmap.geometry import Array
+from hybridmap.simulation.scene import Scene
+from hybridmap.streams.base import Laser, LaserScan
+
+
+def laser_of(config: LaserScannerConfig) -> Laser:
+    """Bearings and mounting; bearings are those that a LaserScan message with its 32-bit angles gives."""
+    field = np.deg2rad(config.field_of_view_deg)
+    steps = config.beams if config.field_of_view_deg >= 360.0 else config.beams - 1
+    first, step = float(np.float32(-0.5 * field)), float(np.float32(field / steps))
+    bearings = first + np.arange(config.beams, dtype=np.float64) * step
+    low, high = (float(np.float32(value)) for value in (config.range_min_m, config.range_max_m))
+    return Laser(bearings, low, high, np.array([config.forward_m, 0.0, 0.0]))
+
+
+class LaserModel:
+    """Scans one scene in a plane parallel to the floor."""
+
+    def __init__(self, scene: Scene, config: LaserScannerConfig) -> None:
+        self._scene = scene
+        self._config = config
+        self.laser = laser_of(config)
+
+    def scan(self, stamp_ns: int, pose_world_base: Array, rng: np.random.Generator) -> LaserScan:
+        """What the laser measures from a pose (3,), m and rad, with the noise of `rng`."""
+        x, y, yaw = pose_world_base
+        angle = self.laser.bearings_rad + yaw
+        rays = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))]).astype(np.float32)
+        forward = self._config.forward_m
+        origin = np.array([x + forward * np.cos(yaw), y + forward * np.sin(yaw), self._config.height_m])
+        hits = self._scene.cast(origin, rays)
+        ranges = np.where(hits.hit, hits.length, np.inf).astype(np.float64)
+        ranges = ranges + self._config.noise_m * rng.standard_normal(len(ranges))
+        dropped = rng.random(len(ranges)) < self._config.drop_fraction
+        return LaserScan(stamp_ns, self._valid(ranges.astype(np.float32), dropped))
+
+    def _valid(self, ranges: NDArray[np.float32], dropped: NDArray[np.bool_]) -> NDArray[np.float32]:
+        inside = (ranges >= np.float32(self.laser.range_min_m)) & (ranges < np.float32(self.laser.range_max_m))
+        return np.where(inside & ~dropped, ranges, np.float32(np.nan))

@@ -1,0 +1,174 @@
+"""The simulated stream: a world, a drive through it, and what wheels, camera and laser make of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.config.simulation import SimulationConfig
+from hybridmap.errors import ConfigError
+from hybridmap.geometry import Array
+from hybridmap.simulation.carry import Carry, carry
+from hybridmap.simulation.drive import DriveLimits, drive
+from hybridmap.simulation.surfaces import World
+from hybridmap.simulation.wheels import as_transmitted, wheel_odometry
+from hybridmap.simulation.worlds import build_world
+from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion, StreamReport
+from hybridmap.trajectory import NS_PER_S, Trajectory
+
+if TYPE_CHECKING:
+    from hybridmap.simulation.scene import Scene
+
+_START_NS = 1_700_000_000 * NS_PER_S
+_WHEELS, _CAMERA, _LASER = range(3)
+
+
+class SimulatedStream:
+    """A drive through a simulated world.
+
+    The drive and the world are the same for every seed; the seed draws the errors of the sensors. Whatever is yielded has
+    been rounded to what bags and folders hold, so that a recording of the stream reads back to the same bits.
+    """
+
+    def __init__(self, config: SimulationConfig, seed: int) -> None:
+        """Prepare a drive; the world is rendered while iterating.
+
+        Args:
+            config: world, drive, sensors.
+            seed: of the sensors' errors.
+
+        Raises:
+            ConfigError: there is no such world, or no known place in it to carry the robot to.
+        """
+        self._config = config
+        self._seed = seed
+        self._world: World = build_world(config.world)
+        self._report = StreamReport()
+        step_s = 1.0 / config.odometry_rate_hz
+        truth = felt = drive(self._world.legs, DriveLimits(config.speed_m_s, config.turn_rate_rad_s), step_s)
+        self._carry = None if config.carried_m is None else carry(truth, config.carried_m, step_s)
+        if self._carry is not None:
+            truth, felt = self._carry.truth, self._carry.felt
+        odometry = wheel_odometry(felt, config.wheels, self._generators()[_WHEELS])
+        count = len(truth) if config.duration_s is None else max(3, int(config.duration_s * config.odometry_rate_hz) + 1)
+        stamps = _stamps_ns(len(truth), config.odometry_rate_hz)[:count]
+        self._truth = Trajectory(stamps, np.column_stack([truth[:, :2], as_transmitted(truth[:, 2])])[:count])
+        self._odometry = Trajectory(stamps, odometry[:count])
+        if self._carry is not None and self._carry.last >= count:
+            raise ConfigError(
+                f"simulation.carried_m: the robot is put down again after {self._carry.last * step_s:.1f} s, "
+                f"but the drive ends after {config.duration_s:g} s; make simulation.duration_s longer"
+            )
+
+    @property
+    def name(self) -> str:
+        """The world's name."""
+        return self._world.name
+
+    @cached_property
+    def rig(self) -> Rig:
+        """The sensors that the configuration asks for."""
+        from hybridmap.simulation.camera import camera_of
+        from hybridmap.simulation.laser import laser_of
+
+        camera = camera_of(self._config.camera) if self._config.sensors != "laser" else None
+        laser = laser_of(self._config.laser) if self._config.sensors != "rgbd" else None
+        return Rig(camera, laser)
+
+    @property
+    def groundtruth(self) -> Trajectory:
+        """True poses of `base_link` in the world at the stamps of the odometry."""
+        return self._truth
+
+    @property
+    def odometry(self) -> Trajectory:
+        """What the wheels report: poses of `base_link` in `odom`."""
+        return self._odometry
+
+    @property
+    def carry(self) -> Carry | None:
+        """When the robot is carried, and how far; None where it never is."""
+        return self._carry
+
+    @property
+    def expected_observations(self) -> int:
+        """Frames and scans to come."""
+        return sum(len(stamps) for stamps in (self._frame_stamps, self._scan_stamps))
+
+    @property
+    def report(self) -> StreamReport:
+        """Counts of the last iteration."""
+        return self._report
+
+    def __iter__(self) -> Iterator[Sample]:
+        """Yield odometry, frames and scans by stamp; at equal stamps in this order."""
+        self._report = StreamReport()
+        observations = self._observations()
+        waiting = next(observations, None)
+        for stamp, pose in zip(self._odometry.stamps_ns, self._odometry.poses, strict=True):
+            while waiting is not None and waiting.stamp_ns < stamp:
+                yield waiting
+                waiting = next(observations, None)
+            self._report.count("odometry")
+            yield SelfMotion(int(stamp), pose.copy())
+        while waiting is not None:
+            yield waiting
+            waiting = next(observations, None)
+
+    def _observations(self) -> Iterator[Observation]:
+        from hybridmap.simulation.camera import CameraModel
+        from hybridmap.simulation.laser import LaserModel
+
+        generators = self._generators()
+        camera = CameraModel(self._scene, self._config.camera, generators[_CAMERA])
+        laser = LaserModel(self._scene, self._config.laser)
+        frame_noise = generators[_CAMERA].spawn(len(self._frame_stamps))
+        scan_noise = generators[_LASER].spawn(len(self._scan_stamps))
+        due = [(int(stamp), 0, index) for index, stamp in enumerate(self._frame_stamps)]
+        due += [(int(stamp), 1, index) for index, stamp in enumerate(self._scan_stamps)]
+        for stamp, kind, index in sorted(due):
+            pose = self._true_pose(stamp)
+            if kind == 0:
+                self._report.count("frames")
+                yield camera.frame(stamp, (stamp - _START_NS) / NS_PER_S, pose, frame_noise[index])
+            else:
+                self._report.count("scans")
+                yield laser.scan(stamp, pose, scan_noise[index])
+
+    def _true_pose(self, stamp_ns: int) -> Array:
+        return np.asarray(self._truth.at([stamp_ns])[0])
+
+    @cached_property
+    def _scene(self) -> Scene:
+        from hybridmap.simulation.scene import Scene
+
+        return Scene(self._world)
+
+    @cached_property
+    def _frame_stamps(self) -> NDArray[np.int64]:
+        return self._stamps_of(self._config.camera.rate_hz, wanted=self._config.sensors != "laser")
+
+    @cached_property
+    def _scan_stamps(self) -> NDArray[np.int64]:
+        return self._stamps_of(self._config.laser.rate_hz, wanted=self._config.sensors != "rgbd")
+
+    def _stamps_of(self, rate_hz: float, *, wanted: bool) -> NDArray[np.int64]:
+        span_s = float(self._truth.stamps_ns[-1] - _START_NS) / NS_PER_S
+        stamps = _stamps_ns(int(span_s * rate_hz) + 2 if wanted else 0, rate_hz)
+        stamps = np.asarray(stamps[stamps <= self._truth.stamps_ns[-1]])
+        if self._carry is None:
+            return stamps
+        up, down = self._truth.stamps_ns[self._carry.first], self._truth.stamps_ns[self._carry.last]
+        return np.asarray(stamps[(stamps <= up) | (stamps >= down)])
+
+    def _generators(self) -> list[np.random.Generator]:
+        return np.random.default_rng(self._seed).spawn(3)
+
+
+def _stamps_ns(count: int, rate_hz: float) -> NDArray[np.int64]:
+    since_start = np.rint(np.arange(count) * (NS_PER_S / rate_hz)).astype(np.int64)
+    return np.asarray(_START_NS + since_start, dtype=np.int64)

@@ -1,0 +1,33 @@
+"""The worlds by name; each is built only when it is asked for."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+from hybridmap.errors import ConfigError
+from hybridmap.simulation.surfaces import World
+
+_BUILDERS: dict[str, tuple[str, str]] = {
+    "lab": ("lab", "lab"),
+    "office": ("office", "office"),
+    "corridor": ("corridor", "corridor"),
+    "corridor-landmarks": ("corridor", "corridor_landmarks"),
+}
+
+
+def world_names() -> tuple[str, ...]:
+    """Names of the worlds that can be simulated."""
+    return tuple(_BUILDERS)
+
+
+def build_world(name: str) -> World:
+    """Build a world.
+
+    Raises:
+        ConfigError: there is none of that name.
+    """
+    if name not in _BUILDERS:
+        raise ConfigError(f"simulation.world: no world called {name!r}; there are {', '.join(_BUILDERS)}")
+    module, function = _BUILDERS[name]
+    world: World = getattr(import_module(f"{__name__}.{module}"), function)()
+    return world

@@ -1,0 +1,147 @@
+"""The path integrator against exact integration of the same input, read from its activity only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridmap import geometry
+from hybridmap.config.neural import NeuralConfig
+from hybridmap.geometry import Array
+from hybridmap.neural import PathIntegrator
+from hybridmap.neural.head_direction import HeadDirectionRing
+from hybridmap.verification.drives import Drive, corridor, wander
+
+_NODE_M = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class PathErrors:
+    """Errors along a drive, taken every half metre, as a mapper reads the pose at its nodes.
+
+    Attributes:
+        distance_m: (S,) driven.
+        module: (S, M) error of each module's phase, as a share of its spacing.
+        position_m: (S,) error of the position decoded from all modules together.
+        heading_rad: (S,) error of the decoded heading.
+    """
+
+    distance_m: Array
+    module: Array
+    position_m: Array
+    heading_rad: Array
+
+
+def path_errors(config: NeuralConfig, drive: Drive, rng: np.random.Generator | None = None) -> PathErrors:
+    """Drive a new path integrator and compare it with the exact poses; `rng` is of the neuron noise."""
+    integrator = PathIntegrator(config, rng)
+    dt, next_m = 1.0 / drive.hz, 0.0
+    rows: list[tuple[float, Array, float, float]] = []
+    last = len(drive.deltas) - 1
+    for k, delta in enumerate(drive.deltas):
+        integrator.step(delta, dt)
+        if drive.distance_m[k] < next_m and k != last:
+            continue
+        next_m += _NODE_M
+        pose, exact = integrator.pose, drive.poses[k]
+        away = float(np.hypot(*(pose[:2] - exact[:2])))
+        turned = abs(float(geometry.wrap_angle(pose[2] - exact[2])))
+        rows.append((float(drive.distance_m[k]), integrator.module_errors(exact), away, turned))
+    distance, module, position, heading = zip(*rows, strict=True)
+    return PathErrors(np.array(distance), np.array(module), np.array(position), np.array(heading))
+
+
+def room_errors(seed: np.random.SeedSequence, settings: dict[str, object], distance_m: float, hz: float) -> PathErrors:
+    """Errors of cells with these settings on a drive through the 10 x 3 m room."""
+    drive = wander(np.random.default_rng(seed), distance_m, hz)
+    return path_errors(NeuralConfig.model_validate(settings), drive)
+
+
+def corridor_errors(seed: np.random.SeedSequence, settings: dict[str, object]) -> PathErrors:
+    """Errors of cells with these settings on a drive down the 16.8 m corridor, 30 Hz."""
+    return path_errors(NeuralConfig.model_validate(settings), corridor(np.random.default_rng(seed), 30.0))
+
+
+def noise_errors(
+    drive_seed: np.random.SeedSequence,
+    noise_seed: np.random.SeedSequence,
+    settings: dict[str, object],
+    noise: float,
+    distance_m: float,
+) -> PathErrors:
+    """Errors of cells with multiplicative neuron noise in every population, on a drive through the room, 30 Hz."""
+    drive = wander(np.random.default_rng(drive_seed), distance_m, 30.0)
+    config = NeuralConfig.model_validate(settings | {"neuron_noise": noise})
+    return path_errors(config, drive, np.random.default_rng(noise_seed))
+
+
+@dataclass(frozen=True, slots=True)
+class HeadDirectionResult:
+    """The head-direction ring after many turns.
+
+    Attributes:
+        error_rad: error of the decoded heading after the last of the turns, by precision.
+        preferred_rad: (m,) preferred directions.
+        tuning: (6, 360) rates of six cells at headings of 0 to 359 degrees.
+        turn_rates_rad_s: (R,) turn rates of `rates`.
+        rates: (R, m) rates shown at those turn rates (`HeadDirectionRing.rates`; no other cell sees them).
+    """
+
+    error_rad: dict[str, float]
+    preferred_rad: Array
+    tuning: Array
+    turn_rates_rad_s: Array
+    rates: Array
+
+
+def head_direction(seed: np.random.SeedSequence, settings: dict[str, object], steps: int) -> HeadDirectionResult:
+    """Turn rings of both precisions by the same random turns and compare with their sum."""
+    turns = np.random.default_rng(seed).normal(0.002, 0.02, steps)
+    cells = NeuralConfig.model_validate(settings).head_direction_cells
+    errors = {}
+    for dtype in ("float64", "float32"):
+        ring = HeadDirectionRing(cells, np.dtype(dtype))
+        for turn in turns:
+            ring.turn(float(turn))
+        errors[dtype] = abs(float(geometry.wrap_angle(ring.heading_rad - turns.sum())))
+    ring = HeadDirectionRing(cells)
+    tuning = []
+    for _ in range(360):
+        tuning.append(ring.activity[:: len(ring.activity) // 6][:6].copy())
+        ring.turn(np.radians(1.0))
+    turn_rates = np.array([0.0, 0.5, 1.0, 2.0])
+    rates = np.array([ring.rates(float(rate)) for rate in turn_rates])
+    return HeadDirectionResult(errors, ring.preferred_rad, np.array(tuning).T, turn_rates, rates)
+
+
+@dataclass(frozen=True, slots=True)
+class StandstillResult:
+    """Standing still.
+
+    Attributes:
+        pose_change: largest change of a coordinate of the pose over the steps without motion, m or rad.
+        ungated: by rectifier, how far a sheet crept when its dynamics ran on all the same, as a share of the spacing.
+    """
+
+    pose_change: float
+    ungated: dict[str, float]
+
+
+def standstill(seed: np.random.SeedSequence, settings: dict[str, object], steps: int) -> StandstillResult:
+    """Drive two metres, then stand; once as the integrator does, once with the dynamics of rings and sheets running on."""
+    drive = wander(np.random.default_rng(seed), 2.0, 30.0)
+    ungated, change = {}, 0.0
+    for rectifier in ("relu", "softplus"):
+        integrator = PathIntegrator(NeuralConfig.model_validate(settings | {"rectifier": rectifier}))
+        for delta in drive.deltas:
+            integrator.step(delta, 1.0 / drive.hz)
+        before = integrator.pose
+        for _ in range(steps):
+            integrator.step((0.0, 0.0, 0.0), 1.0 / drive.hz)
+        change = max(change, float(np.abs(integrator.pose - before).max()))
+        for _ in range(steps // 20):
+            motion = integrator.bands.step(np.zeros(2))
+            integrator.grid.step(motion.advance, motion.phasors)
+        ungated[rectifier] = float(integrator.module_errors(drive.poses[-1]).max())
+    return StandstillResult(change, ungated)

@@ -1,0 +1,241 @@
+"""The table of the verification: one figure a row, with its bar."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hybridmap.geometry import Array
+from hybridmap.metrics import Metric
+from hybridmap.verification.path_error import PathErrors
+from hybridmap.verification.physiology import gridness, ideal_map
+from hybridmap.verification.rate_maps import PlaceResult
+from hybridmap.verification.shadow import STEPS_ON
+from hybridmap.verification.verification import Verification
+
+PHASE_BAR_PERCENT = {"relu": 0.6, "softplus": 0.02}
+ROOM_BAR_MM, CORRIDOR_BAR_MM = 0.5, 0.1
+_SHADOW_BAR = 1e-6
+_ONE_BUMP_BAR_PERCENT = 99.0
+_LEARNT = {"recruited": "recruited place cells", "printed": "place cells by the printed rule"}
+_AT_MOST, _AT_LEAST = "at most", "at least"
+
+
+def rows_of(result: Verification) -> list[Metric]:
+    """Every row of the table, `verify/<row>`; those with a bar say whether they keep to it."""
+    parts: Sequence[Callable[[Verification], list[Metric]]] = (
+        head_direction_rows,
+        band_rows,
+        gridness_rows,
+        phase_rows,
+        position_rows,
+        shadow_rows,
+        place_rows,
+        recurrence_rows,
+        standstill_rows,
+        noise_rows,
+        kernel_rows,
+    )
+    return [row for part in parts for row in part(result)]
+
+
+def _row(name: str, value: float, unit: str, description: str, bar: float | None = None, side: str = _AT_MOST) -> Metric:
+    if bar is None:
+        return Metric(f"verify/{name}", value, unit, description)
+    passed = value >= bar if side == _AT_LEAST else value <= bar  # NaN passes neither
+    return Metric(f"verify/{name}", value, unit, f"{description}; {side} {bar:g}", bar, bool(passed))
+
+
+def head_direction_rows(result: Verification) -> list[Metric]:
+    """The decoded heading after many turns, and the turn-rate modulation."""
+    heading = result.head_direction
+    gain = float(heading.rates[-1].max() / heading.rates[0].max())
+    fastest = heading.turn_rates_rad_s[-1]
+    return [
+        _row(
+            "head_direction_float64", heading.error_rad["float64"], "rad", "decoded heading against the sum of the turns", 1e-9
+        ),
+        _row("head_direction_float32", heading.error_rad["float32"], "rad", "the same in float32", 1e-3),
+        _row(
+            "turn_rate_modulation",
+            gain,
+            "1",
+            f"peak rate shown at {fastest:g} rad/s over that at rest; for display, no other cell sees it",
+        ),
+    ]
+
+
+def band_rows(result: Verification) -> list[Metric]:
+    """Orientation and period of every band, from rate maps of the rings' activity."""
+    lattice = result.lattice
+    orientation = float(lattice.band_orientation_error_deg.max())
+    period = 100.0 * float(lattice.band_period_error.max())
+    return [
+        _row("band_orientation", orientation, "deg", "worst band, from the FFT of its rate map", 0.5),
+        _row("band_period", period, "%", "worst band, from the FFT of its rate map", 2.0),
+    ]
+
+
+def gridness_rows(result: Verification) -> list[Metric]:
+    """Gridness of the sampled cells, of an ideal map, and of the square metric."""
+    scores = result.lattice.gridness
+    spacings = result.lattice.spacings_m / result.lattice.pitch_m
+    side = result.lattice.grid.shape[-1]
+    ideal = min(gridness(ideal_map(side, spacing, 0.1)) for spacing in spacings)
+    return [
+        _row(
+            "gridness", float(scores.min()), "1", f"worst of {scores.size} grid cells in {len(scores)} modules", 1.1, _AT_LEAST
+        ),
+        _row("gridness_median", float(np.median(scores)), "1", "median of the same cells"),
+        _row("gridness_ideal", ideal, "1", "ideal map (three plane waves) of the same size, by the same code"),
+        _row("gridness_square", float(np.median(result.square.gridness)), "1", "median with orthogonal bands, square metric"),
+    ]
+
+
+def phase_rows(result: Verification) -> list[Metric]:
+    """The worst module's phase error of all drives, by rectifier and rate."""
+    return [
+        _row(
+            f"phase_error_{rectifier}_{hz:g}hz",
+            100.0 * max(float(path.module.max()) for path in paths),
+            "%",
+            f"of the spacing: worst module on {len(paths)} drives of {paths[0].distance_m[-1]:.0f} m",
+            PHASE_BAR_PERCENT[rectifier],
+        )
+        for (rectifier, hz), paths in result.room.items()
+    ]
+
+
+def position_rows(result: Verification) -> list[Metric]:
+    """The position decoded from all modules together: in the room and down the corridor."""
+    rows = []
+    for rectifier, corridor in result.corridor.items():
+        drives = [path for (f, _), paths in result.room.items() if f == rectifier for path in paths]
+        room = 1e3 * max(float(path.position_m.max()) for path in drives)
+        what = f"all modules together, largest error on {len(drives)} drives in 10 x 3 m"
+        rows.append(_row(f"position_room_{rectifier}", room, "mm", what, ROOM_BAR_MM))
+        down = 1e3 * float(corridor.position_m.max())
+        rows.append(_row(f"position_corridor_{rectifier}", down, "mm", "the same down a 16.8 m corridor", CORRIDOR_BAR_MM))
+    return rows
+
+
+def shadow_rows(result: Verification) -> list[Metric]:
+    """Whether an overwritten activity moves the pose by exactly that, and which cells hold the position."""
+    at_once = "spacings by which the pose misses a shift written into the sheets"
+    on = f"the same with rings and sheets shifted together, largest over {STEPS_ON} steps of driving on"
+    rows = [
+        row
+        for rectifier, ending, bar in (("softplus", "", _SHADOW_BAR), ("relu", "_relu", None))
+        for row in (
+            _row(f"no_shadow_integrator{ending}", float(result.overwritten[rectifier].at_once.max()), "1", at_once, bar),
+            _row(f"no_shadow_driving_on{ending}", result.overwritten[rectifier].driving_on, "1", on, bar),
+        )
+    ]
+    shown, shift_mm = result.overwritten["softplus"].shown, 1e3 * result.overwritten["softplus"].shift_m
+    for stripes, ending, how in ((True, "", ""), (False, "_without_stripes", " (band_drive 0)")):
+        for cells in ("sheets", "rings"):
+            what = f"of {shift_mm:.0f} mm written into the {cells} alone is in the pose {STEPS_ON} steps later{how}, softplus"
+            rows.append(_row(f"shift_of_{cells}{ending}", 100.0 * float(shown[cells, stripes][-1]), "%", what))
+    return rows
+
+
+def place_rows(result: Verification) -> list[Metric]:
+    """Single fields with and without recruitment."""
+    place = result.place
+    recruited = f"of {len(place.recruited.fields)} recruited place cells have one field"
+    printed = f"of {len(place.printed.fields)} cells by the printed rule have one field"
+    return [
+        _row("place_single_recruited", 100.0 * place.recruited.single, "%", recruited, 95.0, _AT_LEAST),
+        _row("place_single_printed", 100.0 * place.printed.single, "%", printed),
+    ]
+
+
+def recurrence_rows(result: Verification) -> list[Metric]:
+    """What settled recurrent competition on the attractor's sheet adds, whichever way it comes out."""
+    rows, place = [], result.place
+    for learnt, cells in _LEARNT.items():
+        for stage, how in (("input", "without competition"), ("settled", "after settled competition")):
+            bumps = f"of the places at which the attractor's sheet holds one bump, {how}, driven by {cells}"
+            bar = _ONE_BUMP_BAR_PERCENT if stage == "settled" else None
+            one_bump = 100.0 * place.one_bump[learnt, stage]
+            rows.append(_row(f"attractor_one_bump_{learnt}_{stage}", one_bump, "%", bumps, bar, _AT_LEAST))
+            what = f"of the attractor's cells have one field, {how}, driven by {cells}"
+            rows.append(_row(f"attractor_single_{learnt}_{stage}", 100.0 * place.sheet[learnt, stage].single, "%", what))
+    return rows
+
+
+def recurrence_verdict(place: PlaceResult) -> str:
+    """In words: what recurrence adds."""
+    sentences = []
+    for learnt, cells in _LEARNT.items():
+        before, after = (100.0 * place.sheet[learnt, stage].single for stage in ("input", "settled"))
+        several, one = (100.0 * place.one_bump[learnt, stage] for stage in ("input", "settled"))
+        sentences.append(
+            f"Behind {cells}, settled competition {_change(after - before)} the share of the attractor's cells with a single "
+            f"field ({before:.1f} % before, {after:.1f} % after). The sheet holds one bump at a time in {several:.1f} % of the "
+            f"places before and in {one:.1f} % after."
+        )
+    return " ".join(sentences)
+
+
+def _change(percent: float) -> str:
+    """The verb for a change by some per cent of all cells."""
+    if abs(percent) < 0.5:
+        return "does not change"
+    return "hardly changes" if abs(percent) < 5.0 else "raises" if percent > 0.0 else "lowers"
+
+
+def standstill_rows(result: Verification) -> list[Metric]:
+    """Standing still: as the integrator does, and with the dynamics running on."""
+    still = result.standstill
+    rows = [_row("standing_still", still.pose_change, "m", "largest change of the pose over all steps without motion", 0.0)]
+    for rectifier, crept in still.ungated.items():
+        what = f"of the spacing that the worst sheet crept with its dynamics running on, {rectifier}"
+        rows.append(_row(f"standing_still_ungated_{rectifier}", 100.0 * crept, "%", what))
+    return rows
+
+
+def noise_rows(result: Verification) -> list[Metric]:
+    """Where noisy neurons lead."""
+    rows = []
+    for share, drives in result.noise.items():
+        curve = noise_curve(drives)
+        low, high = curve.quartiles[:, -1]
+        what = (
+            f"RMS position error of {len(drives)} drives after {curve.distance_m[-1]:.0f} m with {100.0 * share:g} % noise on "
+            f"every rate, every step; half of them between {low:.3g} and {high:.3g} m"
+        )
+        rows.append(_row(f"noise_{100.0 * share:g}_percent", float(curve.rms[-1]), "m", what))
+    return rows
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseCurve:
+    """Errors of several drives over distance.
+
+    Attributes:
+        distance_m: (S,) that all drives have in common.
+        rms: (S,) over the drives.
+        quartiles: (2, S) between which half of the drives are.
+    """
+
+    distance_m: Array
+    rms: Array
+    quartiles: Array
+
+
+def noise_curve(drives: Sequence[PathErrors], what: Literal["position_m", "heading_rad"] = "position_m") -> NoiseCurve:
+    """Position errors, m, or heading errors, rad, of drives with noise."""
+    count = min(len(drive.distance_m) for drive in drives)
+    errors = np.array([getattr(drive, what)[:count] for drive in drives])
+    rms = np.sqrt((errors**2).mean(axis=0))
+    return NoiseCurve(drives[0].distance_m[:count], rms, np.quantile(errors, (0.25, 0.75), axis=0))
+
+
+def kernel_rows(result: Verification) -> list[Metric]:
+    """Whether the printed kernel's instability is noticed and named."""
+    named = float("do not settle" in result.printed_kernel)
+    return [_row("printed_kernel_refused", named, "1", "the instability of the printed kernel is named", 1.0, _AT_LEAST)]

@@ -1,0 +1,198 @@
+"""Run every experiment of the verification, on as many cores as there are."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from hybridmap.config.neural import NeuralConfig
+from hybridmap.errors import ConfigError
+from hybridmap.neural import PathIntegrator
+from hybridmap.verification import path_error, rate_maps, shadow
+from hybridmap.verification.path_error import HeadDirectionResult, PathErrors, StandstillResult
+from hybridmap.verification.rate_maps import LatticeMaps, PlaceResult
+from hybridmap.verification.shadow import Overwriting
+
+RECTIFIERS = ("relu", "softplus")
+RATES_HZ = (30.0, 100.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """How much is run; the defaults are what the bars are stated for.
+
+    Attributes:
+        paths: drives through the room, each of `distance_m`, at each rate with each rectifier.
+        heading_steps, still_steps, overwrites: numbers of steps and of draws.
+        overwritten_drives: directions in which cells are shifted before driving on.
+        arena_m, lattice_pitch_m, lattice_cells: side and pixel of the grid cells' arena, sampled cells a module.
+        place_pitch_m, place_cells, place_epochs: pixel of the place cells' maps; cells and passes of the printed rule.
+        noise: standard deviations of the neuron noise; `noise_repeats` drives of `noise_distance_m` for each.
+        workers: processes; None: as many as there are cores.
+    """
+
+    paths: int = 5
+    distance_m: float = 240.0
+    heading_steps: int = 24_000
+    still_steps: int = 100_000
+    overwrites: int = 20
+    overwritten_drives: int = 2
+    arena_m: float = 1.6
+    lattice_pitch_m: float = 0.0125
+    lattice_cells: int = 6
+    place_pitch_m: float = 0.02
+    place_cells: int = 512
+    place_epochs: int = 10
+    noise: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1)
+    noise_repeats: int = 12
+    noise_distance_m: float = 40.0
+    workers: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """What the experiments gave.
+
+    Attributes:
+        head_direction, standstill: the ring after many turns; standing still.
+        lattice, square: maps on the hexagonal and on the square metric.
+        place: place fields.
+        room: errors of every drive through the room, by (rectifier, rate in Hz).
+        corridor: errors down the corridor, by rectifier.
+        overwritten: what the pose shows of a shift written into cells, by rectifier.
+        noise: errors of every drive with neuron noise, by its standard deviation.
+        printed_kernel: what the cells say of the printed kernel; empty if they accept it.
+    """
+
+    head_direction: HeadDirectionResult
+    standstill: StandstillResult
+    lattice: LatticeMaps
+    square: LatticeMaps
+    place: PlaceResult
+    room: dict[tuple[str, float], list[PathErrors]] = field(default_factory=dict)
+    corridor: dict[str, PathErrors] = field(default_factory=dict)
+    overwritten: dict[str, Overwriting] = field(default_factory=dict)
+    noise: dict[float, list[PathErrors]] = field(default_factory=dict)
+    printed_kernel: str = ""
+
+
+Task = tuple[Callable[..., Any], tuple[Any, ...]]
+
+
+def verify_cells(
+    seed: int, scale: Scale, settings: dict[str, object], progress: Callable[[int, int | None], None] | None = None
+) -> Verification:
+    """Run every experiment; the same seed gives the same figures, on any number of cores.
+
+    Args:
+        seed: of all drives, samples and noises.
+        scale: how much is run.
+        settings: of the cells (`NeuralConfig`), besides what an experiment varies.
+        progress: called with the number of experiments done and of all.
+
+    Raises:
+        ConfigError: with these settings no cells can be made.
+    """
+    PathIntegrator(NeuralConfig.model_validate(settings))  # fails at once if it cannot be made
+    tasks = _tasks(np.random.SeedSequence(seed), scale, settings)
+    done = _run(tasks, scale.workers, progress or (lambda _done, _total: None))
+    parts: dict[str, Any] = {key[0]: value for key, value in done.items() if len(key) == 1}
+    return Verification(
+        **parts,
+        room={(f, hz): [done["room", f, hz, k] for k in range(scale.paths)] for f in RECTIFIERS for hz in RATES_HZ},
+        corridor={f: done["corridor", f] for f in RECTIFIERS},
+        overwritten={f: done["overwritten", f] for f in RECTIFIERS},
+        noise={share: [done["noise", share, k] for k in range(scale.noise_repeats)] for share in scale.noise},
+    )
+
+
+def _tasks(seed: np.random.SeedSequence, scale: Scale, settings: dict[str, object]) -> dict[tuple[Any, ...], Task]:
+    """Every experiment by name, the longest first; each has a seed of its own."""
+    paths, others, noises = seed.spawn(3)
+    path_seeds = paths.spawn(scale.paths)
+    still, turns, lattice, square, place, corridor, overwritten = others.spawn(7)
+    tasks: dict[tuple[Any, ...], Task] = {}
+    for hz in reversed(RATES_HZ):
+        for f in reversed(RECTIFIERS):
+            for k, path_seed in enumerate(path_seeds):
+                tasks["room", f, hz, k] = path_error.room_errors, (path_seed, settings | {"rectifier": f}, scale.distance_m, hz)
+    pitch, cells = scale.lattice_pitch_m, scale.lattice_cells
+    tasks["place",] = (
+        rate_maps.place_maps,
+        (place, settings, scale.arena_m, scale.place_pitch_m, scale.place_cells, scale.place_epochs),
+    )
+    tasks["lattice",] = rate_maps.lattice_maps, (lattice, settings, scale.arena_m, pitch, cells)
+    tasks["square",] = rate_maps.lattice_maps, (square, settings | {"metric": "square"}, scale.arena_m, pitch, cells)
+    for k, one in enumerate(noises.spawn(scale.noise_repeats)):
+        drive_seed, noise_seed = one.spawn(2)
+        for share in scale.noise:  # the same drives and draws for all, so that what differs is the noise
+            arguments = (drive_seed, noise_seed, settings, share, scale.noise_distance_m)
+            tasks["noise", share, k] = path_error.noise_errors, arguments
+    tasks["standstill",] = path_error.standstill, (still, settings, scale.still_steps)
+    tasks["head_direction",] = path_error.head_direction, (turns, settings, scale.heading_steps)
+    for f in RECTIFIERS:
+        tasks["corridor", f] = path_error.corridor_errors, (corridor, settings | {"rectifier": f})
+        tasks["overwritten", f] = (
+            shadow.overwritten,
+            (overwritten, settings | {"rectifier": f}, scale.overwrites, scale.overwritten_drives),
+        )
+    tasks["printed_kernel",] = printed_kernel, (settings,)
+    return tasks
+
+
+def printed_kernel(settings: dict[str, object]) -> str:
+    """What the cells say of the printed kernel with these settings; empty if they accept it."""
+    try:
+        PathIntegrator(NeuralConfig.model_validate(settings | {"kernel": "printed"}))
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
+def _run(
+    tasks: dict[tuple[Any, ...], Task], workers: int | None, progress: Callable[[int, int | None], None]
+) -> dict[tuple[Any, ...], Any]:
+    """Run the tasks in processes, or here if there is to be one only."""
+    count = min(workers or os.cpu_count() or 1, len(tasks))
+    done = {}
+    if count == 1:
+        for number, (key, (function, arguments)) in enumerate(tasks.items()):
+            progress(number, len(tasks))
+            done[key] = function(*arguments)
+        return done
+    with _one_thread_each(), ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_be_quiet) as pool:
+        running: dict[tuple[Any, ...], Future[Any]] = {
+            key: pool.submit(function, *arguments) for key, (function, arguments) in tasks.items()
+        }
+        for number, (key, future) in enumerate(running.items()):
+            progress(number, len(tasks))
+            done[key] = future.result()
+    return done
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Let processes started meanwhile use one thread for matrix products: there are as many processes as cores."""
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _be_quiet() -> None:
+    logging.getLogger("hybridmap").setLevel(logging.ERROR)  # modules disagree in the noise runs: that is what they show

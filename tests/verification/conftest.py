@@ -1,0 +1,10 @@
+import pytest
+
+from hybridmap.verification import verify_cells
+from tests.verification.cells_for_tests import TINY
+
+
+@pytest.fixture(scope="session")
+def result():
+    """A small verification of the cells, seed 3."""
+    return verify_cells(3, TINY, {})
