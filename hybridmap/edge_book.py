@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from hybridmap.backends.base import SolveReport
 from hybridmap.config.mapping import EdgesConfig
-from hybridmap.graph.experience_map import Edge, ExperienceMap, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.vision.base import Doubted, Proposal, Verdict
 
 _KINDS = {"loop": EdgeKind.LOOP, "registration": EdgeKind.REGISTRATION}

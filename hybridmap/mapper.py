@@ -14,10 +14,10 @@ from hybridmap.calibration.online import OnlineCalibration
 from hybridmap.config import Config
 from hybridmap.edge_book import EdgeBook
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, inverse
-from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.graph.motion_noise import odometry_covariance
 from hybridmap.graph.novelty import Novelty
-from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.graph.uncertainty import relative_covariances
 from hybridmap.metrics import StageClock
 from hybridmap.neural.path_integrator import PathIntegrator

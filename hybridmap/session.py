@@ -17,10 +17,9 @@ from hybridmap.config import Config
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.carries import carries
-from hybridmap.graph.experience_map import Status
+from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.hashing import graph_hash
 from hybridmap.graph.observability import unobserved
-from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.mapper import Mapper, Update
 from hybridmap.metrics import Metric
 from hybridmap.store import MapStore

@@ -8,8 +8,7 @@ import pytest
 from hybridmap.config import Config
 from hybridmap.evaluate import evaluate_session
 from hybridmap.geometry import align, between, compose
-from hybridmap.graph.experience_map import Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.session import run
 from hybridmap.simulation import SimulatedStream
 from hybridmap.store import MapStore

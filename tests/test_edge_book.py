@@ -12,8 +12,8 @@ from hybridmap.config import Config
 from hybridmap.config.mapping import EdgesConfig
 from hybridmap.edge_book import EdgeBook
 from hybridmap.geometry import IDENTITY, RelativePose, between
-from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.mapper import Mapper
 from hybridmap.vision.base import Doubted, Proposal, Verdict
 from tests.streams_for_tests import RoomDrive

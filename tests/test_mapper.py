@@ -9,9 +9,8 @@ from hybridmap.config import Config
 from hybridmap.errors import StreamError
 from hybridmap.evaluate import absolute_error
 from hybridmap.geometry import between, compose
-from hybridmap.graph.experience_map import Status
+from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.hashing import graph_hash
-from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import LaserScan, SelfMotion
 from hybridmap.trajectory import Trajectory

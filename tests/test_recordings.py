@@ -11,8 +11,7 @@ from hybridmap import session
 from hybridmap.cli.choose import choose
 from hybridmap.evaluate import evaluate_session
 from hybridmap.geometry import between
-from hybridmap.graph.experience_map import Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.simulation import SimulatedStream
 from hybridmap.simulation.writers import write_rosbag1, write_rosbag2, write_tum
 from hybridmap.store import MapStore

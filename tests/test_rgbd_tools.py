@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hybridmap.config import Config
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import EdgeKind
 from hybridmap.streams.base import RgbdFrame, SelfMotion
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -35,8 +35,9 @@ from hybridmap.backends.sweeps import relax_links
 from hybridmap.config.backends import RelaxationConfig
 from hybridmap.geometry import Array, between, compose, exp, wrap_angle
 from hybridmap.graph.connectivity import chain
+from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.io import read_graph
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.metrics import Metric, to_json
 
 _ROUNDS = 7  # of measuring everything in turn, so that all see the same machine

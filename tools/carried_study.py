@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from hybridmap.config import Config
 from hybridmap.geometry import IDENTITY, align, between, compose
 from hybridmap.graph.carries import carries
-from hybridmap.graph.experience_map import ExperienceMap, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.mapper import Mapper
 from hybridmap.metrics import Metric, to_json
 from hybridmap.simulation import SimulatedStream

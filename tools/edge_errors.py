@@ -12,7 +12,7 @@ import argparse
 from pathlib import Path
 
 from hybridmap.evaluate.edges import EdgeErrors, edge_errors, edge_errors_on
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import EdgeKind
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.trajectory import read_tum
 

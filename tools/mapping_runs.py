@@ -19,8 +19,8 @@ from hybridmap.config import Config
 from hybridmap.evaluate.edges import normalised_errors
 from hybridmap.evaluate.session import evaluate_session
 from hybridmap.evaluate.trajectory import absolute_error
-from hybridmap.graph.experience_map import ExperienceMap, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.mapper import Mapper, Update
 from hybridmap.metrics import StageClock
 from hybridmap.session import run as session_run

@@ -30,7 +30,7 @@ from hybridmap.cli.choose import parse_settings
 from hybridmap.config import Config
 from hybridmap.evaluate.closures import ClosureLimits, closure_errors
 from hybridmap.evaluate.edges import EXPECTED_MEDIAN
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import EdgeKind
 from hybridmap.metrics import Metric, to_json
 
 LIMITS = ClosureLimits(right_m=0.5, right_deg=10.0, revisit_m=1.0, revisit_deg=30.0, revisit_gap_s=10.0, window_nodes=3)

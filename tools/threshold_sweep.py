@@ -22,7 +22,7 @@ from mapping_runs import judged_session
 from hybridmap.cli.choose import parse_settings
 from hybridmap.config import Config
 from hybridmap.evaluate.edges import edge_errors
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import EdgeKind
 from hybridmap.metrics import Metric, to_json
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.streams.open import open_stream

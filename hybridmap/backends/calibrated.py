@@ -23,7 +23,8 @@ from hybridmap.backends.kernels import noise_models
 from hybridmap.backends.objective import gate_of, residuals
 from hybridmap.backends.weak import softened, truncated_cost
 from hybridmap.geometry import Array, adjoint, between, exp, log
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.pose_graph import PoseGraph
 
 BIAS_STARTS_RAD_M = (0.0, -0.02, 0.02, -0.06, 0.06)
 """Starts of the heading bias, rad/m; the drift of wheels seldom exceeds 3 deg/m."""

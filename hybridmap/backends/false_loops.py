@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from hybridmap.errors import GraphError
 from hybridmap.geometry import compose
 from hybridmap.graph.connectivity import chain
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.pose_graph import PoseGraph
 
 _DROP_OUT_M, _DROP_OUT_RAD = 0.5, np.deg2rad(20.0)
 _RUN = 5  # aliased loops that come one after the other and agree with each other

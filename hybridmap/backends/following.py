@@ -19,7 +19,8 @@ from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.connectivity import extend, require_connected
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.pose_graph import PoseGraph
 
 _ROUNDING = 1e-9  # of chi2: a chain without loops has none, and no solver finds less
 

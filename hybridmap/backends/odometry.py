@@ -7,7 +7,8 @@ import numpy as np
 from hybridmap.backends.base import SolveStatus
 from hybridmap.backends.following import Change, GraphBackend, Outcome
 from hybridmap.geometry import Array, between, compose
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.pose_graph import PoseGraph
 
 
 def dead_reckoning(graph: PoseGraph, placed: Array) -> Array:

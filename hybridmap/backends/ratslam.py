@@ -13,7 +13,8 @@ from hybridmap.backends.relaxing import RelaxationBackend
 from hybridmap.backends.sweeps import Relaxed, relax_links
 from hybridmap.config.backends import RelaxationConfig
 from hybridmap.geometry import Array, between, compose
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.pose_graph import PoseGraph
 
 _REJECTED = 0.25  # weight of a loop whose residual is the scale itself
 

@@ -15,7 +15,8 @@ from hybridmap.calibration.gains import Gains
 from hybridmap.calibration.legs import Legs, Motion
 from hybridmap.calibration.regression import leg_length, leg_sigmas
 from hybridmap.geometry import Array
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.pose_graph import PoseGraph
 
 _OVERLAP = 4
 

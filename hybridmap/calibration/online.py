@@ -16,7 +16,8 @@ from hybridmap.calibration.regression import Sighting, regress
 from hybridmap.config.calibration import CalibrationConfig
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.pose_graph import PoseGraph
 
 _logger = logging.getLogger(__name__)
 

@@ -19,7 +19,8 @@ from hybridmap.calibration.regression import Sighting, regress, require_leg
 from hybridmap.config import Config
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array, between
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.streams.base import Rig
 from hybridmap.trajectory import NS_PER_S, Trajectory

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from hybridmap.evaluate.association import MAX_GAP_S, known_at
 from hybridmap.geometry import Array, between, log
-from hybridmap.graph.experience_map import Edge, ExperienceMap, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.trajectory import Trajectory
 
 EXPECTED_MEDIAN = 2.366

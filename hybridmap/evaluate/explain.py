@@ -16,8 +16,8 @@ from hybridmap.errors import EvaluationError
 from hybridmap.evaluate.association import known_at
 from hybridmap.evaluate.checks import Check, checks_of, otherwise, setting
 from hybridmap.geometry import Array, between
-from hybridmap.graph.experience_map import Edge, ExperienceMap
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind
+from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.trajectory import NS_PER_S, Trajectory, format_motion, read_tum
 from hybridmap.vision.gating import GATE_FIELDS

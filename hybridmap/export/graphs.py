@@ -9,9 +9,8 @@ import numpy as np
 from hybridmap.errors import ExportError
 from hybridmap.export.view import SessionView
 from hybridmap.geometry import Array, RelativePose, invert_relative
-from hybridmap.graph.experience_map import Edge, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.io import write_g2o
-from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.metrics import Metric
 
 _COLORS = {

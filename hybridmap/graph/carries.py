@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.geometry import Array
-from hybridmap.graph.experience_map import ExperienceMap, Status
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.trajectory import Trajectory
 
 

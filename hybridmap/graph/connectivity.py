@@ -10,7 +10,8 @@ from scipy.sparse.csgraph import connected_components
 
 from hybridmap.errors import GraphError
 from hybridmap.geometry import Array, compose, inverse
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.pose_graph import PoseGraph
 
 _TRUST = np.zeros(len(EdgeKind), dtype=np.int64)  # of a kind of edge, when a new node is placed
 _TRUST[EdgeKind.LOOP], _TRUST[EdgeKind.MANUAL], _TRUST[EdgeKind.ODOMETRY], _TRUST[EdgeKind.REGISTRATION] = 0, 0, 1, 2

@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from enum import StrEnum
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.errors import GraphError
-from hybridmap.geometry import Array, RelativePose
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
-
-
-class Status(StrEnum):
-    """What became of an edge; only accepted ones are in the graph."""
-
-    ACCEPTED = "accepted"
-    PENDING = "pending"
-    REJECTED = "rejected"
-    RETRACTED = "retracted"
+from hybridmap.geometry import Array
+from hybridmap.graph.edges import Edge, Status
+from hybridmap.graph.pose_graph import PoseGraph
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,30 +31,6 @@ class Node:
     place_code: NDArray[np.float32]
     template: int
     travel_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class Edge:
-    """A relative pose between two nodes, in the frame of the source, with its fate.
-
-    Attributes:
-        source, target: node numbers.
-        kind: where it comes from.
-        status, reason: what became of it, and why.
-        relative: the measurement; None where a candidate was refused before one was made.
-        scores: the figures that the decision rested on.
-        since_node: number of the newest node when the edge got its present status (-1: let the map note it), so that a
-            replay brings an edge that was committed late at the same moment.
-    """
-
-    source: int
-    target: int
-    kind: EdgeKind
-    status: Status
-    reason: str
-    relative: RelativePose | None
-    scores: Mapping[str, float] = field(default_factory=dict)
-    since_node: int = -1
 
 
 class ExperienceMap:

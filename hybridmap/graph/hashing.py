@@ -7,7 +7,8 @@ import hashlib
 import numpy as np
 
 from hybridmap.geometry import Array
-from hybridmap.graph.experience_map import ExperienceMap, Status
+from hybridmap.graph.edges import Status
+from hybridmap.graph.experience_map import ExperienceMap
 
 
 def graph_hash(experiences: ExperienceMap) -> str:

@@ -11,7 +11,8 @@ import numpy as np
 from hybridmap.errors import GraphError
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.connectivity import chain
-from hybridmap.graph.pose_graph import EdgeKind, GraphFile, PoseGraph
+from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.pose_graph import GraphFile, PoseGraph
 from hybridmap.trajectory import write_text_atomic
 
 log = logging.getLogger(__name__)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybridmap.geometry import Array, loosest_direction
-from hybridmap.graph.experience_map import Edge, ExperienceMap, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap
 
 _ALIKE = 0.7  # mean resultant length of doubled angles from which stretches are said to share a direction
 

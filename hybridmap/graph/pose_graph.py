@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
@@ -11,21 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridmap.errors import GraphError
 from hybridmap.geometry import Array
+from hybridmap.graph.edges import EdgeKind
 
 _FARTHEST = 1e9  # m and rad: beyond it metres have no millionths left
 _LOOSEST, _TIGHTEST = 1e-9, 1e15  # information of standard deviations of some 30 km and 30 nm: beyond, solvers stand still
 _UPPER, _LOWER = ([0, 0, 1], [1, 2, 2]), ([1, 2, 2], [0, 0, 1])
 _WEAK = 0.5  # squared correlations of an information matrix: with a sum below, its determinant is at least a third
 _CLEAR = 1e-6  # determinant of correlations from which rounding cannot make it positive
-
-
-class EdgeKind(IntEnum):
-    """Where an edge comes from."""
-
-    ODOMETRY = 0
-    REGISTRATION = 1
-    LOOP = 2
-    MANUAL = 3
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hybridmap.evaluate.scores import in_words
 from hybridmap.geometry import Array, between, transform_points
-from hybridmap.graph.experience_map import Edge, Status
+from hybridmap.graph.edges import Edge, Status
 from hybridmap.report import style
 from hybridmap.report.map_figure import loops_by_fate
 from hybridmap.report.scene import ODOMETRY, Scene

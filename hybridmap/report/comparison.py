@@ -17,7 +17,8 @@ from hybridmap.backends.objective import squared_norms
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.carries import Carry
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.report import comparison_figures as figures
 from hybridmap.report import tables
 from hybridmap.report.template import rendered

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from hybridmap.geometry import Array, wrap_angle
-from hybridmap.graph.experience_map import Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.report import style
 from hybridmap.report.scene import ODOMETRY, ONLINE, Scene
 from hybridmap.trajectory import NS_PER_S

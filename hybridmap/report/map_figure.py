@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from hybridmap.graph.carries import carries, pieces
-from hybridmap.graph.experience_map import Edge, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.report import style
 from hybridmap.report.outline import Raster
 from hybridmap.report.scene import Scene

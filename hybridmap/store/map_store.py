@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from hybridmap.backends.base import Solution, SolveReport
 from hybridmap.errors import StoreError
 from hybridmap.geometry import Array, RelativePose
-from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.store import codec, schema
 from hybridmap.store.track import NO_ANCHORS, Anchors, Track
 from hybridmap.streams.base import Rig

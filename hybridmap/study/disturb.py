@@ -9,7 +9,8 @@ import numpy as np
 
 from hybridmap.backends.false_loops import drop_out, inject
 from hybridmap.geometry import Array, between, compose, exp
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.study.model import DriftConfig
 
 Kind = Literal["random", "aliased"]

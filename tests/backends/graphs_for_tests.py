@@ -6,7 +6,8 @@ import numpy as np
 
 from hybridmap.geometry import between, compose, exp
 from hybridmap.graph.connectivity import chain
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.pose_graph import PoseGraph
 
 SIGMA = np.array([0.03, 0.02, 0.01])
 

@@ -14,7 +14,7 @@ from hybridmap.backends.gnc import Truncated, on_probation
 from hybridmap.backends.objective import gate_of
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import EdgeKind
 
 CONFIG = BackendsConfig()
 

@@ -8,7 +8,7 @@ from hybridmap import backends
 from hybridmap.backends import GraphSession
 from hybridmap.errors import BackendError, GraphError
 from hybridmap.geometry import between, compose
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import EdgeKind
 
 
 def fill(session, graph):

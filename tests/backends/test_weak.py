@@ -16,7 +16,7 @@ from hybridmap.backends.weak import WEAK, hanging_nodes, motion_weights, truncat
 from hybridmap.config.backends import BackendsConfig, RobustConfig
 from hybridmap.errors import GraphError
 from hybridmap.geometry import align, transform_points
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import EdgeKind
 from hybridmap.store.codec import report_from_json, report_to_json
 
 KERNELS = {

@@ -10,8 +10,8 @@ from hybridmap.calibration.gains import Gains, remove
 from hybridmap.calibration.legs import Motion, chain
 from hybridmap.calibration.regression import Sighting
 from hybridmap.geometry import RelativePose, between, compose, exp, interpolate
-from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.streams.base import Rig
 

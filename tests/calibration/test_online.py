@@ -11,6 +11,7 @@ from hybridmap.calibration.online import OnlineCalibration
 from hybridmap.config import Config
 from hybridmap.config.calibration import CalibrationConfig
 from hybridmap.geometry import compose
+from hybridmap.graph.edges import EdgeKind
 from hybridmap.mapper import Mapper
 from tests.calibration.drives import GAINS, STEP_NS, drive, experience_map
 
@@ -71,7 +72,6 @@ def test_right_odometry_is_left_alone():
 def test_a_map_of_odometry_alone_says_nothing():
     rng = np.random.default_rng(0)
     one = drive(rng, laps=2)
-    from hybridmap.graph.pose_graph import EdgeKind
 
     experiences, chosen = experience_map(one, rng)
     graph, stage = experiences.pose_graph().only(EdgeKind.ODOMETRY), OnlineCalibration(ON, NEUTRAL)

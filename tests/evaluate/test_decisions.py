@@ -12,8 +12,7 @@ from hybridmap.errors import EvaluationError, StoreError
 from hybridmap.evaluate.checks import checks_of, otherwise
 from hybridmap.evaluate.explain import Explainer
 from hybridmap.geometry import RelativePose
-from hybridmap.graph.experience_map import Edge, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.session import run
 from hybridmap.simulation import SimulatedStream
 from tests.store.sessions import ring_map, write_session

@@ -5,8 +5,8 @@ import pytest
 
 from hybridmap.evaluate.edges import edge_errors
 from hybridmap.geometry import IDENTITY, RelativePose, between, compose, exp
-from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.trajectory import Trajectory
 from tests.store.sessions import SECOND, truth_at
 

@@ -7,8 +7,7 @@ from hybridmap.errors import EvaluationError, StoreError, StreamError
 from hybridmap.evaluate import evaluate_session
 from hybridmap.evaluate.solutions import judge_solutions
 from hybridmap.geometry import RelativePose, between
-from hybridmap.graph.experience_map import Edge, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.store import SessionFolder
 from hybridmap.trajectory import read_tum
 from tests.store.sessions import SECOND, ring_map, truth_at, write_session

@@ -5,8 +5,8 @@ import pytest
 
 from hybridmap.geometry import RelativePose
 from hybridmap.graph.carries import carries, grounded, parted, pieces, through_the_air
-from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.trajectory import Trajectory
 
 SECOND = 10**9

@@ -7,8 +7,8 @@ import pytest
 
 from hybridmap.errors import GraphError
 from hybridmap.geometry import RelativePose
-from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap, Node
 
 STEP = RelativePose(np.array([1.0, 0.0, 0.0]), 0.01 * np.eye(3))
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from hybridmap.geometry import RelativePose, loosest_direction
-from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.graph.observability import unobserved
-from hybridmap.graph.pose_graph import EdgeKind
 
 ODOMETRY = np.diag([0.02, 0.02, 0.01]) ** 2
 HELD = np.diag([0.002, 0.002, 0.001]) ** 2

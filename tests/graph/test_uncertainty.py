@@ -7,7 +7,8 @@ import pytest
 
 from hybridmap.errors import GraphError
 from hybridmap.geometry import RelativePose, adjoint, compose, compose_relative, inverse, invert_relative
-from hybridmap.graph.pose_graph import EdgeKind, PoseGraph
+from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.graph.uncertainty import chain_of, relative_covariances
 
 

@@ -15,8 +15,7 @@ from hybridmap.cli.graphs import open_graph
 from hybridmap.evaluate.solutions import judge_solutions
 from hybridmap.geometry import RelativePose, between
 from hybridmap.graph.carries import carries
-from hybridmap.graph.experience_map import Edge, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.report import comparison_figures, correction_figure, map_figure, style
 from hybridmap.report.scene import Correction, Scene, load_scene
 from hybridmap.store import MapStore, SessionFolder

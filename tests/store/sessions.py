@@ -8,8 +8,8 @@ import numpy as np
 
 from hybridmap.backends.base import SolveReport, SolveStatus
 from hybridmap.geometry import RelativePose, between, compose
-from hybridmap.graph.experience_map import Edge, ExperienceMap, Node, Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.store import MapStore, SessionFolder, trajectory_of
 from hybridmap.streams.base import Camera, Laser, Rig
 from hybridmap.trajectory import Trajectory

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from hybridmap.geometry import RelativePose
-from hybridmap.graph.experience_map import ExperienceMap, Status
+from hybridmap.graph.edges import Status
+from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.hashing import graph_hash
 from tests.store.sessions import ring_map
 

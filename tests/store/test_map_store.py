@@ -10,9 +10,9 @@ import pytest
 
 from hybridmap.backends.base import SolveReport, SolveStatus
 from hybridmap.errors import StoreError
-from hybridmap.graph.experience_map import Edge, ExperienceMap, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.hashing import graph_hash
-from hybridmap.graph.pose_graph import EdgeKind
 from hybridmap.store import MapStore, anchors_on
 from hybridmap.streams.base import Rig
 from tests.store.sessions import RIG, keyframe_of, ring_map, truth_at, write_session

@@ -7,7 +7,7 @@ from hybridmap.backends import batch
 from hybridmap.backends.base import SolveStatus
 from hybridmap.errors import BackendError
 from hybridmap.geometry import between, compose
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import EdgeKind
 from hybridmap.study import cell as cells
 from hybridmap.study.disturb import with_drift, with_false_loops
 from hybridmap.study.grid import lay_out

@@ -12,8 +12,7 @@ from hybridmap.backends import create
 from hybridmap.config import Config
 from hybridmap.config.vision import RelocalisingConfig
 from hybridmap.geometry import RelativePose, align, between, compose
-from hybridmap.graph.experience_map import Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import Rig
 from hybridmap.vision.base import Proposal, Verdict

@@ -11,8 +11,7 @@ from hybridmap.config import Config
 from hybridmap.config.rgbd import RgbdClosingConfig, RgbdConfig
 from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import RelativePose, between, compose
-from hybridmap.graph.experience_map import Status
-from hybridmap.graph.pose_graph import EdgeKind
+from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import Rig
 from hybridmap.vision.base import Doubted, Proposal, Verdict, VerifyingFrontEnd
