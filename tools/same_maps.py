@@ -1,0 +1,192 @@
+"""Hold the maps of one tree against those of another: errors, graph hashes, trajectories, and the cost of mapping.
+
+    python tools/same_maps.py measure --tree ../before --out before.json
+    python tools/same_maps.py measure --out after.json
+    python tools/same_maps.py compare before.json after.json
+    python tools/same_maps.py speed --before ../before --pairs 5
+
+`measure` runs the command line of a checkout (default: this one) with this interpreter. `compare` exits with 1 where an error
+grew by more than 2 % and by more than 0.5 mm. `speed` maps in alternating pairs and exits with 1 where the median ratio of the
+processor time is above 1.02. Recordings are looked for in `$HYBRIDMAP_DATA`, else in `../shared/data`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get("HYBRIDMAP_DATA") or ROOT.parent / "shared" / "data")
+PROGRAM = (sys.executable, "-c", "from hybridmap.cli import main; main()")
+WORSE_SHARE, WORSE_M, SLOWER = 1.02, 0.0005, 1.02
+
+
+@dataclass(frozen=True)
+class Case:
+    """One drive or graph.
+
+    Attributes:
+        commands: run one after the other in one folder; `DATA` is the folder of recordings. The first one makes `out`.
+        figures: errors in m that must not grow, of any command; `PRIMARY` stands for the back-end that drives the pose.
+    """
+
+    commands: tuple[str, ...]
+    figures: tuple[str, ...]
+
+
+def _logged(folder: str, recording: str) -> Case:
+    source = f"DATA/real/{folder}"
+    commands = (f"map {source}/{recording} --out out", f"evaluate out --relations {source}/relations.txt")
+    return Case(commands, ("relation_trans_mean/PRIMARY", "relation_loop_trans_mean/PRIMARY"))
+
+
+def _driven(command: str) -> Case:
+    return Case((f"{command} --out out",), ("ate_rmse/PRIMARY",))
+
+
+def _kidnapped(config: str, seed: int) -> Case:
+    return _driven(f"map office --config {config} --set simulation.carried_m=20 --seed {seed}")
+
+
+FALSE_LOOPS = """
+seeds: 3
+sources: [{{name: graph, graph: {graph}}}]
+backends: [gtsam-gnc]
+false_loops: {{rates: [0.4], kinds: [random, aliased]}}
+statistics: {{method: bootstrap}}
+"""
+HOLOLENS = "map DATA/real/hololens_office"
+CASES = {
+    "fr079": _logged("fr079", "fr079.mcap"),
+    "aces": _logged("aces", "aces.bag"),
+    "office": _driven("map office"),
+    "demo": _driven("demo"),
+    "hololens": _driven(HOLOLENS),
+    "hololens-hard": _driven(f"{HOLOLENS} --odometry-file odometry_hard.txt"),
+    **{f"kidnapped-laser-{seed}": _kidnapped("laser", seed) for seed in range(1, 6)},
+    **{f"kidnapped-rgbd-{seed}": _kidnapped("rgbd", seed) for seed in range(1, 4)},
+    **{
+        f"false-loops-{name}": Case(("study study.yaml --out out --workers 0",), (f"DATA/posegraphs/{name}.g2o",))
+        for name in ("intel", "manhattanOlson3500")
+    },
+}
+SPEED = {"aces": "map DATA/real/aces/aces.bag --out out", "demo": "demo --out out"}
+
+
+def main() -> None:
+    """Parse the command line and do one of the three."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    one = commands.add_parser("measure")
+    one.add_argument("--tree", type=Path, default=ROOT, help="a checkout")
+    one.add_argument("--out", type=Path, required=True, help="JSON file; cases that it holds and that are not run are kept")
+    one.add_argument("--only", nargs="+", choices=list(CASES), default=list(CASES))
+    two = commands.add_parser("compare")
+    two.add_argument("before", type=Path)
+    two.add_argument("after", type=Path)
+    three = commands.add_parser("speed")
+    three.add_argument("--before", type=Path, required=True, help="a checkout")
+    three.add_argument("--after", type=Path, default=ROOT, help="a checkout")
+    three.add_argument("--pairs", type=int, default=5)
+    chosen = parser.parse_args()
+    if chosen.command == "measure":
+        measure(chosen.tree.resolve(), chosen.out, chosen.only)
+    elif chosen.command == "compare":
+        raise SystemExit(compare(json.loads(chosen.before.read_text()), json.loads(chosen.after.read_text())))
+    else:
+        raise SystemExit(speed(chosen.before.resolve(), chosen.after.resolve(), chosen.pairs))
+
+
+def measure(tree: Path, out: Path, names: list[str]) -> None:
+    """Run cases on a checkout; what was found is written after each."""
+    found: dict[str, Any] = json.loads(out.read_text()) if out.is_file() else {}
+    for name in names:
+        found[name] = measured(tree, CASES[name])
+        print(name, json.dumps(found[name]), flush=True)
+        out.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def measured(tree: Path, case: Case) -> dict[str, Any]:
+    """Errors, hash of the graph, hash of the trajectories and processor time of one case."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, figures, graph_hash, cpu_s = Path(name), dict[str, float](), "", 0.0
+        wanted = case.figures
+        if case.commands[0].startswith("study"):
+            (folder / "study.yaml").write_text(FALSE_LOOPS.format(graph=wanted[0].replace("DATA", str(DATA))))
+        for command in case.commands:
+            output, seconds = run(tree, command, folder)
+            cpu_s += seconds
+            primary, graph_hash = output.get("primary_backend", ""), output.get("graph_hash") or graph_hash
+            values = {metric["name"]: metric["value"] for metric in output["metrics"]}
+            chosen = [figure.replace("PRIMARY", primary) for figure in wanted]
+            chosen += [name for name in values if name.startswith("ate_m/") and "gtsam" in name]
+            figures |= {figure: values[figure] for figure in chosen if figure in values}
+        lines = b"".join(path.read_bytes() for path in sorted((folder / "out").glob("trajectory/*.tum")))
+        trajectories = hashlib.sha256(lines).hexdigest()[:16] if lines else ""
+        return {"figures": figures, "graph_hash": graph_hash, "trajectories": trajectories, "cpu_s": round(cpu_s, 2)}
+
+
+def run(tree: Path, command: str, folder: Path) -> tuple[dict[str, Any], float]:
+    """One command of a checkout: what it printed as JSON, and its processor time in s."""
+    arguments = [*command.replace("DATA", str(DATA)).split(), "--json"]
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    environment = {**os.environ, **threads, "PYTHONPATH": str(tree), "HYBRIDMAP_DATA": str(DATA)}
+    done = subprocess.run([*PROGRAM, *arguments], cwd=folder, env=environment, capture_output=True, text=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    if done.returncode not in (0, 1) or not done.stdout.startswith("{"):
+        raise SystemExit(f"{tree}: {command}: exit code {done.returncode}\n{done.stderr}")
+    return json.loads(done.stdout), after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def compare(before: dict[str, Any], after: dict[str, Any]) -> int:
+    """Print one line a figure; how many got worse, as an exit code."""
+    worse = 0
+    print("| case | error | before, m | after, m | same graph | same trajectories |\n|---|---|---:|---:|---|---|")
+    for name in (name for name in before if name in after):
+        old, new = before[name], after[name]
+        graph, track = ("yes" if old[key] and old[key] == new[key] else "no" for key in ("graph_hash", "trajectories"))
+        for figure, value in old["figures"].items():
+            now = new["figures"].get(figure, float("nan"))
+            bad = not now <= max(value * WORSE_SHARE, value + WORSE_M)
+            worse += bad
+            print(f"| {name} | {figure} | {value:.5f} | {now:.5f}{' **worse**' if bad else ''} | {graph} | {track} |")
+    print(f"\n{worse} figures got worse" if worse else "\nno figure got worse")
+    return min(worse, 1)
+
+
+def speed(before: Path, after: Path, pairs: int) -> int:
+    """Map in alternating pairs; 1 where the median ratio is above the bar."""
+    slow = 0
+    for name, command in SPEED.items():
+        ratios = []
+        for pair in range(pairs + 1):
+            trees = (before, after) if pair % 2 else (after, before)
+            seconds = {tree: timed(tree, command) for tree in trees}
+            if pair:  # the first pair fills the caches of compiled code
+                ratios.append(seconds[after] / seconds[before])
+                print(f"{name}: {seconds[before]:.2f} s before, {seconds[after]:.2f} s after", flush=True)
+        median = statistics.median(ratios)
+        slow += median > SLOWER
+        print(f"{name}: median ratio {median:.3f} ({min(ratios):.3f} to {max(ratios):.3f}), bar {SLOWER}")
+    return min(slow, 1)
+
+
+def timed(tree: Path, command: str) -> float:
+    """Processor time of one command, s."""
+    with tempfile.TemporaryDirectory() as folder:
+        return run(tree, command, Path(folder))[1]
+
+
+if __name__ == "__main__":
+    main()
