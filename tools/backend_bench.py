@@ -29,9 +29,8 @@ from barred import at_least, at_most
 from numpy.typing import NDArray
 
 from hybridmap import backends
-from hybridmap.backends.factors import NoiseModels, factor_graph, values
-from hybridmap.backends.false_loops import inject
-from hybridmap.backends.sweeps import relax_links
+from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph, values
+from hybridmap.backends.relaxation.sweeps import relax_links
 from hybridmap.config.backends import RelaxationConfig
 from hybridmap.geometry import Array, between, compose, exp, wrap_angle
 from hybridmap.graph.connectivity import chain
@@ -39,6 +38,7 @@ from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.metrics import Metric, to_json
+from hybridmap.study.false_loops import inject
 
 _ROUNDS = 7  # of measuring everything in turn, so that all see the same machine
 

@@ -25,7 +25,6 @@ from pathlib import Path
 import numpy as np
 
 from hybridmap import backends
-from hybridmap.backends.false_loops import bend, drop_out, inject
 from hybridmap.cli.choose import parse_settings
 from hybridmap.config import Config
 from hybridmap.config.backends import BackendsConfig
@@ -33,6 +32,7 @@ from hybridmap.geometry import Array, align, transform_points
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.metrics import Metric, to_json
+from hybridmap.study.false_loops import bend, drop_out, inject
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,15 +12,15 @@ from barred import at_least, at_most
 
 from hybridmap import backends
 from hybridmap.backends.base import Backend, Solution
-from hybridmap.backends.batch import run
-from hybridmap.backends.factors import NoiseModels, factor_graph
-from hybridmap.backends.false_loops import inject
 from hybridmap.backends.following import prefix
+from hybridmap.backends.gtsam.batch import run
+from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph
 from hybridmap.geometry import Array, between
 from hybridmap.graph.connectivity import chain
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.metrics import Metric
+from hybridmap.study.false_loops import inject
 
 GRAPHS = {"manhattanOlson3500.g2o": None, "city10000.g2o": 4000}
 """Files, and how many nodes of each are replayed with false edges (all of them: minutes of least squares on a ruined map)."""

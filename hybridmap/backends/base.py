@@ -47,7 +47,7 @@ class SolveReport:
         unit_variance: chi2 of the edges that were not rejected per degree of freedom; 1 where the stated noise is the true one.
         rejected_clusters: groups of rejected loops that agree with each other, the largest first: true loops that were
             dropped, or a place taken for another one. Only where a whole graph was solved.
-        inconsistent_edge_ids: of the rejected loops, those that a pre-filter (`backends.consistency`) kept from the solver.
+        inconsistent_edge_ids: of the rejected loops, those that the pre-filter (`judging.prefilter`) kept from the solver.
         weak_edges: odometry and registration edges -> weight, where a kernel on them (`backends.robust.odometry`) leaves less
             than a tenth. They do not count for the unit variance.
         hanging_nodes: nodes that only such edges and rejected loops join to node 0: nothing else holds them.

@@ -11,8 +11,8 @@ from itertools import product
 import numpy as np
 
 from hybridmap.backends.base import Backend, Solution, SolveStatus
-from hybridmap.backends.certificate import Certificate, certify
 from hybridmap.backends.convergence import convergence
+from hybridmap.backends.judging.certificate import Certificate, certify
 from hybridmap.backends.objective import chi2
 from hybridmap.backends.registry import create
 from hybridmap.backends.replay import replay
@@ -94,7 +94,7 @@ def compare(
         names: back-ends, in the order of the rows.
         config: their settings.
         ways: how each gets the graph; dead reckoning is the same in every way and gets the first alone.
-        certified: try to prove each solution optimal (`backends.certificate`).
+        certified: try to prove each solution optimal (`backends.judging.certificate`).
         traced: find out how each solution came about, which takes batch solvers some three times the time.
         progress: called with the units done and their total.
 

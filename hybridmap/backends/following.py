@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.base import Solution, SolveReport, SolveStatus, SupportsPoseGraph
-from hybridmap.backends.clusters import rejected_clusters
+from hybridmap.backends.judging.clusters import rejected_clusters
+from hybridmap.backends.judging.weak import hanging_nodes, weak_edges
 from hybridmap.backends.objective import chi2, gate_of, squared_norms, total, unit_variance
-from hybridmap.backends.weak import hanging_nodes, weak_edges
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, between, compose

@@ -5,28 +5,28 @@ from __future__ import annotations
 from importlib import import_module
 
 from hybridmap.backends.base import Backend
-from hybridmap.backends.prefilter import ConsistentBackend
+from hybridmap.backends.judging.prefilter import ConsistentBackend
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 
 # name -> (module, class); every class is made as Class(name, config).
 _TABLE = {
     "odometry": ("odometry", "OdometryBackend"),
-    "relaxation-paper": ("relaxation", "PaperRelaxation"),
-    "relaxation-normalised": ("relaxation", "NormalisedRelaxation"),
-    "relaxation-ratslam": ("ratslam", "RatslamRelaxation"),
-    "relaxation-robust": ("ratslam", "RobustRelaxation"),
-    "relaxation-gtsam-lm": ("hybrid", "HybridRelaxation"),
-    "gtsam-lm": ("batch", "BatchBackend"),
-    "gtsam-gn": ("batch", "BatchBackend"),
-    "gtsam-dogleg": ("batch", "BatchBackend"),
-    "gtsam-isam2": ("incremental", "Isam2Backend"),
-    "gtsam-huber": ("robust", "KernelBackend"),
-    "gtsam-cauchy": ("robust", "KernelBackend"),
-    "gtsam-dcs": ("robust", "KernelBackend"),
-    "gtsam-geman-mcclure": ("robust", "KernelBackend"),
-    "gtsam-gnc": ("gnc", "GncBackend"),
-    "gtsam-calibrated": ("calibrated", "CalibratedBackend"),
+    "relaxation-paper": ("relaxation.linear", "PaperRelaxation"),
+    "relaxation-normalised": ("relaxation.linear", "NormalisedRelaxation"),
+    "relaxation-ratslam": ("relaxation.ratslam", "RatslamRelaxation"),
+    "relaxation-robust": ("relaxation.ratslam", "RobustRelaxation"),
+    "relaxation-gtsam-lm": ("relaxation.hybrid", "HybridRelaxation"),
+    "gtsam-lm": ("gtsam.batch", "BatchBackend"),
+    "gtsam-gn": ("gtsam.batch", "BatchBackend"),
+    "gtsam-dogleg": ("gtsam.batch", "BatchBackend"),
+    "gtsam-isam2": ("gtsam.incremental", "Isam2Backend"),
+    "gtsam-huber": ("gtsam.robust", "KernelBackend"),
+    "gtsam-cauchy": ("gtsam.robust", "KernelBackend"),
+    "gtsam-dcs": ("gtsam.robust", "KernelBackend"),
+    "gtsam-geman-mcclure": ("gtsam.robust", "KernelBackend"),
+    "gtsam-gnc": ("gtsam.gnc", "GncBackend"),
+    "gtsam-calibrated": ("gtsam.calibrated", "CalibratedBackend"),
 }
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hybridmap.backends.base import Solution, SolveStatus
-from hybridmap.backends.covariance import Covariances
+from hybridmap.backends.gtsam.covariance import Covariances
 from hybridmap.backends.registry import create
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError, GraphError

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap import backends
-from hybridmap.backends.factors import NoiseModels, anchor, factors, poses_of
+from hybridmap.backends.gtsam.factors import NoiseModels, anchor, factors, poses_of
 from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.gains import NEUTRAL, Gains
 from hybridmap.calibration.legs import Motion

@@ -24,8 +24,8 @@ def optimize(
     Exit code 1, and no file, where the back-end failed, diverged or found the graph singular.
     """
     from hybridmap.backends import create
-    from hybridmap.backends.certificate import certify
     from hybridmap.backends.comparison import Row, metrics_of
+    from hybridmap.backends.judging.certificate import certify
     from hybridmap.cli.graphs import open_graph, settings_of
     from hybridmap.cli.show import emit
     from hybridmap.errors import GraphError

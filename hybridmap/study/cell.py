@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.base import Solution, SolveStatus
-from hybridmap.backends.initial import angular_start
+from hybridmap.backends.gtsam.initial import angular_start
 from hybridmap.backends.objective import chi2
 from hybridmap.backends.odometry import dead_reckoning
 from hybridmap.backends.registry import create

@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from hybridmap.backends.false_loops import drop_out, inject
 from hybridmap.geometry import Array, between, compose, exp
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.study.false_loops import drop_out, inject
 from hybridmap.study.model import DriftConfig
 
 Kind = Literal["random", "aliased"]
@@ -38,7 +38,7 @@ def with_drift(graph: PoseGraph, drift: DriftConfig, seed: int) -> PoseGraph:
 
 
 def with_false_loops(graph: PoseGraph, kind: Kind, rate: float, seed: int) -> PoseGraph:
-    """The graph with false loops appended (`backends.false_loops.inject`); the same for every back-end.
+    """The graph with false loops appended (`study.false_loops.inject`); the same for every back-end.
 
     Raises:
         GraphError: no loop to copy.

@@ -17,7 +17,16 @@ SCHEMA = 1
 
 _LIBRARIES = ("gtsam", "numba", "numpy", "scipy", "opencv-python-headless")
 _SHOWING = ("cli", "evaluate", "export", "report", "session.py", "study")
-_SOLVING = ("backends", "config/backends.py", "geometry.py", "graph", "study/cell.py", "study/disturb.py", "study/sources.py")
+_SOLVING = (
+    "backends",
+    "config/backends.py",
+    "geometry.py",
+    "graph",
+    "study/cell.py",
+    "study/disturb.py",
+    "study/false_loops.py",
+    "study/sources.py",
+)
 
 
 def digest(tree: Mapping[str, Any]) -> str:

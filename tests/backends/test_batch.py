@@ -10,9 +10,9 @@ from scipy.optimize import least_squares
 
 from hybridmap import backends
 from hybridmap.backends.base import SolveStatus
-from hybridmap.backends.batch import run
-from hybridmap.backends.factors import NoiseModels, factor_graph, factors, values
-from hybridmap.backends.initial import angular_start
+from hybridmap.backends.gtsam.batch import run
+from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph, factors, values
+from hybridmap.backends.gtsam.initial import angular_start
 from hybridmap.backends.objective import chi2, residuals
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError, GraphError

@@ -6,10 +6,10 @@ from graphs_for_tests import laps
 from test_robust import ate
 
 from hybridmap import backends
-from hybridmap.backends.calibrated import with_gains
-from hybridmap.backends.false_loops import bend, inject
+from hybridmap.backends.gtsam.calibrated import with_gains
 from hybridmap.geometry import between, compose, exp
 from hybridmap.graph.io import read_graph
+from hybridmap.study.false_loops import bend, inject
 
 BIAS = 0.12
 

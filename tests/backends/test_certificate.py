@@ -8,14 +8,14 @@ import pytest
 from graphs_for_tests import laps
 
 from hybridmap import backends
-from hybridmap.backends.batch import run
-from hybridmap.backends.certificate import certify
 from hybridmap.backends.comparison import compare, metrics_of
-from hybridmap.backends.dual import prove, quadratic_form
-from hybridmap.backends.factors import NoiseModels, factor_graph
-from hybridmap.backends.false_loops import inject
+from hybridmap.backends.gtsam.batch import run
+from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph
+from hybridmap.backends.judging.certificate import certify
+from hybridmap.backends.judging.dual import prove, quadratic_form
 from hybridmap.geometry import compose
 from hybridmap.graph.io import read_graph
+from hybridmap.study.false_loops import inject
 
 
 def stacked(poses):

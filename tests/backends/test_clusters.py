@@ -7,14 +7,14 @@ import pytest
 from graphs_for_tests import laps
 
 from hybridmap import backends
-from hybridmap.backends.clusters import rejected_clusters
-from hybridmap.backends.covariance import Covariances
-from hybridmap.backends.false_loops import inject
-from hybridmap.backends.gnc import Truncated, on_probation
+from hybridmap.backends.gtsam.covariance import Covariances
+from hybridmap.backends.gtsam.gnc import Truncated, on_probation
+from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.objective import gate_of
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.graph.edges import EdgeKind
+from hybridmap.study.false_loops import inject
 
 CONFIG = BackendsConfig()
 

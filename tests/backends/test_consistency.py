@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from scipy.stats import chi2 as chi2_law
 
 from hybridmap import backends
-from hybridmap.backends import prefilter
 from hybridmap.backends.base import Solution, SolveReport, SolveStatus
-from hybridmap.backends.consistency import Consistent, _Asked, consistent_loops, largest_clique
-from hybridmap.backends.false_loops import inject
 from hybridmap.backends.following import prefix
+from hybridmap.backends.judging import prefilter
+from hybridmap.backends.judging.consistency import Consistent, _Asked, consistent_loops, largest_clique
 from hybridmap.config.backends import BackendsConfig, ConsistencyConfig
 from hybridmap.geometry import adjoint, align, inverse, transform_points
 from hybridmap.store.codec import report_from_json, report_to_json
+from hybridmap.study.false_loops import inject
 
 CONFIG = ConsistencyConfig()
 FILTERED = BackendsConfig(consistency=ConsistencyConfig(enabled=True))

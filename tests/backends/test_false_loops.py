@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hybridmap.backends.false_loops import inject
 from hybridmap.errors import GraphError
+from hybridmap.study.false_loops import inject
 from tests.backends.graphs_for_tests import laps
 
 

@@ -83,7 +83,7 @@ def test_isam2_recovers_from_an_exception_inside_the_solver(monkeypatch):
     def fail(*_):
         raise RuntimeError("Indeterminate linear system\nmore words")
 
-    from hybridmap.backends.incremental import Smoother
+    from hybridmap.backends.gtsam.incremental import Smoother
 
     with monkeypatch.context() as broken:
         broken.setattr(Smoother, "follow", fail)

@@ -7,15 +7,15 @@ import pytest
 from graphs_for_tests import laps
 
 from hybridmap import backends
-from hybridmap.backends.covariance import Covariances
-from hybridmap.backends.factors import NoiseModels, poses_of
-from hybridmap.backends.false_loops import inject
 from hybridmap.backends.following import prefix
-from hybridmap.backends.incremental import Isam2Backend, Smoother
+from hybridmap.backends.gtsam.covariance import Covariances
+from hybridmap.backends.gtsam.factors import NoiseModels, poses_of
+from hybridmap.backends.gtsam.incremental import Isam2Backend, Smoother
 from hybridmap.config.backends import BackendsConfig, Isam2Config
 from hybridmap.errors import BackendError
 from hybridmap.geometry import between, log
 from hybridmap.graph.io import read_graph
+from hybridmap.study.false_loops import inject
 
 
 def modest(seed, nodes=90):

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from hybridmap.backends.factors import NoiseModels, factors, values
+from hybridmap.backends.gtsam.factors import NoiseModels, factors, values
 from hybridmap.backends.objective import chi2, chi2_quantile, residuals, squared_norms
 from hybridmap.geometry import between, compose, exp, inverse, log
 

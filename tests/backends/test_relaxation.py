@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridmap import backends
-from hybridmap.backends.false_loops import inject
-from hybridmap.backends.relaxation import LinearRule, lambda_max, relax
+from hybridmap.backends.relaxation.linear import LinearRule, lambda_max, relax
 from hybridmap.config.backends import BackendsConfig, RelaxationConfig
 from hybridmap.geometry import align, transform_points, wrap_angle
 from hybridmap.graph.connectivity import chain
 from hybridmap.graph.io import read_graph
+from hybridmap.study.false_loops import inject
 
 
 def configured(**settings_):

@@ -8,14 +8,14 @@ import pytest
 from graphs_for_tests import laps
 
 from hybridmap import backends
-from hybridmap.backends import gnc
-from hybridmap.backends.false_loops import inject
-from hybridmap.backends.gnc import GncBackend, Truncated
+from hybridmap.backends.gtsam import gnc
+from hybridmap.backends.gtsam.gnc import GncBackend, Truncated
 from hybridmap.backends.objective import gate_of
 from hybridmap.config.backends import BackendsConfig, GncConfig
 from hybridmap.errors import GraphError
 from hybridmap.geometry import align, transform_points
 from hybridmap.graph.io import read_graph
+from hybridmap.study.false_loops import inject
 
 
 def ate(poses, reference):

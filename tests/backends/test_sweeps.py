@@ -12,17 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridmap import backends, compiled
-from hybridmap.backends import sweeps
-from hybridmap.backends.false_loops import inject
-from hybridmap.backends.sweeps import relax_links
+from hybridmap.backends.relaxation import sweeps
+from hybridmap.backends.relaxation.sweeps import relax_links
 from hybridmap.config.backends import RelaxationConfig
 from hybridmap.errors import GraphError
 from hybridmap.geometry import compose, wrap_angle
+from hybridmap.study.false_loops import inject
 
 ELSEWHERE = """
 import sys, numba, numpy as np
 from graphs_for_tests import laps
-from hybridmap.backends.sweeps import relax_links
+from hybridmap.backends.relaxation.sweeps import relax_links
 from hybridmap.config.backends import RelaxationConfig
 graph = laps(np.random.default_rng(0), noise=3.0)[0]
 print(numba.config.DISABLE_JIT, relax_links(graph, graph.initial, 10, RelaxationConfig(), robust=True).poses.tobytes().hex())

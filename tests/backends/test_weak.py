@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridmap import backends
-from hybridmap.backends.false_loops import drop_out, inject
+from hybridmap.backends.judging.weak import WEAK, hanging_nodes, motion_weights, truncated_cost, weak_edges
 from hybridmap.backends.objective import squared_norms
-from hybridmap.backends.weak import WEAK, hanging_nodes, motion_weights, truncated_cost, weak_edges
 from hybridmap.config.backends import BackendsConfig, RobustConfig
 from hybridmap.errors import GraphError
 from hybridmap.geometry import align, transform_points
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.store.codec import report_from_json, report_to_json
+from hybridmap.study.false_loops import drop_out, inject
 
 KERNELS = {
     "huber": gtsam.noiseModel.mEstimator.Huber,

@@ -11,7 +11,6 @@ import pytest
 from hybridmap.backends import comparison, odometry
 from hybridmap.backends.base import SolveStatus
 from hybridmap.backends.comparison import Way
-from hybridmap.backends.false_loops import inject
 from hybridmap.backends.objective import chi2
 from hybridmap.cli import main
 from hybridmap.cli.compare import _judged
@@ -19,6 +18,7 @@ from hybridmap.cli.graphs import open_graph
 from hybridmap.errors import BackendError
 from hybridmap.geometry import between
 from hybridmap.graph.io import read_graph
+from hybridmap.study.false_loops import inject
 from hybridmap.trajectory import Trajectory
 from tests.backends.graphs_for_tests import laps
 from tests.store.sessions import ring_map, truth_at, write_session

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hybridmap.backends import batch
 from hybridmap.backends.base import SolveStatus
+from hybridmap.backends.gtsam import batch
 from hybridmap.errors import BackendError
 from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybridmap.backends.false_loops import inject
 from hybridmap.errors import GraphError
 from hybridmap.graph.io import write_g2o
 from hybridmap.study import provenance
+from hybridmap.study.false_loops import inject
 from hybridmap.study.grid import lay_out
 from hybridmap.study.model import SyntheticConfig
 from hybridmap.study.sources import laps
@@ -76,7 +76,7 @@ def test_other_code_or_libraries_give_other_keys(monkeypatch):
 
 def test_the_digest_of_the_code_sees_a_changed_solver(monkeypatch, tmp_path):
     package = tmp_path / "hybridmap"
-    for name in ("backends/gnc.py", "cli/app.py", "vision/look.py"):
+    for name in ("backends/gtsam/gnc.py", "cli/app.py", "vision/look.py"):
         (package / name).parent.mkdir(parents=True)
         (package / name).write_text("1\n")
     monkeypatch.setattr(provenance.resources, "files", lambda _: package)

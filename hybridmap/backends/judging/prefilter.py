@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.base import Backend, Solution, SupportsPoseGraph
-from hybridmap.backends.clusters import rejected_clusters
-from hybridmap.backends.consistency import Consistent, consistent_loops
-from hybridmap.backends.covariance import expected_loops
+from hybridmap.backends.gtsam.covariance import expected_loops
+from hybridmap.backends.judging.clusters import rejected_clusters
+from hybridmap.backends.judging.consistency import Consistent, consistent_loops
+from hybridmap.backends.judging.weak import softened, truncated_cost
 from hybridmap.backends.objective import SLACK, chi2, gate_of
-from hybridmap.backends.weak import softened, truncated_cost
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import GraphError
 from hybridmap.graph.pose_graph import PoseGraph

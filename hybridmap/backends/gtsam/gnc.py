@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.base import Solution, SolveStatus
-from hybridmap.backends.batch import run
-from hybridmap.backends.clusters import neighbouring_pairs, rejected_clusters
-from hybridmap.backends.covariance import expected_loops
-from hybridmap.backends.factors import NoiseModels, factor_graph, factors, poses_of, values
 from hybridmap.backends.following import Change, GraphBackend, Outcome, prefix
-from hybridmap.backends.initial import best_start, trusted_start
-from hybridmap.backends.kernels import noise_models
+from hybridmap.backends.gtsam.batch import run
+from hybridmap.backends.gtsam.covariance import expected_loops
+from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph, factors, poses_of, values
+from hybridmap.backends.gtsam.initial import best_start, trusted_start
+from hybridmap.backends.gtsam.kernels import noise_models
+from hybridmap.backends.gtsam.robust import WarmKernel, with_kernel
+from hybridmap.backends.judging.clusters import neighbouring_pairs, rejected_clusters
+from hybridmap.backends.judging.weak import softened, truncated_cost, weak_edges
 from hybridmap.backends.objective import SLACK, gate_of, squared_norms, unit_variance
-from hybridmap.backends.robust import WarmKernel, with_kernel
-from hybridmap.backends.weak import softened, truncated_cost, weak_edges
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.connectivity import extend

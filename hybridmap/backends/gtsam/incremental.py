@@ -6,12 +6,12 @@ import numpy as np
 
 from hybridmap.backends.base import Solution, SolveStatus
 from hybridmap.backends.following import Change, GraphBackend, Outcome, prefix
-from hybridmap.backends.initial import angular_start
-from hybridmap.backends.kernels import loop_kernel, noise_models
+from hybridmap.backends.gtsam.initial import angular_start
+from hybridmap.backends.gtsam.kernels import loop_kernel, noise_models
+from hybridmap.backends.gtsam.robust import judged
+from hybridmap.backends.gtsam.smoother import Smoother
+from hybridmap.backends.judging.weak import truncated_cost
 from hybridmap.backends.objective import gate_of, squared_norms, total
-from hybridmap.backends.robust import judged
-from hybridmap.backends.smoother import Smoother
-from hybridmap.backends.weak import truncated_cost
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph

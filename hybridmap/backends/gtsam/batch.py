@@ -10,9 +10,9 @@ import gtsam
 import numpy as np
 
 from hybridmap.backends.base import SolveStatus
-from hybridmap.backends.factors import NoiseModels, anchor, collected, factor_graph, factors, poses_of, values
 from hybridmap.backends.following import Change, GraphBackend, Outcome, difference
-from hybridmap.backends.initial import best_start
+from hybridmap.backends.gtsam.factors import NoiseModels, anchor, collected, factor_graph, factors, poses_of, values
+from hybridmap.backends.gtsam.initial import best_start
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph

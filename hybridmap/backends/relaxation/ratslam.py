@@ -9,8 +9,8 @@ import numpy as np
 from hybridmap.backends.base import Solution, SolveStatus
 from hybridmap.backends.following import Outcome
 from hybridmap.backends.objective import gate_of, truncated_cost
-from hybridmap.backends.relaxing import RelaxationBackend
-from hybridmap.backends.sweeps import Relaxed, relax_links
+from hybridmap.backends.relaxation.relaxing import RelaxationBackend
+from hybridmap.backends.relaxation.sweeps import Relaxed, relax_links
 from hybridmap.config.backends import RelaxationConfig
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.edges import EdgeKind

@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.backends.batch import run
-from hybridmap.backends.clusters import rejected_clusters
-from hybridmap.backends.covariance import Covariances
-from hybridmap.backends.factors import factor_graph
 from hybridmap.backends.following import Outcome
-from hybridmap.backends.gnc import GncBackend
-from hybridmap.backends.kernels import noise_models
+from hybridmap.backends.gtsam.batch import run
+from hybridmap.backends.gtsam.covariance import Covariances
+from hybridmap.backends.gtsam.factors import factor_graph
+from hybridmap.backends.gtsam.gnc import GncBackend
+from hybridmap.backends.gtsam.kernels import noise_models
+from hybridmap.backends.judging.clusters import rejected_clusters
+from hybridmap.backends.judging.weak import softened, truncated_cost
 from hybridmap.backends.objective import gate_of, residuals
-from hybridmap.backends.weak import softened, truncated_cost
 from hybridmap.geometry import Array, adjoint, between, exp, log
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph

@@ -7,7 +7,7 @@ from typing import Any
 
 from gtsam import noiseModel
 
-from hybridmap.backends.factors import NoiseModels, Wrap
+from hybridmap.backends.gtsam.factors import NoiseModels, Wrap
 from hybridmap.config.backends import RobustConfig
 
 _LOOP: dict[str, Callable[[RobustConfig], Any]] = {

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.backends.clusters import neighbouring_pairs
+from hybridmap.backends.judging.clusters import neighbouring_pairs
 from hybridmap.backends.objective import SLACK, chi2_quantile
 from hybridmap.config.backends import ConsistencyConfig
 from hybridmap.geometry import Array, adjoint, compose, inverse, log

@@ -17,7 +17,7 @@ from scipy.sparse.linalg import eigsh
 
 from hybridmap.backends.base import SolveStatus
 from hybridmap.backends.following import Outcome
-from hybridmap.backends.relaxing import RelaxationBackend
+from hybridmap.backends.relaxation.relaxing import RelaxationBackend
 from hybridmap.config.backends import RelaxationConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from hybridmap.backends.batch import WarmStart, run
-from hybridmap.backends.factors import factor_graph
 from hybridmap.backends.following import Change, GraphBackend, Outcome
-from hybridmap.backends.initial import trusted_start
-from hybridmap.backends.kernels import loop_kernel, noise_models
+from hybridmap.backends.gtsam.batch import WarmStart, run
+from hybridmap.backends.gtsam.factors import factor_graph
+from hybridmap.backends.gtsam.initial import trusted_start
+from hybridmap.backends.gtsam.kernels import loop_kernel, noise_models
 from hybridmap.backends.objective import gate_of, squared_norms
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array

@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from hybridmap.backends.base import Solution, SolveStatus
-from hybridmap.backends.batch import run
-from hybridmap.backends.factors import NoiseModels, factor_graph
 from hybridmap.backends.following import Outcome
+from hybridmap.backends.gtsam.batch import run
+from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph
 from hybridmap.backends.objective import chi2
-from hybridmap.backends.ratslam import RatslamRelaxation
+from hybridmap.backends.relaxation.ratslam import RatslamRelaxation
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
 

@@ -2,7 +2,7 @@
 
 Three things are checked, over the edges that the back-end kept: Levenberg-Marquardt on the true objective chi2 finds next
 to nothing to gain from the solution; the critical point of the isotropised objective F beside it is proved to be the global
-optimum of F (`backends.dual`); and F at the solution is near that. No lower bound of chi2 itself is proved, but for zero.
+optimum of F (`judging.dual`); and F at the solution is near that. No lower bound of chi2 itself is proved, but for zero.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybridmap.backends.base import SolveStatus
-from hybridmap.backends.batch import run
-from hybridmap.backends.dual import prove
-from hybridmap.backends.factors import NoiseModels, factor_graph
+from hybridmap.backends.gtsam.batch import run
+from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph
+from hybridmap.backends.judging.dual import prove
 from hybridmap.backends.objective import chi2
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph

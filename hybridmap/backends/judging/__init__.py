@@ -1,0 +1,1 @@
+"""What speaks for and against a solution: certificates, consistency of loops, edges of little weight."""

@@ -1,0 +1,1 @@
+"""The relaxation rules: the paper's, its stable relative, and RatSLAM's."""
