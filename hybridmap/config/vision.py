@@ -73,8 +73,9 @@ class RelocalisingConfig(AgreementConfig):
 class VisionConfig(Section):
     """Which sensor closes loops, and how."""
 
-    sensor: Literal["auto", "laser", "rgbd", "none"] = "auto"
-    """The sensor to map with; `auto` takes laser if the source has one, else RGB-D."""
+    sensor: str = Field(default="auto", min_length=1)
+    """The front-end to map with: `laser`, `rgbd`, `none`, or one that another package adds. `auto` takes laser if the source
+    has one, else RGB-D."""
     profile: ProfileConfig = ProfileConfig()
     """Scanline profiles."""
     matching: MatchingConfig = MatchingConfig()

@@ -30,7 +30,7 @@ _COUNT_OF: dict[type, str] = {SelfMotion: "odometry", LaserScan: "scans", RgbdFr
 class BagStream:
     """ROS 1 bag, ROS 2 folder, `.mcap` or `.db3` file.
 
-    Samples carry header stamps. The rig holds the sensor that is mapped with: `vision.sensor`, or with `auto` the laser
+    Samples carry header stamps. The rig holds the sensor that is mapped with: `vision.sensor`, or with any other name the laser
     if the bag has one, else the camera.
     """
 
@@ -163,11 +163,11 @@ class BagStream:
         wanted, chosen, source = self._config.vision.sensor, self.selection, str(self._bag.path)
         if wanted == "none":
             return SensorPlan()
-        if wanted in ("laser", "auto") and chosen.scan is not None:
+        if wanted != "rgbd" and chosen.scan is not None:
             return plan_scans(chosen.scan, self._index, self._base_frame, self._sensors, source)
         if wanted == "laser":
             raise StreamError(f"{source}: no laser: expected a topic of type sensor_msgs/LaserScan")
-        if wanted == "auto" and chosen.color is None and chosen.depth is None:
+        if wanted != "rgbd" and chosen.color is None and chosen.depth is None:
             return SensorPlan(remarks=["neither scans nor colour and depth pictures: self-motion alone"])
         return plan_frames(chosen, self._index, self._base_frame, self._sensors, source)
 

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from hybridmap.config.vision import VisionConfig
-from hybridmap.errors import StreamError
+from hybridmap.errors import ConfigError, StreamError
 from hybridmap.metrics import StageClock
+from hybridmap.plugins import Table
 from hybridmap.streams.base import Rig
 from hybridmap.vision.base import FrontEnd
 
-__all__ = ["create_front_end"]
+__all__ = ["Factory", "create_front_end", "register"]
+
+Factory = Callable[[VisionConfig, Rig, int, StageClock], FrontEnd | None]
+"""Makes a front-end from its settings, the sensors of the source, a seed, and a clock for stages of its own."""
 
 
 def _laser(config: VisionConfig, rig: Rig, seed: int, clock: StageClock) -> FrontEnd:
@@ -28,11 +34,26 @@ def _rgbd(config: VisionConfig, rig: Rig, seed: int, clock: StageClock) -> Front
     return RgbdFrontEnd(config, rig.camera, seed, clock)
 
 
-_FRONT_ENDS = {"laser": _laser, "rgbd": _rgbd}
+def _none(config: VisionConfig, rig: Rig, seed: int, clock: StageClock) -> None:
+    del config, rig, seed, clock
+
+
+_FRONT_ENDS: Table[Factory] = Table(
+    "front-end", {"laser": _laser, "rgbd": _rgbd, "none": _none}, "hybridmap.front_ends", ConfigError
+)
+
+
+def register(name: str, factory: Factory) -> None:
+    """Add a front-end, which `vision.sensor` then takes by its name; packages have entry points `hybridmap.front_ends`.
+
+    Raises:
+        ConfigError: there is one of this name already.
+    """
+    _FRONT_ENDS.register(name, factory)
 
 
 def create_front_end(config: VisionConfig, rig: Rig, seed: int, clock: StageClock | None = None) -> FrontEnd | None:
-    """The front-end for a source: `auto` takes laser if there is one, else RGB-D, else None (dead reckoning).
+    """The front-end for a source: `auto` takes laser if there is one, else RGB-D; None for `none` (dead reckoning).
 
     Args:
         config: settings of the visual side.
@@ -41,11 +62,10 @@ def create_front_end(config: VisionConfig, rig: Rig, seed: int, clock: StageCloc
         clock: is given the stage `search` by an RGB-D front-end.
 
     Raises:
+        ConfigError: there is no front-end of this name.
         StreamError: the configuration asks for a sensor that the source does not have.
     """
-    sensor: str = config.sensor
+    sensor = config.sensor
     if sensor == "auto":
         sensor = "laser" if rig.laser is not None else "rgbd" if rig.camera is not None else "none"
-    if sensor == "none":
-        return None
     return _FRONT_ENDS[sensor](config, rig, seed, clock or StageClock())
