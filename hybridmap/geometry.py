@@ -20,11 +20,11 @@ IDENTITY.setflags(write=False)
 
 @dataclass(frozen=True, slots=True)
 class RelativePose:
-    """A measured relative pose with its uncertainty.
+    """A measured relative pose with its uncertainty, or many of them.
 
     Attributes:
-        delta: (3,) pose of the target in the frame of the source, m and rad.
-        covariance: (3, 3) of the right perturbation `delta * exp(xi)`, i.e. in the target's frame, m^2 and rad^2.
+        delta: (..., 3) pose of the target in the frame of the source, m and rad.
+        covariance: (..., 3, 3) of the right perturbation `delta * exp(xi)`, i.e. in the target's frame, m^2 and rad^2.
     """
 
     delta: Array
@@ -136,14 +136,14 @@ def compose_relative(first: RelativePose, second: RelativePose) -> RelativePose:
     carry = adjoint(inverse(second.delta))
     return RelativePose(
         compose(first.delta, second.delta),
-        carry @ first.covariance @ carry.T + second.covariance,
+        carry @ first.covariance @ np.swapaxes(carry, -1, -2) + second.covariance,
     )
 
 
 def invert_relative(relative: RelativePose) -> RelativePose:
     """Turn a relative pose round: the source seen from the target."""
     carry = adjoint(relative.delta)
-    return RelativePose(inverse(relative.delta), carry @ relative.covariance @ carry.T)
+    return RelativePose(inverse(relative.delta), carry @ relative.covariance @ np.swapaxes(carry, -1, -2))
 
 
 def transform_points(pose_a_b: ArrayLike, points_b: ArrayLike) -> Array:

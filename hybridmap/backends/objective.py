@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array, log
+from hybridmap.graph.agreement import chi2_quantile
 from hybridmap.graph.pose_graph import PoseGraph
 
 SLACK = 4.0
@@ -62,8 +62,3 @@ def truncated_cost(graph: PoseGraph, poses: Array, bound: float) -> float:
 def gate_of(config: BackendsConfig) -> float:
     """Squared residual from which a loop is held for false: the configured quantile of chi2 with 3 degrees of freedom."""
     return chi2_quantile(config.gnc.quantile)
-
-
-def chi2_quantile(probability: float) -> float:
-    """Quantile of chi2 with 3 degrees of freedom; `scipy.stats` has it too, and takes half a second to import."""
-    return float(2.0 * gammaincinv(1.5, probability))

@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from hybridmap.errors import GraphError
-from hybridmap.geometry import Array, adjoint, compose, inverse
+from hybridmap.geometry import Array, RelativePose, adjoint, between, compose, inverse
 from hybridmap.graph.pose_graph import PoseGraph
 
 _MIN_WEIGHT = 1e-12  # csgraph takes an explicit zero for a missing edge
@@ -37,32 +37,43 @@ class Chain:
     """The way from node to node, and how uncertain it has become.
 
     Attributes:
-        poses: (N, 3) m and rad, node 0 at the origin.
-        covariance: (N, 3, 3) of each node relative to node 0, as a perturbation in the frame of node 0. It only grows: the
-            difference of two is that of the way between them.
+        poses: (N, 3) m and rad.
+        covariance: (N, 3, 3) of the way from node 0 to each, as a perturbation in the frame in which the poses are. It only
+            grows: the difference of two is that of the way between them.
+        breaks: (B,) nodes that no edge of motion joins to the one before; there the poses go on, but nothing is known.
     """
 
     poses: Array
     covariance: Array
+    breaks: NDArray[np.int64]
+
+    def ways(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> RelativePose:
+        """The way between nodes (P,) and nodes (P,), as `agreement.Ways`."""
+        back = adjoint(inverse(self.poses[second]))
+        sign = np.where(second >= first, 1.0, -1.0)[:, None, None]
+        covariance = back @ (sign * (self.covariance[second] - self.covariance[first])) @ back.transpose(0, 2, 1)
+        covariance[np.searchsorted(self.breaks, first, "right") != np.searchsorted(self.breaks, second, "right")] = np.inf
+        return RelativePose(between(self.poses[first], self.poses[second]), covariance)
 
 
-def chain_of(graph: PoseGraph) -> Chain:
+def chain_of(graph: PoseGraph, poses: Array | None = None) -> Chain:
     """The chain of consecutive nodes by its edges of motion; those of the same two nodes count together, as independent.
 
-    Raises:
-        GraphError: no edge of motion joins two consecutive nodes; it names them.
+    Args:
+        graph: the measurements.
+        poses: (N, 3) along which the chain lies; None: as its edges have it, with node 0 at the origin.
     """
     links = _links(graph.with_edges(graph.is_motion))
     steps = np.flatnonzero(links.high == links.low + 1)
-    missing = np.setdiff1d(np.arange(graph.n_nodes - 1), links.low[steps])
-    if len(missing):
-        raise GraphError(f"graph: no edge of motion joins nodes {missing[0]} and {missing[0] + 1}")
-    poses = np.zeros((graph.n_nodes, 3))
-    for node, step in enumerate(links.delta[steps], start=1):
-        poses[node] = compose(poses[node - 1], step)
-    carry = adjoint(poses[1:])
-    grown = np.cumsum(carry @ links.covariance[steps] @ carry.transpose(0, 2, 1), axis=0)
-    return Chain(poses, np.concatenate([np.zeros((1, 3, 3)), grown]))
+    deltas, covariances = np.zeros((graph.n_nodes, 3)), np.zeros((graph.n_nodes, 3, 3))
+    deltas[links.high[steps]], covariances[links.high[steps]] = links.delta[steps], links.covariance[steps]
+    if poses is None:
+        poses = np.zeros((graph.n_nodes, 3))
+        for node in range(1, graph.n_nodes):
+            poses[node] = compose(poses[node - 1], deltas[node])
+    carry = adjoint(poses)
+    grown = np.cumsum(carry @ covariances @ carry.transpose(0, 2, 1), axis=0)
+    return Chain(poses, grown, np.setdiff1d(np.arange(1, graph.n_nodes), links.high[steps]))
 
 
 def relative_covariances(graph: PoseGraph, node: int) -> Array:

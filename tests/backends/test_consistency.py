@@ -5,17 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from graphs_for_tests import laps
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.stats import chi2 as chi2_law
 
 from hybridmap import backends
 from hybridmap.backends.base import Solution, SolveReport, SolveStatus
 from hybridmap.backends.following import prefix
 from hybridmap.backends.judging import prefilter
-from hybridmap.backends.judging.consistency import Consistent, _Asked, consistent_loops, largest_clique
+from hybridmap.backends.judging.clusters import loops_of
+from hybridmap.backends.judging.consistency import Consistent, consistent_loops
 from hybridmap.config.backends import BackendsConfig, ConsistencyConfig
 from hybridmap.geometry import adjoint, align, inverse, transform_points
+from hybridmap.graph.agreement import ring
+from hybridmap.graph.uncertainty import chain_of
 from hybridmap.store.codec import report_from_json, report_to_json
 from hybridmap.study.false_loops import inject
 
@@ -49,39 +50,18 @@ def test_true_loops_are_as_far_apart_as_the_stated_noise_has_it():
     apart = []
     for seed in range(20):
         graph, _ = laps(np.random.default_rng(seed), nodes=120, per_lap=40, every=7)
-        loops = np.flatnonzero(graph.is_loop)
-        apart.append(_Asked.by(graph, loops).apart(np.arange(len(loops) - 1), np.arange(1, len(loops))))
+        loops = loops_of(graph, np.flatnonzero(graph.is_loop))
+        first = np.arange(len(loops.older) - 1)
+        apart.append(ring(loops[first], loops[first + 1], chain_of(graph).ways).distance)
     law = chi2_law(df=3)
     found = np.quantile(np.concatenate(apart), [0.25, 0.5, 0.9])
     assert found == pytest.approx(law.ppf([0.25, 0.5, 0.9]), rel=0.25)
 
 
-def test_it_does_not_matter_from_which_end_a_loop_is_told(drive):
-    graph, _ = drive
-    loops = np.flatnonzero(graph.is_loop)
-    first, second = np.zeros(len(loops) - 1, dtype=np.int64), np.arange(1, len(loops))
-    told = _Asked.by(graph, loops).apart(first, second)
-    assert np.allclose(_Asked.by(turned(graph, loops[::2]), loops).apart(first, second), told)
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(1, 40), st.integers(0, 2**32 - 1), st.floats(0.0, 1.0))
-def test_a_clique_is_one_and_nothing_can_be_added_to_it(count, seed, density):
-    rng = np.random.default_rng(seed)
-    adjacent = np.triu(rng.random((count, count)) < density, 1)
-    adjacent = adjacent | adjacent.T | np.eye(count, dtype=bool)
-    members = largest_clique(adjacent)
-    assert adjacent[np.ix_(members, members)].all()
-    assert members.any()
-    assert not adjacent[np.ix_(~members, members)].all(axis=1).any()
-
-
-def test_a_planted_clique_is_found():
-    rng = np.random.default_rng(0)
-    adjacent = np.triu(rng.random((60, 60)) < 0.4, 1)
-    planted = np.arange(60) % 2 == 0
-    adjacent |= np.triu(np.outer(planted, planted), 1)
-    assert np.array_equal(largest_clique(adjacent | adjacent.T | np.eye(60, dtype=bool)), planted)
+def test_it_does_not_matter_from_which_end_loops_are_told(drive):
+    graph = inject(drive[0], 0.3, "random", np.random.default_rng(1))
+    told = consistent_loops(turned(graph, np.flatnonzero(graph.is_loop)[::2]), CONFIG)
+    assert np.array_equal(told.loops, consistent_loops(graph, CONFIG).loops)
 
 
 @pytest.mark.parametrize("mode", ["random", "aliased"])

@@ -7,10 +7,9 @@ import pytest
 from graphs_for_tests import laps
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
 
 from hybridmap.backends.gtsam.factors import NoiseModels, factors, values
-from hybridmap.backends.objective import chi2, chi2_quantile, residuals, squared_norms
+from hybridmap.backends.objective import chi2, residuals, squared_norms
 from hybridmap.geometry import between, compose, exp, inverse, log
 
 
@@ -27,11 +26,6 @@ def test_a_residual_is_the_logarithm_of_the_edge_undone():
     poses = compose(truth, exp(rng.normal(size=truth.shape) * [1.0, 1.0, 1.5]))
     off = compose(inverse(graph.deltas), between(poses[graph.sources], poses[graph.targets]))
     assert np.allclose(residuals(graph, poses), log(off), atol=1e-12)
-
-
-def test_the_gate_is_the_quantile_of_chi2():
-    for probability in (0.5, 0.95, 0.999):
-        assert chi2_quantile(probability) == pytest.approx(stats.chi2.ppf(probability, df=3), rel=1e-12)
 
 
 def test_chi2_is_zero_where_the_measurements_are_kept_and_its_expectation_is_their_number():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybridmap.errors import GraphError
-from hybridmap.geometry import RelativePose, adjoint, compose, compose_relative, inverse, invert_relative
+from hybridmap.geometry import RelativePose, compose, compose_relative, invert_relative
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.graph.uncertainty import chain_of, relative_covariances
@@ -93,17 +93,20 @@ def test_an_unknown_node_is_refused():
         relative_covariances(graph_of([(0, 1)], np.random.default_rng(0), 2), 9)
 
 
-def test_the_way_between_two_nodes_of_a_chain_is_the_difference_of_theirs():
+def test_the_way_between_two_nodes_of_a_chain_is_that_along_its_edges():
     graph = graph_of([(0, 1), (2, 1), (2, 3), (3, 4), (2, 3)], np.random.default_rng(0), 5)
     chain = chain_of(graph)
-    for source, target in ((0, 4), (1, 3), (2, 4)):
-        between_them = chain.covariance[target] - chain.covariance[source]
-        at_target = adjoint(inverse(chain.poses[target])) @ between_them @ adjoint(inverse(chain.poses[target])).T
-        assert np.allclose(at_target, relative_covariances(graph, source)[target])
+    first, second = np.array([0, 1, 2, 3]), np.array([4, 3, 4, 0])
+    ways = chain.ways(first, second)
+    for delta, covariance, source, target in zip(ways.delta, ways.covariance, first, second, strict=True):
+        assert np.allclose(covariance, relative_covariances(graph, source)[target])
+        assert np.allclose(compose(chain.poses[source], delta), chain.poses[target])
     assert np.allclose(compose(chain.poses[3], graph.deltas[3]), chain.poses[4])
 
 
-def test_a_broken_chain_is_refused_with_the_place():
+def test_nothing_is_known_of_a_way_across_a_break():
     graph = graph_of([(0, 1), (1, 2), (1, 3), (3, 4)], np.random.default_rng(0), 5)
-    with pytest.raises(GraphError, match="nodes 2 and 3"):
-        chain_of(graph)
+    chain = chain_of(graph)
+    assert chain.breaks.tolist() == [3]
+    known = np.isfinite(chain.ways(np.array([0, 2, 3, 4]), np.array([2, 3, 4, 1])).covariance).all(axis=(1, 2))
+    assert known.tolist() == [True, False, True, False]

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import splu
 
-from hybridmap.backends.objective import SLACK, chi2_quantile, residuals
+from hybridmap.backends.objective import SLACK, residuals
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, adjoint, between
+from hybridmap.graph.agreement import chi2_quantile
 from hybridmap.graph.pose_graph import PoseGraph
 
 _AT_ONCE = 64  # pairs of nodes, whose columns are dense

@@ -1,0 +1,130 @@
+"""Whether loops agree with each other through the chain, and the largest set of loops that do.
+
+Two loops, the way between their older ends and the way between their newer ends form a ring. If all four are right, the ring
+closes within its uncertainty. Mangelson et al., "Pairwise Consistent Measurement Set Maximization for Robust Multi-robot Map
+Merging" (2018), keep the largest set of loops that are consistent in pairs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+from hybridmap.geometry import Array, RelativePose, between, compose_relative, invert_relative, log
+
+Indices = NDArray[np.int64]
+Ways = Callable[[Indices, Indices], RelativePose]
+"""How the robot came from nodes (P,) to nodes (P,): the latter seen from the former. Not finite where nothing is known."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loops:
+    """Measured loops, all told from the older node.
+
+    Attributes:
+        older, newer: (L,) nodes.
+        relative: pose (L, 3) of the newer node in the frame of the older one, with its covariance (L, 3, 3).
+    """
+
+    older: Indices
+    newer: Indices
+    relative: RelativePose
+
+    @classmethod
+    def of(cls, sources: Indices, targets: Indices, relative: RelativePose) -> Loops:
+        """Loops as they were measured: `relative` is the targets (L,) seen from the sources (L,)."""
+        back, forward = invert_relative(relative), sources < targets
+        delta = np.where(forward[:, None], relative.delta, back.delta)
+        covariance = np.where(forward[:, None, None], relative.covariance, back.covariance)
+        return cls(np.minimum(sources, targets), np.maximum(sources, targets), RelativePose(delta, covariance))
+
+    def __getitem__(self, chosen: Indices) -> Loops:
+        """Some of them (P,)."""
+        relative = RelativePose(self.relative.delta[chosen], self.relative.covariance[chosen])
+        return Loops(self.older[chosen], self.newer[chosen], relative)
+
+
+@dataclass(frozen=True, slots=True)
+class Ring:
+    """By how much rings fail to close.
+
+    Attributes:
+        error: (P, 3) twist (m, m, rad) in the frame of the newer node of the second loop.
+        covariance: (P, 3, 3) of it.
+    """
+
+    error: Array
+    covariance: Array
+
+    @property
+    def distance(self) -> Array:
+        """Squared Mahalanobis distance (P,): chi2 with 3 degrees of freedom where all is right; infinite where unknown."""
+        known: NDArray[np.bool_] = np.asarray(np.isfinite(self.covariance).all(axis=(-2, -1)))
+        error, covariance = self.error[known], self.covariance[known]
+        out = np.full(len(known), np.inf)
+        out[known] = np.einsum("ei,ei->e", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+        return out
+
+
+def ring(first: Loops, second: Loops, ways: Ways) -> Ring:
+    """Close rings (P,): by the first loop and on to the newer end of the second, against the second loop itself.
+
+    The four parts count as independent, although the ways between older and between newer ends may overlap.
+    """
+    with np.errstate(invalid="ignore"):  # a way of which nothing is known
+        along_new = compose_relative(first.relative, ways(first.newer, second.newer))
+        along_old = compose_relative(ways(first.older, second.older), second.relative)
+    error = log(between(along_old.delta, along_new.delta))
+    return Ring(error, along_new.covariance + along_old.covariance)
+
+
+def agreement(loops: Loops, ways: Ways, bound: float) -> NDArray[np.bool_]:
+    """Which loops agree in pairs: (L, L), symmetric, with a true diagonal. Costs L^2 / 2 rings.
+
+    Args:
+        loops: L of them.
+        ways: between their ends.
+        bound: largest squared Mahalanobis distance of a pair that agrees; see `chi2_quantile`.
+    """
+    count = len(loops.older)
+    out = np.eye(count, dtype=bool)
+    for first in range(count - 1):
+        rest = np.arange(first + 1, count)
+        out[first, rest] = out[rest, first] = ring(loops[np.full(len(rest), first)], loops[rest], ways).distance <= bound
+    return out
+
+
+def largest_consistent_set(
+    agree: NDArray[np.bool_], weights: Array | None = None, first: int | None = None
+) -> NDArray[np.bool_]:
+    """A set (L,) of large weight whose members all agree with each other; not always the largest.
+
+    Again and again the member is added whose agreeing candidates, itself among them, have the largest weight (the greedy step
+    of Pattabiraman et al., "Fast Algorithms for the Maximum Clique Problem on Massive Graphs", 2015).
+
+    Args:
+        agree: (L, L) symmetric, with a true diagonal.
+        weights: (L,) positive; None: all 1.
+        first: a member to begin with; None: the best.
+    """
+    weights = np.ones(len(agree)) if weights is None else weights
+    members, possible = np.zeros(len(agree), dtype=bool), np.ones(len(agree), dtype=bool)
+    support = agree @ weights  # of each, among those still possible
+    best = first
+    while np.any(candidates := possible & ~members):
+        best = int(np.argmax(np.where(candidates, support, -1.0))) if best is None else best
+        members[best] = True
+        gone = possible & ~agree[best]
+        support -= agree[:, gone] @ weights[gone]
+        possible &= agree[best]
+        best = None
+    return members
+
+
+def chi2_quantile(probability: float) -> float:
+    """Quantile of chi2 with 3 degrees of freedom; `scipy.stats` has it too, and takes half a second to import."""
+    return float(2.0 * gammaincinv(1.5, probability))
