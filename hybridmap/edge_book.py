@@ -8,10 +8,7 @@ from hybridmap.backends.base import SolveReport
 from hybridmap.config.mapping import EdgesConfig
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
-from hybridmap.vision.base import Doubted, Proposal, Verdict
-
-_KINDS = {"loop": EdgeKind.LOOP, "registration": EdgeKind.REGISTRATION}
-_STATUS = {Verdict.ACCEPTED: Status.ACCEPTED, Verdict.PENDING: Status.PENDING, Verdict.REJECTED: Status.REJECTED}
+from hybridmap.vision.base import Doubted
 
 
 class EdgeBook:
@@ -27,24 +24,15 @@ class EdgeBook:
         self._edge_of_proposal: dict[int, int] = {}
         self.tried_again: tuple[int, ...] = ()
 
-    def enter(self, proposals: list[Proposal]) -> list[int]:
+    def enter(self, proposals: list[Edge]) -> list[int]:
         """Write proposals into the map; a later one with the same key replaces the edge of the earlier. Returns the edges."""
         changed = []
         for proposal in proposals:
-            edge = Edge(
-                proposal.source,
-                proposal.target,
-                _KINDS[proposal.kind],
-                _STATUS[proposal.verdict],
-                proposal.reason,
-                proposal.relative,
-                proposal.scores,
-            )
             if proposal.key in self._edge_of_proposal:
                 number = self._edge_of_proposal[proposal.key]
-                self._map.update_edge(number, edge)
+                self._map.update_edge(number, proposal)
             else:
-                number = self._edge_of_proposal[proposal.key] = self._map.add_edge(edge)
+                number = self._edge_of_proposal[proposal.key] = self._map.add_edge(proposal)
             changed.append(number)
             if proposal.contradicts_odometry and self._config.drop_contradicted:
                 changed += self._drop_odometry(proposal)
@@ -56,13 +44,13 @@ class EdgeBook:
         numbers = [number for number in report.rejected_edge_ids if number in key_of]
         return [Doubted(key_of[n], self._map.edge(n).source, self._map.edge(n).target) for n in numbers]
 
-    def enter_again(self, proposals: list[Proposal], backend: str) -> list[int]:
+    def enter_again(self, proposals: list[Edge], backend: str) -> list[int]:
         """Write what became of loops that were measured again because a back-end held them for false."""
         words = {
-            Verdict.ACCEPTED: f"measured again, as {backend} had given it no weight: ",
-            Verdict.REJECTED: f"given no weight by {backend} and not found again on its map: ",
+            Status.ACCEPTED: f"measured again, as {backend} had given it no weight: ",
+            Status.REJECTED: f"given no weight by {backend} and not found again on its map: ",
         }
-        again = [replace(p, reason=words.get(p.verdict, "") + p.reason) for p in proposals]
+        again = [replace(p, reason=words.get(p.status, "") + p.reason) for p in proposals]
         self.tried_again = tuple(self.enter(again))
         return list(self.tried_again)
 
@@ -75,7 +63,7 @@ class EdgeBook:
             self._map.update_edge(number, replace(edge, reason=reason))
         return list(report.rejected_edge_ids)
 
-    def _drop_odometry(self, proposal: Proposal) -> list[int]:
+    def _drop_odometry(self, proposal: Edge) -> list[int]:
         ends = {proposal.source, proposal.target}
         dropped = [
             number

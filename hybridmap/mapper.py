@@ -27,7 +27,7 @@ from hybridmap.streams.rig import rig_of
 from hybridmap.streams.synchronise import Ready, Synchroniser
 from hybridmap.trajectory import NS_PER_S, stamp_ns_from_s
 from hybridmap.vision import create_front_end
-from hybridmap.vision.base import Belief, Proposal, Retraced, RetracingFrontEnd, Verdict, VerifyingFrontEnd, View
+from hybridmap.vision.base import Belief, Retraced, RetracingFrontEnd, VerifyingFrontEnd, View
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +154,7 @@ class Mapper:
                 break
             self._correct()
             updates.append(self._update(pose_odom, "loops proposed again on the optimised map", None, edges))
-            if not any(proposal.verdict is Verdict.ACCEPTED for proposal in proposals):
+            if not any(proposal.status is Status.ACCEPTED for proposal in proposals):
                 break
         if len(self.map):
             self._correct(final=True)
@@ -288,12 +288,12 @@ class Mapper:
         with self.clock.stage("matching"):
             proposals = self.vision.close(node, self.belief())
         edges = self.book.enter(proposals)
-        closed = [proposal for proposal in proposals if proposal.verdict is Verdict.ACCEPTED]
+        closed = [proposal for proposal in proposals if proposal.status is Status.ACCEPTED]
         if closed:
             self._recalibrate(max(closed, key=lambda proposal: proposal.source))
         return edges
 
-    def _recalibrate(self, matched: Proposal) -> None:
+    def _recalibrate(self, matched: Edge) -> None:
         """Bring the cells back to the matched node, which lies in `odom` where the match has it, and hang the robot on it.
 
         Both as configured: `neural.reanchor_weight` (paper eq. 16) and `edges.hanging: ratslam` (OpenRatSLAM).

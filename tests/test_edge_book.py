@@ -15,15 +15,16 @@ from hybridmap.geometry import IDENTITY, RelativePose, between
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.mapper import Mapper
-from hybridmap.vision.base import Doubted, Proposal, Verdict
+from hybridmap.vision.base import Doubted
 from tests.streams_for_tests import RoomDrive
 
 COVARIANCE = np.diag([1e-4, 1e-4, 1e-5])
 
 
-def proposal(key: int, verdict: Verdict = Verdict.ACCEPTED, kind: str = "loop", contradicts: bool = False) -> Proposal:
-    relative = None if verdict is Verdict.REJECTED else RelativePose(np.array([1.0, 0, 0]), COVARIANCE)
-    return Proposal(key, kind, 3, 2 if contradicts else 0, verdict, "as it is", relative, {}, contradicts)
+def proposal(key: int, status: Status = Status.ACCEPTED, kind: EdgeKind = EdgeKind.LOOP, contradicts: bool = False) -> Edge:
+    relative = None if status is Status.REJECTED else RelativePose(np.array([1.0, 0, 0]), COVARIANCE)
+    source = 2 if contradicts else 0
+    return Edge(3, source, kind, status, "as it is", relative, key=key, contradicts_odometry=contradicts)
 
 
 @pytest.fixture
@@ -42,13 +43,13 @@ def report(*rejected: int) -> SolveReport:
 
 
 def test_a_later_proposal_of_the_same_key_replaces_the_edge(book):
-    assert book.enter([proposal(7, Verdict.PENDING)]) == [3]
-    assert book.enter([proposal(7), proposal(8, Verdict.REJECTED)]) == [3, 4]
+    assert book.enter([proposal(7, Status.PENDING)]) == [3]
+    assert book.enter([proposal(7), proposal(8, Status.REJECTED)]) == [3, 4]
     assert [edge.status for edge in book._map.edges[3:]] == [Status.ACCEPTED, Status.REJECTED]
 
 
 def test_a_contradicted_odometry_edge_is_dropped(book):
-    assert book.enter([proposal(0, kind="registration", contradicts=True)]) == [3, 2]
+    assert book.enter([proposal(0, kind=EdgeKind.REGISTRATION, contradicts=True)]) == [3, 2]
     assert book._map.edge(2).status is Status.REJECTED
     assert "contradicted" in book._map.edge(2).reason
 
@@ -66,7 +67,7 @@ def test_loops_without_weight_are_named_with_their_keys(book):
 
 def test_what_became_of_them_is_said(book):
     book.enter([proposal(5), proposal(6)])
-    assert book.enter_again([proposal(5), proposal(6, Verdict.REJECTED)], "gtsam-gnc") == [3, 4]
+    assert book.enter_again([proposal(5), proposal(6, Status.REJECTED)], "gtsam-gnc") == [3, 4]
     found, lost = book._map.edge(3), book._map.edge(4)
     assert found.status is Status.ACCEPTED
     assert "measured again" in found.reason
@@ -83,7 +84,7 @@ def test_a_loop_that_was_measured_wrongly_is_measured_again_at_the_end():
     mapper.finish()
     loop = next(e for e in mapper.map.edges if e.kind is EdgeKind.LOOP and e.status is Status.ACCEPTED)
     wrong = RelativePose(np.array([0.9, 0.8, 0.4]), COVARIANCE)
-    [spoilt] = mapper.book.enter([Proposal(900, "loop", loop.source, loop.target, Verdict.ACCEPTED, "made up", wrong)])
+    [spoilt] = mapper.book.enter([replace(loop, relative=wrong, key=900, since_node=-1)])
     updates = mapper.finish()
     solution, edge = mapper.backends.solutions["gtsam-gnc"], mapper.map.edge(spoilt)
     assert mapper.book.tried_again == (spoilt,)

@@ -31,6 +31,8 @@ class Status(StrEnum):
 class Edge:
     """A relative pose between two nodes, in the frame of the source, with its fate.
 
+    A front-end proposes one under a key of its own; it gets its number from the map.
+
     Attributes:
         source, target: node numbers.
         kind: where it comes from.
@@ -39,6 +41,8 @@ class Edge:
         scores: the figures that the decision rested on.
         since_node: number of the newest node when the edge got its present status (-1: let the map note it), so that a
             replay brings an edge that was committed late at the same moment.
+        key: number within the front-end that proposed it (-1: none did): a later proposal of the same key replaces this one.
+        contradicts_odometry: a registration so good that the odometry edge beside it is wrong and is to be dropped.
     """
 
     source: int
@@ -49,3 +53,5 @@ class Edge:
     relative: RelativePose | None
     scores: Mapping[str, float] = field(default_factory=dict)
     since_node: int = -1
+    key: int = field(default=-1, kw_only=True, compare=False)
+    contradicts_odometry: bool = field(default=False, kw_only=True)

@@ -6,50 +6,16 @@ solver: what they know reaches it as a `Belief`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from enum import StrEnum
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.geometry import Array, RelativePose
+from hybridmap.graph.edges import Edge
 from hybridmap.streams.base import Observation
-
-
-class Verdict(StrEnum):
-    """State of a proposed edge."""
-
-    ACCEPTED = "accepted"
-    PENDING = "pending"
-    REJECTED = "rejected"
-
-
-@dataclass(frozen=True, slots=True)
-class Proposal:
-    """An edge that vision considered.
-
-    Attributes:
-        key: stable number within the front-end; a later proposal with the same key replaces the verdict of this one.
-        kind: `loop` or `registration` (consecutive nodes: refined self-motion).
-        source, target: nodes; for loops the source is the newer one.
-        verdict: accepted, pending or rejected.
-        reason: one line for people: why.
-        relative: measured pose of the target in the frame of the source; None if none was measured.
-        scores: every figure that the decision rested on, by name (`profile_G`, `inliers`, `fit`, ...).
-        contradicts_odometry: a registration so good that the odometry edge beside it is wrong and is to be dropped.
-    """
-
-    key: int
-    kind: str
-    source: int
-    target: int
-    verdict: Verdict
-    reason: str
-    relative: RelativePose | None = None
-    scores: Mapping[str, float] = field(default_factory=dict)
-    contradicts_odometry: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,13 +67,13 @@ class FrontEnd(Protocol):
     def add_node(self, node: int, view: View) -> None:
         """Make a node of the frame observed last. Nodes are numbered from 0 without gaps."""
 
-    def track(self, node: int, odometry: RelativePose | None) -> list[Proposal]:
+    def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
         """Register the new node to the ones before it; `odometry` is its pose seen from node - 1 (None for the first node)."""
 
-    def close(self, node: int, belief: Belief) -> list[Proposal]:
+    def close(self, node: int, belief: Belief) -> list[Edge]:
         """Look for loop closures of the new node; may also settle proposals that were pending."""
 
-    def finish(self, belief: Belief) -> list[Proposal]:
+    def finish(self, belief: Belief) -> list[Edge]:
         """Re-propose on the optimised map; settle what is pending."""
 
     @property
@@ -131,7 +97,7 @@ class Doubted:
 class VerifyingFrontEnd(FrontEnd, Protocol):
     """A front-end that can measure loops again."""
 
-    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Proposal]:
+    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Edge]:
         """Measure loops again from where their nodes lie on the map; each keeps its key. What is left out stays as it is."""
 
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from hybridmap.config.agreement import AgreementConfig
 from hybridmap.geometry import Array, RelativePose, between, compose, inverse
-from hybridmap.vision.base import Belief, Proposal, Verdict
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.vision.base import Belief
 from hybridmap.vision.whereabouts import Chain, Whereabouts
 
 Indices = NDArray[np.int64]
@@ -36,8 +37,8 @@ class Settlement:
         carried_to: the node to which the robot was carried; None where it is not found, or was not carried.
     """
 
-    proposals: list[Proposal]
-    friends: tuple[Proposal, ...] = ()
+    proposals: list[Edge]
+    friends: tuple[Edge, ...] = ()
     carried_to: int | None = None
 
 
@@ -57,22 +58,22 @@ class Relocaliser:
         self._given_up = given_up
         self._config = config
         self._new_key = new_key
-        self._waiting: list[Proposal] = []
-        self._steps: deque[Proposal] = deque(maxlen=KEPT_STEPS)
+        self._waiting: list[Edge] = []
+        self._steps: deque[Edge] = deque(maxlen=KEPT_STEPS)
 
-    def tracked(self, node: int, chain: Chain, steps: list[Proposal]) -> None:
+    def tracked(self, node: int, chain: Chain, steps: list[Edge]) -> None:
         """Take notice of how a new node was registered to the ones before it."""
         self.whereabouts.tracked(node, chain)
-        self._steps += [step for step in steps if step.verdict is Verdict.ACCEPTED]
+        self._steps += [step for step in steps if step.status is Status.ACCEPTED]
 
-    def settle(self, found: list[Proposal], belief: Belief) -> Settlement:
+    def settle(self, found: list[Edge], belief: Belief) -> Settlement:
         """Let new sightings wait; accept the one that most agree with, and these with it, if they are good enough.
 
         Args:
             found: what was looked at, in any state; those that are pending are sightings.
             belief: the map's; poses on either side of the break are right among themselves.
         """
-        self._waiting += [p for p in found if p.verdict is Verdict.PENDING]
+        self._waiting += [p for p in found if p.status is Status.PENDING]
         out = found + self._expired(belief)
         if not self._waiting:
             return Settlement(out)
@@ -81,7 +82,7 @@ class Relocaliser:
         if not self._enough(chosen, weights, belief):
             return Settlement(out)
         reason = f"lost; {len(chosen)} closures put the robot there"
-        friends = tuple(replace(self._waiting[i], verdict=Verdict.ACCEPTED, reason=reason) for i in chosen.tolist())
+        friends = tuple(replace(self._waiting[i], status=Status.ACCEPTED, reason=reason) for i in chosen.tolist())
         self._waiting = [s for i, s in enumerate(self._waiting) if i not in set(chosen.tolist())]
         out += [*friends, *self.dismiss("contradicts the closures that put the robot elsewhere")]
         broken_at = self.whereabouts.break_before(min(s.source for s in friends))
@@ -91,13 +92,13 @@ class Relocaliser:
             out + (self.rehang(carried_to, friends, belief) if carried_to is not None else []), friends, carried_to
         )
 
-    def dismiss(self, reason: str | None = None) -> list[Proposal]:
+    def dismiss(self, reason: str | None = None) -> list[Edge]:
         """Refuse all sightings that wait; without a reason they are given up."""
-        out = [replace(s, verdict=Verdict.REJECTED, reason=reason or self._given_up) for s in self._waiting]
+        out = [replace(s, status=Status.REJECTED, reason=reason or self._given_up) for s in self._waiting]
         self._waiting = []
         return out
 
-    def rehang(self, broken_at: int, friends: tuple[Proposal, ...], belief: Belief) -> list[Proposal]:
+    def rehang(self, broken_at: int, friends: tuple[Edge, ...], belief: Belief) -> list[Edge]:
         """Take back what was registered across a break, and hang the node behind it where its sightings have it.
 
         Args:
@@ -112,18 +113,18 @@ class Relocaliser:
         reason = f"the robot was carried between nodes {broken_at - 1} and {broken_at}; before that was known: "
         return [
             *(
-                replace(step, verdict=Verdict.REJECTED, reason=reason + step.reason, contradicts_odometry=False)
+                replace(step, status=Status.REJECTED, reason=reason + step.reason, contradicts_odometry=False)
                 for step in crossing
             ),
             self._rehung(broken_at, friends, belief),
         ]
 
-    def _expired(self, belief: Belief) -> list[Proposal]:
+    def _expired(self, belief: Belief) -> list[Edge]:
         """Refuse sightings that have waited too long."""
         oldest_m = float(belief.travel_m[-1]) - self._config.wait_m
         old = [s for s in self._waiting if belief.travel_m[s.source] < oldest_m]
         self._waiting = [s for s in self._waiting if belief.travel_m[s.source] >= oldest_m]
-        return [replace(s, verdict=Verdict.REJECTED, reason=self._given_up) for s in old]
+        return [replace(s, status=Status.REJECTED, reason=self._given_up) for s in old]
 
     def _agreement(self, belief: Belief) -> NDArray[np.bool_]:
         """(n, n) which sightings put the robot at the same pose, each carried along the chain to the newest node."""
@@ -156,11 +157,11 @@ class Relocaliser:
                 return True
         return False
 
-    def _carried(self, broken_at: int, friends: tuple[Proposal, ...], belief: Belief) -> bool:
+    def _carried(self, broken_at: int, friends: tuple[Edge, ...], belief: Belief) -> bool:
         off = between(belief.poses_map_node[broken_at], placed_by(friends, broken_at, belief.poses_map_node))
         return bool(np.hypot(off[0], off[1]) > WHERE_IT_WAS * REHUNG_M or abs(off[2]) > WHERE_IT_WAS * REHUNG_RAD)
 
-    def _rehung(self, broken_at: int, friends: tuple[Proposal, ...], belief: Belief) -> Proposal:
+    def _rehung(self, broken_at: int, friends: tuple[Edge, ...], belief: Belief) -> Edge:
         """The edge into the node at which the chain broke, by way of the closures; it contradicts the odometry beside it."""
         poses = belief.poses_map_node
         middle = placed_by(friends, broken_at, poses)
@@ -168,8 +169,16 @@ class Relocaliser:
         moved_m = float(np.hypot(*(middle - poses[broken_at])[:2]))
         reason = f"carried: {len(friends)} closures put the robot {moved_m:.1f} m from where the odometry has it"
         scores = {"closures": float(len(friends)), "carried_m": moved_m}
-        return Proposal(
-            self._new_key(), "registration", broken_at - 1, broken_at, Verdict.ACCEPTED, reason, relative, scores, True
+        return Edge(
+            broken_at - 1,
+            broken_at,
+            EdgeKind.REGISTRATION,
+            Status.ACCEPTED,
+            reason,
+            relative,
+            scores,
+            key=self._new_key(),
+            contradicts_odometry=True,
         )
 
     def _sources(self) -> Indices:
@@ -179,13 +188,13 @@ class Relocaliser:
         return np.array([s.scores.get("mismatch", 0.0) for s in self._waiting])
 
 
-def placed_by(sightings: Sequence[Proposal], at: int, poses: Array) -> Array:
+def placed_by(sightings: Sequence[Edge], at: int, poses: Array) -> Array:
     """Pose (3,) on the map of a node, by the sighting that lies most amid the others."""
     placed = np.array([_placed(s, at, poses) for s in sightings])
     return np.asarray(placed[int(np.argmin(np.abs(placed[:, None, :2] - placed[None, :, :2]).sum(axis=(1, 2))))])
 
 
-def _placed(sighting: Proposal, at: int, poses: Array) -> Array:
+def _placed(sighting: Edge, at: int, poses: Array) -> Array:
     """Pose (3,) on the map of a node of the new piece of chain, as one sighting has it."""
     assert sighting.relative is not None
     seen = compose(poses[sighting.target], inverse(sighting.relative.delta))

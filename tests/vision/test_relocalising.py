@@ -7,7 +7,8 @@ import pytest
 
 from hybridmap.config.agreement import AgreementConfig
 from hybridmap.geometry import RelativePose, between, compose
-from hybridmap.vision.base import Belief, Proposal, Verdict
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.vision.base import Belief
 from hybridmap.vision.relocalising import Relocaliser
 from hybridmap.vision.whereabouts import Chain, Whereabouts
 
@@ -35,7 +36,7 @@ class Search:
         for target, mismatch in sightings:
             scores = {} if mismatch is None else {"mismatch": mismatch}
             relative = RelativePose(np.zeros(3), np.eye(3) * 1e-4)
-            found.append(Proposal(next(self.keys), "loop", node, target, Verdict.PENDING, "waits", relative, scores))
+            found.append(Edge(node, target, EdgeKind.LOOP, Status.PENDING, "waits", relative, scores, key=next(self.keys)))
         self.settlements.append(self.relocaliser.settle(found, seen_until(node)))
         self.proposals |= {p.key: p for p in self.settlements[-1].proposals}
         return self
@@ -45,8 +46,8 @@ class Search:
             self.see(node, (place + node - BROKEN_AT, mismatch))
         return self
 
-    def verdicts(self, kind="loop"):
-        return [p.verdict for p in self.proposals.values() if p.kind == kind]
+    def verdicts(self, kind=EdgeKind.LOOP):
+        return [p.status for p in self.proposals.values() if p.kind is kind]
 
     @property
     def lost(self):
@@ -57,16 +58,17 @@ def seen_until(node):
     return Belief(BELIEF.poses_map_node[: node + 1], BELIEF.stamps_s[: node + 1], X[: node + 1], BELIEF.covariance_from)
 
 
-def step(source, target, verdict=Verdict.ACCEPTED):
-    return Proposal(10**6 + source, "registration", source, target, verdict, "", None, {}, contradicts_odometry=True)
+def step(source, target, status=Status.ACCEPTED):
+    key = 10**6 + source
+    return Edge(source, target, EdgeKind.REGISTRATION, status, "", None, key=key, contradicts_odometry=True)
 
 
 def test_sightings_wait_until_enough_of_them_agree():
     search = Search().drive(range(40, 43), THERE)
-    assert search.verdicts() == [Verdict.PENDING] * 3
+    assert search.verdicts() == [Status.PENDING] * 3
     assert search.lost
     search.drive([43], THERE)
-    assert search.verdicts() == [Verdict.ACCEPTED] * 4
+    assert search.verdicts() == [Status.ACCEPTED] * 4
     assert not search.lost
     assert search.settlements[-1].carried_to == BROKEN_AT
     assert len(search.settlements[-1].friends) == 4
@@ -74,8 +76,8 @@ def test_sightings_wait_until_enough_of_them_agree():
 
 def test_the_chain_is_hung_where_the_sightings_have_it():
     search = Search().drive(range(40, 44), THERE)
-    rehung = next(p for p in search.proposals.values() if p.kind == "registration")
-    assert (rehung.source, rehung.target, rehung.verdict) == (39, 40, Verdict.ACCEPTED)
+    rehung = next(p for p in search.proposals.values() if p.kind is EdgeKind.REGISTRATION)
+    assert (rehung.source, rehung.target, rehung.status) == (39, 40, Status.ACCEPTED)
     assert rehung.contradicts_odometry
     assert compose(BELIEF.poses_map_node[39], rehung.relative.delta) == pytest.approx([X[THERE], 0.0, 0.0])
     assert rehung.scores["carried_m"] == pytest.approx(X[BROKEN_AT] - X[THERE])
@@ -84,7 +86,7 @@ def test_the_chain_is_hung_where_the_sightings_have_it():
 def test_registrations_across_the_break_are_taken_back():
     believed = [step(38, 39), step(39, 40), step(38, 40), step(40, 41)]
     search = Search(steps=believed).drive(range(40, 44), THERE)
-    taken_back = [p for p in search.proposals.values() if p.kind == "registration" and p.verdict is Verdict.REJECTED]
+    taken_back = [p for p in search.proposals.values() if p.kind is EdgeKind.REGISTRATION and p.status is Status.REJECTED]
     assert [(p.source, p.target) for p in taken_back] == [(39, 40), (38, 40)]
     assert all("carried between nodes 39 and 40" in p.reason and not p.contradicts_odometry for p in taken_back)
 
@@ -93,8 +95,8 @@ def test_a_robot_found_where_the_chain_has_it_was_not_carried():
     search = Search(steps=[step(39, 40)])
     for node in range(40, 44):
         search.see(node, (node, None))
-    assert search.verdicts() == [Verdict.ACCEPTED] * 4
-    assert search.verdicts("registration") == []
+    assert search.verdicts() == [Status.ACCEPTED] * 4
+    assert search.verdicts(EdgeKind.REGISTRATION) == []
     assert search.settlements[-1].carried_to is None
     assert not search.lost
 
@@ -119,7 +121,7 @@ def test_a_rival_place_keeps_it_waiting():
     for node in range(46, 60):
         search.see(node, (THERE + node - 40, None))
     assert not search.lost
-    refused = [p for p in search.proposals.values() if p.verdict is Verdict.REJECTED]
+    refused = [p for p in search.proposals.values() if p.status is Status.REJECTED]
     assert {p.target for p in refused} == set(range(ELSEWHERE, ELSEWHERE + 6))
     assert all("contradicts" in p.reason for p in refused)
 
@@ -144,7 +146,7 @@ def test_the_worse_they_fit_the_more_travel_is_needed(mismatch, nodes):
 def test_old_sightings_are_given_up():
     search = Search(AgreementConfig(wait_m=6.0)).drive(range(40, 43), THERE)
     search.see(65)
-    assert search.verdicts() == [Verdict.REJECTED] * 3
+    assert search.verdicts() == [Status.REJECTED] * 3
     assert all(p.reason == "given up" for p in search.proposals.values())
     assert search.relocaliser.dismiss("over") == []
 
@@ -152,7 +154,7 @@ def test_old_sightings_are_given_up():
 def test_what_waits_can_be_dismissed():
     search = Search().drive(range(40, 43), THERE)
     dismissed = search.relocaliser.dismiss("over")
-    assert [(p.verdict, p.reason) for p in dismissed] == [(Verdict.REJECTED, "over")] * 3
+    assert [(p.status, p.reason) for p in dismissed] == [(Status.REJECTED, "over")] * 3
     assert search.relocaliser.dismiss("over") == []
 
 
@@ -163,8 +165,8 @@ def test_sightings_of_a_chain_that_holds_hang_nothing_anew():
     for node in range(40, 44):
         delta = between(BELIEF.poses_map_node[node], BELIEF.poses_map_node[node] + [0.0, 3.0, 0.0])
         relative = RelativePose(delta, np.eye(3) * 1e-4)
-        found.append(Proposal(node, "loop", node, THERE + node - 40, Verdict.PENDING, "waits", relative, {}))
+        found.append(Edge(node, THERE + node - 40, EdgeKind.LOOP, Status.PENDING, "waits", relative, key=node))
     settlement = relocaliser.settle(found, seen_until(43))
     assert len(settlement.friends) == 4
     assert settlement.carried_to is None
-    assert {p.kind for p in settlement.proposals} == {"loop"}
+    assert {p.kind for p in settlement.proposals} == {EdgeKind.LOOP}

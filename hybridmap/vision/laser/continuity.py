@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from hybridmap.config.laser import LaserConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, inverse
+from hybridmap.graph.edges import Edge
 from hybridmap.streams.base import Laser, LaserScan
-from hybridmap.vision.base import Belief, Proposal
+from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import nodes_within
 from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan, merged_at
 from hybridmap.vision.laser.likelihood import build_field
@@ -77,7 +78,7 @@ class Continuity:
         there = self._seen_about(poses[node], near, poses)
         return self._violation(here, there, IDENTITY, self._atlas.ranges) > c.map_violation
 
-    def carried_unnoticed(self, sightings: Sequence[Proposal], belief: Belief) -> int | None:
+    def carried_unnoticed(self, sightings: Sequence[Edge], belief: Belief) -> int | None:
         """The node to which the robot was carried without anything that showed it, once sightings say where it is.
 
         The sightings lie outside the gate: the chain cannot have drifted so far. The scans before that node fit where the

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, Array, RelativePose, compose
+from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.streams.base import Laser, LaserScan, Observation
-from hybridmap.vision.base import Belief, Doubted, Proposal, Retraced, Verdict, View
+from hybridmap.vision.base import Belief, Doubted, Retraced, View
 from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan
 from hybridmap.vision.laser.clusters import Commitment, Settled
 from hybridmap.vision.laser.continuity import Continuity
@@ -84,7 +85,7 @@ class LaserFrontEnd:
         self._profiles.append(view.profile)
         self._node = (node, self._cloud(seen.scan), seen.scan)
 
-    def track(self, node: int, odometry: RelativePose | None) -> list[Proposal]:
+    def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
         """Register the new node to the submap of the last ones."""
         assert self._node is not None
         number, cloud, scan = self._node
@@ -100,7 +101,7 @@ class LaserFrontEnd:
         broken = self._continuity.broken(node, step, odometry, [(seen.motion, seen.scan) for seen in self._between])
         return [self._whole_map.tracked(self._registration(node, step), broken)]
 
-    def close(self, node: int, belief: Belief) -> list[Proposal]:
+    def close(self, node: int, belief: Belief) -> list[Edge]:
         """Look for a lost robot on the whole map; probe the old submaps every few metres; settle what has waited."""
         sought = self._whole_map.search(node, belief)
         travel_m = self._atlas.travel_m[node]
@@ -108,22 +109,22 @@ class LaserFrontEnd:
             return sought.proposals
         out = sought.proposals + self._probe(node, belief)
         settled = [_settled(s) for s in self._commitment.settle(travel_m, belief)]
-        return out + settled + (self._whole_map.closed() if any(p.verdict is Verdict.ACCEPTED for p in settled) else [])
+        return out + settled + (self._whole_map.closed() if any(p.status is Status.ACCEPTED for p in settled) else [])
 
-    def _probe(self, node: int, belief: Belief) -> list[Proposal]:
+    def _probe(self, node: int, belief: Belief) -> list[Edge]:
         self._last_probe_m = self._atlas.travel_m[node]
         hypotheses, out = self._prober.probe(node, belief, self._whole_map.since), []
         self._whole_map.probed(node, hypotheses, belief)
         for hypothesis in hypotheses:
             key = self._next_key()
             if hypothesis.refusal:
-                out.append(_loop(key, hypothesis, Verdict.REJECTED, hypothesis.refusal))
+                out.append(_loop(key, hypothesis, Status.REJECTED, hypothesis.refusal))
             else:
                 self._commitment.add(key, hypothesis)
-                out.append(_loop(key, hypothesis, Verdict.PENDING, "waits for a cluster"))
+                out.append(_loop(key, hypothesis, Status.PENDING, "waits for a cluster"))
         return out
 
-    def finish(self, belief: Belief) -> list[Proposal]:
+    def finish(self, belief: Belief) -> list[Edge]:
         """Probe from where the robot ended and settle all that waits; then register nodes that lie near each other."""
         last, out = len(self._atlas) - 1, []
         if last >= 0 and self._atlas.travel_m[last] - self._last_probe_m > LAST_PROBE_M:
@@ -133,17 +134,17 @@ class LaserFrontEnd:
         if any(s.accepted for s in settled):
             return out
         for hypothesis in self._reviser.round(belief, self._whole_map.since):
-            verdict = Verdict.REJECTED if hypothesis.refusal else Verdict.ACCEPTED
-            out.append(_loop(self._next_key(), hypothesis, verdict, hypothesis.refusal or "near on the optimised map"))
+            status = Status.REJECTED if hypothesis.refusal else Status.ACCEPTED
+            out.append(_loop(self._next_key(), hypothesis, status, hypothesis.refusal or "near on the optimised map"))
         return out
 
-    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Proposal]:
+    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Edge]:
         """Register again, from where they lie on the map, nodes whose loop a back-end holds for false."""
         out = []
         for d in doubted:
             hypothesis = self._reviser.register(d.source, d.target, belief.poses_map_node)
-            verdict = Verdict.REJECTED if hypothesis.refusal else Verdict.ACCEPTED
-            out.append(_loop(d.key, hypothesis, verdict, hypothesis.refusal or "agrees with the map"))
+            status = Status.REJECTED if hypothesis.refusal else Status.ACCEPTED
+            out.append(_loop(d.key, hypothesis, status, hypothesis.refusal or "agrees with the map"))
         return out
 
     def retrace(self, belief: Belief) -> Retraced:
@@ -170,24 +171,24 @@ class LaserFrontEnd:
     def _clouds_between(self) -> Iterator[tuple[Array, Cloud]]:
         return ((seen.motion, self._cloud(seen.scan)) for seen in self._between)
 
-    def _registration(self, node: int, step: Step) -> Proposal:
-        return Proposal(
-            key=self._next_key(),
-            kind="registration",
+    def _registration(self, node: int, step: Step) -> Edge:
+        return Edge(
             source=node - 1,
             target=node,
-            verdict=Verdict.ACCEPTED if step.measured else Verdict.REJECTED,
+            kind=EdgeKind.REGISTRATION,
+            status=Status.ACCEPTED if step.measured else Status.REJECTED,
             reason=step.reason,
             relative=step.relative if step.measured else None,
             scores={"inliers": step.inliers, "fit": step.fit},
+            key=self._next_key(),
             contradicts_odometry=step.contradicts_odometry,
         )
 
 
-def _loop(key: int, hypothesis: Hypothesis, verdict: Verdict, reason: str) -> Proposal:
-    return Proposal(key, "loop", hypothesis.probe, hypothesis.anchor, verdict, reason, hypothesis.relative, hypothesis.scores)
+def _loop(key: int, h: Hypothesis, status: Status, reason: str) -> Edge:
+    return Edge(h.probe, h.anchor, EdgeKind.LOOP, status, reason, h.relative, h.scores, key=key)
 
 
-def _settled(settled: Settled) -> Proposal:
-    verdict = Verdict.ACCEPTED if settled.accepted else Verdict.REJECTED
-    return _loop(settled.key, settled.hypothesis, verdict, settled.reason)
+def _settled(settled: Settled) -> Edge:
+    status = Status.ACCEPTED if settled.accepted else Status.REJECTED
+    return _loop(settled.key, settled.hypothesis, status, settled.reason)

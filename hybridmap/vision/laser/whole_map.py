@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from hybridmap.config.laser import LaserConfig
-from hybridmap.vision.base import Belief, Proposal, Verdict
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.continuity import RECENT_M, Continuity
 from hybridmap.vision.laser.hypotheses import Hypothesis, Prober
 from hybridmap.vision.laser.submap import Atlas
@@ -65,7 +66,7 @@ class WholeMap:
         """The first node of the piece of map that the robot surely is on: 0, or where the chain broke."""
         return self._broken_at or 0
 
-    def tracked(self, registration: Proposal, why: str) -> Proposal:
+    def tracked(self, registration: Edge, why: str) -> Edge:
         """Take notice of how the newest node of the atlas was registered; a new piece begins with it if the chain broke.
 
         Args:
@@ -103,14 +104,14 @@ class WholeMap:
                 self._lost_m = self._atlas.travel_m[node] - self._config.relocalising.from_m
             self._whereabouts.unrecognised()
 
-    def closed(self) -> list[Proposal]:
+    def closed(self) -> list[Edge]:
         """Loops inside the gate have entered the map: the robot is where the map has it, if it is on that piece of it."""
         if self._broken_at is not None:
             return []
         self._whereabouts.recognised()
         return self._relocaliser.dismiss("the robot is where the map had it")
 
-    def finish(self) -> list[Proposal]:
+    def finish(self) -> list[Edge]:
         """The drive is over: sightings that still wait are refused."""
         return self._relocaliser.dismiss()
 
@@ -146,15 +147,15 @@ class WholeMap:
         likeliest = list(dict.fromkeys(following.tolist()))[:most]
         return [anchors[i] for i in sorted(likeliest)]
 
-    def _sighting(self, h: Hypothesis) -> Proposal:
+    def _sighting(self, h: Hypothesis) -> Edge:
         scores = {name: value for name, value in h.scores.items() if name not in GATED} | {"whole_map": 1.0}
-        verdict, reason = Verdict.REJECTED, h.refusal
+        status, reason = Status.REJECTED, h.refusal
         if not h.refusal:
             misfit = self._misfits / self._steps
             worse = max(1.0, self._config.relocalising.misfit / misfit)
             scores["mismatch"] = worse * (1.0 - scores["fit"] + scores["violation"])
-            verdict, reason = Verdict.PENDING, "lost: waits for other submaps that put the robot there"
-        return Proposal(self._new_key(), "loop", h.probe, h.anchor, verdict, reason, h.relative, scores)
+            status, reason = Status.PENDING, "lost: waits for other submaps that put the robot there"
+        return Edge(h.probe, h.anchor, EdgeKind.LOOP, status, reason, h.relative, scores, key=self._new_key())
 
     def _found(self, settlement: Settlement, belief: Belief) -> Settlement:
         """The robot knows where it is; where nothing had shown when it was carried, find that out."""

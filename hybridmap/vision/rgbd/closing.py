@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from hybridmap.config.rgbd import RgbdConfig
 from hybridmap.config.vision import MatchingConfig, RelocalisingConfig
 from hybridmap.geometry import Array, RelativePose, between, wrap_angle
+from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.metrics import StageClock
-from hybridmap.vision.base import Belief, Doubted, Proposal, Verdict
+from hybridmap.vision.base import Belief, Doubted
 from hybridmap.vision.gating import GATE_FIELDS, nodes_within
 from hybridmap.vision.profile import Profile
 from hybridmap.vision.relocalising import Relocaliser
@@ -75,14 +76,14 @@ class LoopCloser:
         """Store the profile of the next node."""
         self._matcher.add(profile)
 
-    def close(self, node: int, belief: Belief) -> list[Proposal]:
+    def close(self, node: int, belief: Belief) -> list[Edge]:
         """Look for loops of one node, and settle what was pending."""
         since_m = self._travel_at_closure
         gated = self._gate(node, belief)
         changed = self._try_candidates(node, self._ranked(node, gated), belief) if len(gated) else []
         if self._config.verify != "none":
             broken = self._relocaliser.whereabouts.first_break is not None
-            if not broken and not any(p.verdict is Verdict.ACCEPTED for p in changed):
+            if not broken and not any(p.status is Status.ACCEPTED for p in changed):
                 near = self._nearest(node, 1, belief)
                 changed += self._try_again(node, near, belief, {j for j in near if self._is_sure(node, j, belief)})
             changed += self._relocalise(node, gated, changed, belief)
@@ -92,9 +93,9 @@ class LoopCloser:
             self._revisits.closed(node, since_m, belief)
         return [*changed, *self._support.give_up(before=node - self._closing.pending_nodes)]
 
-    def _catch_up(self, belief: Belief) -> list[Proposal]:
+    def _catch_up(self, belief: Belief) -> list[Edge]:
         """Try a few of the nodes again that a closure has moved."""
-        out: list[Proposal] = []
+        out: list[Edge] = []
         for _ in range(self._closing.repropose_online):
             node = self._revisits.next_moved(belief)
             if node is None:
@@ -104,7 +105,7 @@ class LoopCloser:
                 out += self._try_again(node, near, belief, {j for j in near if self._is_sure(node, j, belief)})
         return out
 
-    def tracked(self, node: int, steps: list[Proposal]) -> None:
+    def tracked(self, node: int, steps: list[Edge]) -> None:
         """Take notice of how a new node was registered to the ones before it."""
         self._relocaliser.tracked(node, chain_of(steps, self._relocalising), steps)
 
@@ -117,10 +118,10 @@ class LoopCloser:
         """What the map file keeps of the newest node's search: `gate` (see `GATE_FIELDS`), `ranked` (n, 3): node, G, shift."""
         return dict(self._note) if node == self._noted else {}
 
-    def _relocalise(self, node: int, gated: Indices, changed: list[Proposal], belief: Belief) -> list[Proposal]:
+    def _relocalise(self, node: int, gated: Indices, changed: list[Edge], belief: Belief) -> list[Edge]:
         """Keep account of whether the robot knows where it is; while it does not, look for it on the whole map."""
         whereabouts = self._relocaliser.whereabouts
-        if any(p.verdict is Verdict.ACCEPTED for p in changed):
+        if any(p.status is Status.ACCEPTED for p in changed):
             whereabouts.recognised()
             return self._relocaliser.dismiss("the robot is where the map had it")
         near, turn = self._relocalising.known_m, np.deg2rad(self._relocalising.known_deg)
@@ -138,9 +139,9 @@ class LoopCloser:
             self._travel_at_closure = float(belief.travel_m[node])
         return found.proposals
 
-    def finish(self, belief: Belief) -> list[Proposal]:
+    def finish(self, belief: Belief) -> list[Edge]:
         """Try pairs that the optimised map puts side by side and that are not joined yet; then settle everything."""
-        out: list[Proposal] = []
+        out: list[Edge] = []
         if self._rounds_left > 0 and self._closing.repropose_m > 0 and self._config.verify != "none":
             self._rounds_left -= 1
             first_break = self._relocaliser.whereabouts.first_break
@@ -152,15 +153,15 @@ class LoopCloser:
         out += self._relocaliser.dismiss()
         return [*out, *self._support.give_up(before=len(self._keyframes))]
 
-    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Proposal]:
+    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Edge]:
         """Measure doubted loops again; `belief` is that of the map without them."""
         if self._config.verify == "none":
             return []
         out = []
         for d in doubted:
             found = self._second_look.measure(d, belief)
-            verdict = Verdict.REJECTED if found.relative is None else Verdict.ACCEPTED
-            out.append(Proposal(d.key, "loop", d.source, d.target, verdict, found.reason, found.relative, found.scores))
+            status = Status.REJECTED if found.relative is None else Status.ACCEPTED
+            out.append(Edge(d.source, d.target, EdgeKind.LOOP, status, found.reason, found.relative, found.scores, key=d.key))
             self._support.replace(out[-1])
         return out
 
@@ -204,11 +205,11 @@ class LoopCloser:
                 break
         return chosen
 
-    def _try_candidates(self, node: int, ranked: dict[int, dict[str, float]], belief: Belief) -> list[Proposal]:
+    def _try_candidates(self, node: int, ranked: dict[int, dict[str, float]], belief: Belief) -> list[Edge]:
         """Measure each candidate, the best first, until enough have entered."""
         if self._config.verify == "none":
             return self._accept_unverified(node, ranked, belief)
-        out: list[Proposal] = []
+        out: list[Edge] = []
         entered = 0
         for target, scores in ranked.items():
             if entered == self._closing.accept:
@@ -216,15 +217,13 @@ class LoopCloser:
             self._tried.add((node, target))
             found = self._verifier.verify(self._keyframes[node], self._keyframes[target])
             changed = self._file(node, target, scores, found, belief)
-            entered += changed[0].verdict is Verdict.ACCEPTED
+            entered += changed[0].status is Status.ACCEPTED
             out += changed
         return out
 
-    def _try_again(
-        self, node: int, near: dict[int, dict[str, float]], belief: Belief, by_depth: Collection[int]
-    ) -> list[Proposal]:
+    def _try_again(self, node: int, near: dict[int, dict[str, float]], belief: Belief, by_depth: Collection[int]) -> list[Edge]:
         """Measure pairs that the map puts side by side: by features if that was not tried, else some by depth."""
-        out: list[Proposal] = []
+        out: list[Edge] = []
         for target, scores in near.items():
             found: Verification | None = None
             if (node, target) not in self._tried:
@@ -237,15 +236,15 @@ class LoopCloser:
                 out += self._file(node, target, scores, found, belief)
         return out
 
-    def _file(self, node: int, target: int, scores: dict[str, float], found: Verification, belief: Belief) -> list[Proposal]:
+    def _file(self, node: int, target: int, scores: dict[str, float], found: Verification, belief: Belief) -> list[Edge]:
         """Turn a verification into proposals: its own first, then those that it supports."""
         scores = {**scores, **found.scores}
-        proposal = Proposal(self._new_key(), "loop", node, target, Verdict.REJECTED, found.reason, found.relative, scores)
+        proposal = Edge(node, target, EdgeKind.LOOP, Status.REJECTED, found.reason, found.relative, scores, key=self._new_key())
         if found.relative is None:
             return [proposal]
-        waiting = replace(proposal, verdict=Verdict.PENDING, reason="waits for support")
+        waiting = replace(proposal, status=Status.PENDING, reason="waits for support")
         changed = self._support.file(Hypothesis(waiting, found.relative, found.reason), belief)
-        if changed[0].verdict is Verdict.ACCEPTED:
+        if changed[0].status is Status.ACCEPTED:
             self._travel_at_closure = max(self._travel_at_closure, float(belief.travel_m[node]))
         return changed
 
@@ -268,7 +267,7 @@ class LoopCloser:
                 break
         return chosen
 
-    def _accept_unverified(self, node: int, ranked: dict[int, dict[str, float]], belief: Belief) -> list[Proposal]:
+    def _accept_unverified(self, node: int, ranked: dict[int, dict[str, float]], belief: Belief) -> list[Edge]:
         """The seed's way: the best match is a closure; its shift gives the yaw, and nothing gives the translation."""
         for target, scores in ranked.items():
             delta = np.array([0.0, 0.0, self._yaw_of_shift(int(scores["shift"]))])
@@ -276,5 +275,5 @@ class LoopCloser:
             relative = RelativePose(delta, np.diag(sigma**2))
             self._travel_at_closure = float(belief.travel_m[node])
             reason = "profile below c_t, not verified"
-            return [Proposal(self._new_key(), "loop", node, target, Verdict.ACCEPTED, reason, relative, scores)]
+            return [Edge(node, target, EdgeKind.LOOP, Status.ACCEPTED, reason, relative, scores, key=self._new_key())]
         return []

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, RelativePose
+from hybridmap.graph.edges import Edge
 from hybridmap.metrics import StageClock
 from hybridmap.streams.base import Camera, Observation, RgbdFrame
-from hybridmap.vision.base import Belief, Doubted, Proposal, View
+from hybridmap.vision.base import Belief, Doubted, View
 from hybridmap.vision.profile import image_profile
 from hybridmap.vision.rgbd.closing import LoopCloser
 from hybridmap.vision.rgbd.depth_grid import make_grid, place
@@ -110,21 +111,21 @@ class RgbdFrontEnd:
         self._images.append((node, self._frame))
         self._closer.add_node(view.profile)
 
-    def track(self, node: int, odometry: RelativePose | None) -> list[Proposal]:
+    def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
         """Register the new node to the ones before it."""
         steps = self._tracker.track(node, odometry)
         self._closer.tracked(node, steps)
         return steps
 
-    def close(self, node: int, belief: Belief) -> list[Proposal]:
+    def close(self, node: int, belief: Belief) -> list[Edge]:
         """Look for loop closures of the new node."""
         return self._closer.close(node, belief)
 
-    def finish(self, belief: Belief) -> list[Proposal]:
+    def finish(self, belief: Belief) -> list[Edge]:
         """Re-propose on the optimised map; settle what is pending."""
         return self._closer.finish(belief)
 
-    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Proposal]:
+    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Edge]:
         """Measure again, from where their nodes lie on the map, loops that a back-end holds for false."""
         return self._closer.verify(doubted, belief)
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from hybridmap.config.rgbd import RgbdClosingConfig
 from hybridmap.geometry import RelativePose, between, compose
-from hybridmap.vision.base import Belief, Proposal, Verdict
+from hybridmap.graph.edges import Edge, Status
+from hybridmap.vision.base import Belief
 
 
 @dataclass(slots=True)
@@ -22,7 +23,7 @@ class Hypothesis:
         finding: how.
     """
 
-    proposal: Proposal
+    proposal: Edge
     relative: RelativePose
     finding: str
 
@@ -56,13 +57,13 @@ class Support:
 
     def accepted(self, source: int) -> int:
         """How many edges of a node have entered."""
-        return sum(h.proposal.verdict is Verdict.ACCEPTED for h in self._of_source.get(source, ()))
+        return sum(h.proposal.status is Status.ACCEPTED for h in self._of_source.get(source, ()))
 
-    def file(self, new: Hypothesis, belief: Belief) -> list[Proposal]:
+    def file(self, new: Hypothesis, belief: Belief) -> list[Edge]:
         """Take in a hypothesis; accept it and what it supports if another one agrees. Its own proposal comes first."""
         near = self._beside(new)
-        friends = [h for h in near if h.proposal.verdict is Verdict.PENDING and self._agrees(new, h, belief)]
-        accepted = (h for h in near if h.proposal.verdict is Verdict.ACCEPTED)
+        friends = [h for h in near if h.proposal.status is Status.PENDING and self._agrees(new, h, belief)]
+        accepted = (h for h in near if h.proposal.status is Status.ACCEPTED)
         supported = bool(friends) or self._config.support_nodes == 0 or any(self._agrees(new, h, belief) for h in accepted)
         self._of_source[new.source].append(new)
         self._pending.append(new)
@@ -71,10 +72,10 @@ class Support:
             return [new.proposal]
         changed = [new, *friends]
         for h in changed:
-            h.proposal = replace(h.proposal, verdict=Verdict.ACCEPTED, reason=f"{h.finding}; supported")
+            h.proposal = replace(h.proposal, status=Status.ACCEPTED, reason=f"{h.finding}; supported")
         return [h.proposal for h in changed]
 
-    def replace(self, proposal: Proposal) -> None:
+    def replace(self, proposal: Edge) -> None:
         """A loop was measured again: from now on it supports others as it is now, or no longer."""
         of_source = self._of_source[proposal.source]
         kept = [h for h in of_source if h.proposal.key != proposal.key]
@@ -82,13 +83,13 @@ class Support:
             kept.append(Hypothesis(proposal, proposal.relative, proposal.reason))
         self._of_source[proposal.source] = kept
 
-    def give_up(self, before: int) -> list[Proposal]:
+    def give_up(self, before: int) -> list[Edge]:
         """Reject what nodes before one have waited for too long."""
-        self._pending = [h for h in self._pending if h.proposal.verdict is Verdict.PENDING]
+        self._pending = [h for h in self._pending if h.proposal.status is Status.PENDING]
         late = [h for h in self._pending if h.source < before]
         for h in late:
             self._filed.discard((h.source, h.target))
-            h.proposal = replace(h.proposal, verdict=Verdict.REJECTED, reason="no other edge supports it")
+            h.proposal = replace(h.proposal, status=Status.REJECTED, reason="no other edge supports it")
         return [h.proposal for h in late]
 
     def _beside(self, new: Hypothesis) -> list[Hypothesis]:

@@ -9,8 +9,8 @@ import numpy as np
 
 from hybridmap.config.rgbd import RgbdConfig
 from hybridmap.geometry import Array, RelativePose, between, compose, compose_relative, log, loosest_direction
+from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.streams.base import Camera
-from hybridmap.vision.base import Proposal, Verdict
 from hybridmap.vision.rgbd.depth_grid import place
 from hybridmap.vision.rgbd.depth_registration import Registration, register
 from hybridmap.vision.rgbd.features import match
@@ -44,7 +44,7 @@ class Tracker:
         self._steps: list[RelativePose] = []
         self._refined: list[Array] = []
 
-    def track(self, node: int, odometry: RelativePose | None) -> list[Proposal]:
+    def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
         """Proposals `registration` from earlier nodes to this one; `odometry` is its pose seen from node - 1."""
         if odometry is None or node == 0:
             return []
@@ -54,7 +54,7 @@ class Tracker:
             return []
         proposals = [self._register_back(node, back) for back in range(1, min(self._config.back, node) + 1)]
         first = proposals[0]
-        if first.verdict is Verdict.ACCEPTED and first.relative is not None:
+        if first.status is Status.ACCEPTED and first.relative is not None:
             self._refined[-1] = first.relative.delta
         self._learn(node)
         return proposals
@@ -67,7 +67,7 @@ class Tracker:
         self._measured.pop((node - 2, node - 1), None)
         self._measured.pop((node - 2, node), None)
 
-    def _register_back(self, node: int, back: int) -> Proposal:
+    def _register_back(self, node: int, back: int) -> Edge:
         prior = self._steps[-back]
         start = self._refined[-back]
         for step, refined in zip(self._steps[len(self._steps) - back + 1 :], self._refined[-back + 1 :], strict=False):
@@ -78,7 +78,7 @@ class Tracker:
         pairs = self._pairs(fixed, moving, guess) if self._config.keypoints else None
         fit = register(fixed.surface, moving.surface, guess, prior, self._config, pairs)
         proposal = self._judge(node - back, node, fit, prior)
-        if fit is not None and proposal.verdict is Verdict.ACCEPTED:
+        if fit is not None and proposal.status is Status.ACCEPTED:
             if back <= 2:
                 self._measured[node - back, node] = fit.relative
             if back == 1:
@@ -90,10 +90,11 @@ class Tracker:
         pairs = point_pairs(fixed, moving, matches, self._focal_px, self._config.depth_sigma)
         return None if pairs is None else pairs.near(guess, self._config.keypoint_reach_m)
 
-    def _judge(self, source: int, target: int, fit: Registration | None, prior: RelativePose) -> Proposal:
+    def _judge(self, source: int, target: int, fit: Registration | None, prior: RelativePose) -> Edge:
         key = self._new_key()
         if fit is None:
-            return Proposal(key, "registration", source, target, Verdict.REJECTED, "too little depth in common view")
+            reason = "too little depth in common view"
+            return Edge(source, target, EdgeKind.REGISTRATION, Status.REJECTED, reason, None, key=key)
         held = self._keyframes[source].held or self._keyframes[target].held
         relative = self._level.applied(fit.relative, *self._config.floors(held))
         error = log(between(prior.delta, relative.delta))
@@ -110,14 +111,23 @@ class Tracker:
         far = distance > self._config.contradiction_sigma
         sure = fit.inliers > SURE_INLIERS and fit.slack_m < SURE_SLACK_M
         if fit.inliers < self._config.min_inliers:
-            verdict, reason = Verdict.REJECTED, f"only {fit.inliers:.0%} of the depth in common view fits"
+            status, reason = Status.REJECTED, f"only {fit.inliers:.0%} of the depth in common view fits"
         elif far and not sure:
-            verdict, reason = Verdict.REJECTED, f"{distance:.1f} sigma from odometry without being sure"
+            status, reason = Status.REJECTED, f"{distance:.1f} sigma from odometry without being sure"
         else:
-            verdict, reason = Verdict.ACCEPTED, "depth overrules odometry" if far else "depth registered"
+            status, reason = Status.ACCEPTED, "depth overrules odometry" if far else "depth registered"
             reason += _what_slides(relative, prior)
-        overrules = far and sure and verdict is Verdict.ACCEPTED
-        return Proposal(key, "registration", source, target, verdict, reason, relative, scores, overrules)
+        return Edge(
+            source,
+            target,
+            EdgeKind.REGISTRATION,
+            status,
+            reason,
+            relative,
+            scores,
+            key=key,
+            contradicts_odometry=far and sure and status is Status.ACCEPTED,
+        )
 
 
 def _what_slides(relative: RelativePose, odometry: RelativePose) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.vision import RelocalisingConfig
-from hybridmap.vision.base import Proposal, Verdict
+from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp import Verifier
 from hybridmap.vision.templates import Matcher
@@ -38,7 +38,7 @@ class WholeMap:
         self._config = config
         self._new_key = new_key
 
-    def search(self, node: int, elsewhere: Indices) -> list[Proposal]:
+    def search(self, node: int, elsewhere: Indices) -> list[Edge]:
         """Compare a node, the source, with older nodes (n,), ascending; what is verified waits."""
         return [self._measured(node, target, scores) for target, scores in self._candidates(node, elsewhere).items()]
 
@@ -52,20 +52,20 @@ class WholeMap:
                 chosen[target] = {"profile_G": float(score), "shift": float(shift), "whole_map": 1.0}
         return chosen
 
-    def _measured(self, node: int, target: int, scores: dict[str, float]) -> Proposal:
+    def _measured(self, node: int, target: int, scores: dict[str, float]) -> Edge:
         found = self._verifier.verify(self._keyframes[node], self._keyframes[target])
         scores = {**scores, **found.scores}
-        proposal = Proposal(self._new_key(), "loop", node, target, Verdict.REJECTED, found.reason, found.relative, scores)
+        proposal = Edge(node, target, EdgeKind.LOOP, Status.REJECTED, found.reason, found.relative, scores, key=self._new_key())
         if found.relative is None:
             return proposal
-        return replace(proposal, verdict=Verdict.PENDING, reason="lost: waits for others that put the robot there")
+        return replace(proposal, status=Status.PENDING, reason="lost: waits for others that put the robot there")
 
 
-def chain_of(steps: Sequence[Proposal], config: RelocalisingConfig) -> Chain:
+def chain_of(steps: Sequence[Edge], config: RelocalisingConfig) -> Chain:
     """How a node hangs on those before it, by the registrations that were tried; where none was, it does by the odometry."""
     if not steps or config.candidates == 0:
         return Chain.HOLDS
-    sigmas_m = [step.scores.get("sigma_m", 0.0) for step in steps if step.verdict is Verdict.ACCEPTED]
+    sigmas_m = [step.scores.get("sigma_m", 0.0) for step in steps if step.status is Status.ACCEPTED]
     if not sigmas_m:
         return Chain.BROKEN
     return Chain.DOUBTFUL if min(sigmas_m) > config.doubtful_m else Chain.HOLDS

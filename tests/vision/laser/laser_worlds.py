@@ -8,6 +8,7 @@ import numpy as np
 
 from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import IDENTITY, RelativePose, between, compose
+from hybridmap.graph.edges import EdgeKind
 from hybridmap.streams.base import Laser, LaserScan
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.front_end import LaserFrontEnd
@@ -134,8 +135,8 @@ class Run:
         return Belief(np.array(self.poses) if poses is None else poses, np.zeros(len(travel)), travel, covariance_from)
 
     def loops(self, verdict):
-        final = {p.key: p for p in self.proposals if p.kind == "loop"}
-        return [p for p in final.values() if p.verdict is verdict]
+        final = {p.key: p for p in self.proposals if p.kind is EdgeKind.LOOP}
+        return [p for p in final.values() if p.status is verdict]
 
     def error(self, proposal):
         a, b = self.truth[self.node_at[proposal.source]], self.truth[self.node_at[proposal.target]]

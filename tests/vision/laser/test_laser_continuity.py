@@ -8,8 +8,9 @@ from laser_worlds import LASER, box, cast, ring, ring_drive, room
 
 from hybridmap.config.laser import LaserConfig, LaserRelocalisingConfig, ScanConfig
 from hybridmap.geometry import IDENTITY, RelativePose, between, compose
+from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.streams.base import LaserScan
-from hybridmap.vision.base import Belief, Proposal, Verdict
+from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.cloud import cloud_of_scan
 from hybridmap.vision.laser.continuity import Continuity
 from hybridmap.vision.laser.submap import Atlas
@@ -116,7 +117,7 @@ def sightings(onward):
     for node in range(DOWN + AFTER - 4, DOWN + AFTER):
         there = LAP[node + onward]
         old = int(np.argmin(np.hypot(*(LAP[:PER_LAP] - there)[:, :2].T)))
-        out.append(Proposal(node, "loop", node, old, Verdict.ACCEPTED, "", RelativePose(between(there, LAP[old]), SURE), {}))
+        out.append(Edge(node, old, EdgeKind.LOOP, Status.ACCEPTED, "", RelativePose(between(there, LAP[old]), SURE)))
     return out
 
 

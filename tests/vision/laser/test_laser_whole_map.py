@@ -6,7 +6,7 @@ from laser_worlds import LASER, Run, drifting, ring, ring_drive
 
 from hybridmap.config.laser import LaserConfig, LaserRelocalisingConfig
 from hybridmap.geometry import between, compose
-from hybridmap.vision.base import Verdict
+from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.vision.laser.whole_map import WholeMap
 
 EVERY = 5
@@ -34,18 +34,18 @@ def last_words(run):
 
 def across(run, down):
     """Accepted loops from after the carry to before it."""
-    return [p for p in run.loops(Verdict.ACCEPTED) if p.source >= down > p.target]
+    return [p for p in run.loops(Status.ACCEPTED) if p.source >= down > p.target]
 
 
 def test_the_break_is_noticed_and_the_chain_is_joined_anew(found):
     run, down = found
-    into = [p for p in last_words(run) if p.kind == "registration" and p.target == down]
-    seen = next(p for p in run.proposals if p.target == down and p.kind == "registration")
+    into = [p for p in last_words(run) if p.kind is EdgeKind.REGISTRATION and p.target == down]
+    seen = next(p for p in run.proposals if p.target == down and p.kind is EdgeKind.REGISTRATION)
     assert "may have been carried" in seen.reason
     rejected = next(p for p in into if p.key == seen.key)
-    assert rejected.verdict is Verdict.REJECTED
+    assert rejected.status is Status.REJECTED
     assert f"carried between nodes {down - 1} and {down}" in rejected.reason
-    rehung = next(p for p in into if p.verdict is Verdict.ACCEPTED)
+    rehung = next(p for p in into if p.status is Status.ACCEPTED)
     assert (rehung.source, rehung.target, rehung.contradicts_odometry) == (down - 1, down, True)
     error = run.error(rehung)
     assert np.hypot(error[0], error[1]) < 0.2
@@ -66,14 +66,14 @@ def test_it_is_found_within_five_metres_by_loops_that_are_right(found):
 
 def test_what_was_sought_on_the_whole_map_stays_with_its_figures(found):
     run, down = found
-    sought = [p for p in last_words(run) if p.kind == "loop" and "whole_map" in p.scores]
-    assert all(p.source >= down > p.target and p.verdict is not Verdict.PENDING for p in sought)
+    sought = [p for p in last_words(run) if p.kind is EdgeKind.LOOP and "whole_map" in p.scores]
+    assert all(p.source >= down > p.target and p.status is not Status.PENDING for p in sought)
     assert all(p.reason and {"near", "fit"} <= set(p.scores) and "gate_sigma_m" not in p.scores for p in sought)
 
 
 def test_mismatch_is_held_against_how_well_the_scans_of_the_drive_fit(found):
     run, down = found
-    steps = {p.target: 1.0 - p.scores["fit"] for p in run.proposals if p.kind == "registration" and "fit" in p.scores}
+    steps = {p.target: 1.0 - p.scores["fit"] for p in run.proposals if p.kind is EdgeKind.REGISTRATION and "fit" in p.scores}
     usual = LaserRelocalisingConfig().misfit
     sightings = [p for p in last_words(run) if "mismatch" in p.scores]
     assert len(sightings) >= 4
@@ -129,7 +129,7 @@ def test_in_a_place_that_it_does_not_know_it_is_not_found():
     at_the_end = run.front_end.finish(run.belief(on_top))
     assert run.front_end.lost_since == down
     assert len(at_the_end) > 0
-    assert [p for p in at_the_end if p.source >= down > p.target and p.verdict is not Verdict.REJECTED] == []
+    assert [p for p in at_the_end if p.source >= down > p.target and p.status is not Status.REJECTED] == []
     assert [p for p in at_the_end if p.source >= down > p.target and "whole_map" not in p.scores] == []
 
 
@@ -141,7 +141,7 @@ def test_a_glimpse_of_something_else_is_no_carry():
     run = Run(ring(), truth, drifting(way, np.random.default_rng(2)), EVERY)
     assert [p.target for p in run.proposals if "may have been carried" in p.reason] == [660 // EVERY]
     assert not [p for p in run.proposals if p.reason.startswith("carried:")]
-    assert len([p for p in run.loops(Verdict.ACCEPTED) if "whole_map" in p.scores]) >= 4
+    assert len([p for p in run.loops(Status.ACCEPTED) if "whole_map" in p.scores]) >= 4
     assert len(run.front_end._atlas.pieces) == 1
     assert run.front_end.lost_since is None
     assert run.front_end._whole_map.since == 0

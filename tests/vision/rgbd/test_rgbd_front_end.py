@@ -8,9 +8,10 @@ from hybridmap.config.rgbd import RegistrationConfig, RgbdClosingConfig, RgbdCon
 from hybridmap.config.vision import RelocalisingConfig, VisionConfig
 from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import RelativePose, between, compose
+from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.streams.base import LaserScan, RgbdFrame, Rig
 from hybridmap.vision import create_front_end
-from hybridmap.vision.base import Belief, Verdict
+from hybridmap.vision.base import Belief
 from hybridmap.vision.rgbd.front_end import RgbdFrontEnd
 
 VIEW = camera(width=240)
@@ -83,7 +84,7 @@ def sigmas_off(proposal, poses):
 
 
 def test_consecutive_nodes_are_registered_better_than_odometry(driven, poses):
-    accepted = [p for p in driven[1].values() if p.kind == "registration" and p.verdict is Verdict.ACCEPTED]
+    accepted = [p for p in driven[1].values() if p.kind is EdgeKind.REGISTRATION and p.status is Status.ACCEPTED]
     assert len(accepted) > 1.6 * len(poses)
     assert all(p.source in (p.target - 1, p.target - 2) for p in accepted)
     found = errors(accepted, poses)
@@ -92,8 +93,8 @@ def test_consecutive_nodes_are_registered_better_than_odometry(driven, poses):
 
 
 def test_the_second_lap_closes_on_the_first_and_only_rightly(driven, poses):
-    loops = [p for p in driven[1].values() if p.kind == "loop"]
-    accepted = [p for p in loops if p.verdict is Verdict.ACCEPTED]
+    loops = [p for p in driven[1].values() if p.kind is EdgeKind.LOOP]
+    accepted = [p for p in loops if p.status is Status.ACCEPTED]
     assert len({p.source for p in accepted}) > 0.6 * PER_LAP
     assert all(p.source > p.target for p in accepted)
     found = errors(accepted, poses)
@@ -103,7 +104,7 @@ def test_the_second_lap_closes_on_the_first_and_only_rightly(driven, poses):
 
 
 def test_every_refusal_has_a_reason(driven):
-    rejected = [p for p in driven[1].values() if p.verdict is not Verdict.ACCEPTED]
+    rejected = [p for p in driven[1].values() if p.status is not Status.ACCEPTED]
     assert all(p.reason for p in rejected)
 
 
@@ -123,11 +124,11 @@ def test_a_lone_closure_waits_and_is_given_up(poses, frames):
     there = PER_LAP + 1
     kept = [*range(there), there, 3, 4, 5]  # one revisit, then views too young to close on
     front_end, proposals, odometry = drive(config, poses[kept[: there + 1]], 0.0, [frames[i] for i in kept[: there + 1]])
-    loops = [p for p in proposals.values() if p.kind == "loop" and p.relative is not None]
+    loops = [p for p in proposals.values() if p.kind is EdgeKind.LOOP and p.relative is not None]
     lone = [p for p in loops if len({q.source for q in loops}) == 1]
-    assert all(p.verdict is Verdict.PENDING for p in lone)
+    assert all(p.status is Status.PENDING for p in lone)
     settled = front_end.finish(belief_of(odometry))
-    assert all(p.verdict is Verdict.REJECTED for p in settled if p.key in {q.key for q in lone})
+    assert all(p.status is Status.REJECTED for p in settled if p.key in {q.key for q in lone})
     assert front_end.finish(belief_of(odometry)) == []
 
 
@@ -139,9 +140,9 @@ def test_another_place_is_refused(poses, frames):
     ]
     seen = frames[:PER_LAP] + other
     _, proposals, _ = drive(VisionConfig(), np.concatenate([poses[:PER_LAP], poses[:6]]), 0.0, seen)
-    loops = [p for p in proposals.values() if p.kind == "loop"]
+    loops = [p for p in proposals.values() if p.kind is EdgeKind.LOOP]
     assert loops
-    assert not any(p.verdict is Verdict.ACCEPTED for p in loops)
+    assert not any(p.status is Status.ACCEPTED for p in loops)
 
 
 def test_the_end_joins_by_depth_what_features_cannot(poses):
@@ -151,10 +152,8 @@ def test_the_end_joins_by_depth_what_features_cannot(poses):
     rng = np.random.default_rng(5)
     repapered = [render(VIEW, p, papers[i >= PER_LAP], i * 10**9, 0.002, rng) for i, p in enumerate(poses)]
     front_end, proposals, odometry = drive(config, poses, np.deg2rad(0.1), repapered)
-    assert not any(p.verdict is Verdict.ACCEPTED for p in proposals.values() if p.kind == "loop")
-    found = [
-        p for p in front_end.finish(belief_of(odometry)) if p.verdict is Verdict.ACCEPTED and p.target < PER_LAP <= p.source
-    ]
+    assert not any(p.status is Status.ACCEPTED for p in proposals.values() if p.kind is EdgeKind.LOOP)
+    found = [p for p in front_end.finish(belief_of(odometry)) if p.status is Status.ACCEPTED and p.target < PER_LAP <= p.source]
     assert len({p.source for p in found}) > 4
     assert all("depth agrees with the map" in p.reason for p in found)
     assert np.median(errors(found, poses)[:, 0]) < 0.005
@@ -166,7 +165,7 @@ def test_while_driving_depth_alone_joins_only_where_the_map_is_sure(sigma, joins
     papers = textures(1), textures(2)
     repapered = [render(VIEW, p, papers[i >= PER_LAP], i * 10**9) for i, p in enumerate(poses[: PER_LAP + 5])]
     _, proposals, _ = drive(VisionConfig(relocalising=NOT_CARRIED), poses[: PER_LAP + 5], 0.0, repapered, sigma)
-    accepted = [p for p in proposals.values() if p.kind == "loop" and p.verdict is Verdict.ACCEPTED]
+    accepted = [p for p in proposals.values() if p.kind is EdgeKind.LOOP and p.status is Status.ACCEPTED]
     assert bool(accepted) == joins
 
 
@@ -176,7 +175,7 @@ def test_a_bare_wall_leaves_the_way_along_it_to_odometry_and_says_so(poses, fram
     walls = [RgbdFrame(k * 10**9, bare, (2.5 + 0.01 * rng.normal(size=bare.shape[:2])).astype(np.float32)) for k in range(3)]
     sideways = np.array([[0.0, 0.1 * k, 0.0] for k in range(3)])
     _, proposals, _ = drive(VisionConfig(), sideways, 0.0, walls)
-    free = [p for p in proposals.values() if p.kind == "registration"]
+    free = [p for p in proposals.values() if p.kind is EdgeKind.REGISTRATION]
     assert all("free along" in p.reason and "90 deg" in p.reason and "odometry holds it" in p.reason for p in free)
     _, proposals, _ = drive(VisionConfig(), poses[:3], 0.0, frames[:3])
     assert not any("free along" in p.reason for p in proposals.values())
@@ -201,7 +200,7 @@ def test_frames_without_depth_make_nodes_and_no_edges():
     for node in range(3):
         front_end.add_node(node, front_end.observe(blind, np.zeros(3)))
         found = front_end.track(node, step if node else None)
-        assert all(p.verdict is Verdict.REJECTED for p in found)
+        assert all(p.status is Status.REJECTED for p in found)
     assert front_end.close(2, belief_of(np.zeros((3, 3)))) == []
     assert front_end.finish(belief_of(np.zeros((3, 3)))) == []
 
@@ -210,7 +209,7 @@ def test_frames_without_depth_make_nodes_and_no_edges():
 def test_seed_modes_close_by_the_shift_alone(mode, poses, frames):
     config = VisionConfig(rgbd=RgbdConfig(matching=mode, verify="none", registration=RegistrationConfig(enabled=False)))
     _, proposals, _ = drive(config, poses, 0.0, frames)
-    loops = [p for p in proposals.values() if p.kind == "loop"]
+    loops = [p for p in proposals.values() if p.kind is EdgeKind.LOOP]
     assert loops
     assert all(p.relative.delta[:2] == pytest.approx([0.0, 0.0]) for p in loops)
     assert np.sqrt(np.diag(loops[0].relative.covariance)) == pytest.approx([0.7, 0.7, np.deg2rad(6.0)])
@@ -271,5 +270,5 @@ def test_no_two_edges_join_the_same_nodes(poses, frames):
     front_end, proposals, odometry = drive(VisionConfig(), poses, 0.0, frames, sigma=0.1)
     for _ in range(2):
         proposals |= {p.key: p for p in front_end.finish(belief_of(odometry))}
-    joined = [(p.source, p.target) for p in proposals.values() if p.verdict is Verdict.ACCEPTED]
+    joined = [(p.source, p.target) for p in proposals.values() if p.status is Status.ACCEPTED]
     assert len(joined) == len(set(joined))

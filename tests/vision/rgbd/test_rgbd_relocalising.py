@@ -12,10 +12,9 @@ from hybridmap.backends import create
 from hybridmap.config import Config
 from hybridmap.config.vision import RelocalisingConfig
 from hybridmap.geometry import RelativePose, align, between, compose
-from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import Rig
-from hybridmap.vision.base import Proposal, Verdict
 from hybridmap.vision.rgbd.pnp import Verification
 from hybridmap.vision.rgbd.whole_map import WholeMap, chain_of
 from hybridmap.vision.templates import Matcher
@@ -143,24 +142,24 @@ def test_the_likeliest_views_some_nodes_apart_are_verified():
     config = RelocalisingConfig(candidates=3, separation=4)
     found = WholeMap(keyframes, matcher, verifier, config, iter(range(99)).__next__).search(30, np.arange(25))
     assert len(found) == 3
-    assert (found[0].target, found[0].verdict) == (12, Verdict.PENDING)
+    assert (found[0].target, found[0].status) == (12, Status.PENDING)
     assert "lost" in found[0].reason
-    assert [p.verdict for p in found[1:]] == [Verdict.REJECTED] * 2
+    assert [p.status for p in found[1:]] == [Status.REJECTED] * 2
     assert all(abs(a.target - b.target) >= 4 for a in found for b in found if a is not b)
 
 
-def step(verdict, sigma_m=0.01):
-    return Proposal(0, "registration", 39, 40, verdict, "", None, {"sigma_m": sigma_m})
+def step(status, sigma_m=0.01):
+    return Edge(39, 40, EdgeKind.REGISTRATION, status, "", None, {"sigma_m": sigma_m})
 
 
 @pytest.mark.parametrize(
     ("steps", "chain"),
     [
         ([], Chain.HOLDS),
-        ([step(Verdict.REJECTED), step(Verdict.REJECTED)], Chain.BROKEN),
-        ([step(Verdict.REJECTED), step(Verdict.ACCEPTED)], Chain.HOLDS),
-        ([step(Verdict.ACCEPTED, 0.3), step(Verdict.ACCEPTED, 0.4)], Chain.DOUBTFUL),
-        ([step(Verdict.ACCEPTED, 0.3), step(Verdict.ACCEPTED, 0.02)], Chain.HOLDS),
+        ([step(Status.REJECTED), step(Status.REJECTED)], Chain.BROKEN),
+        ([step(Status.REJECTED), step(Status.ACCEPTED)], Chain.HOLDS),
+        ([step(Status.ACCEPTED, 0.3), step(Status.ACCEPTED, 0.4)], Chain.DOUBTFUL),
+        ([step(Status.ACCEPTED, 0.3), step(Status.ACCEPTED, 0.02)], Chain.HOLDS),
     ],
 )
 def test_one_wall_fits_any_other(steps, chain):

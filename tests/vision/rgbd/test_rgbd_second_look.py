@@ -11,10 +11,10 @@ from hybridmap.config import Config
 from hybridmap.config.rgbd import RgbdClosingConfig, RgbdConfig
 from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import RelativePose, between, compose
-from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import Rig
-from hybridmap.vision.base import Doubted, Proposal, Verdict, VerifyingFrontEnd
+from hybridmap.vision.base import Doubted, VerifyingFrontEnd
 from hybridmap.vision.rgbd.front_end import RgbdFrontEnd
 from hybridmap.vision.rgbd.pnp import Verification, Verifier
 from hybridmap.vision.rgbd.revisits import Revisits
@@ -36,13 +36,13 @@ def frames(poses):
 @pytest.fixture(scope="module")
 def driven(poses, frames):
     front_end, proposals, _ = drive(VisionConfig(), poses, np.deg2rad(0.5), frames)
-    loops = [p for p in proposals.values() if p.kind == "loop" and p.verdict is Verdict.ACCEPTED]
+    loops = [p for p in proposals.values() if p.kind is EdgeKind.LOOP and p.status is Status.ACCEPTED]
     return front_end, loops
 
 
 def again(front_end, loop, poses, sigma=SURE):
     [found] = front_end.verify([Doubted(loop.key, loop.source, loop.target)], belief_of(poses, sigma))
-    assert (found.key, found.source, found.target, found.kind) == (loop.key, loop.source, loop.target, "loop")
+    assert (found.key, found.source, found.target, found.kind) == (loop.key, loop.source, loop.target, EdgeKind.LOOP)
     return found
 
 
@@ -61,7 +61,7 @@ def test_the_front_end_can_measure_again(driven):
 def test_a_true_loop_is_found_again_from_where_the_map_has_it(driven, poses, by):
     front_end, loops = driven
     found = again(front_end, loops[0], moved(poses, loops[0].source, np.array(by)))
-    assert found.verdict is Verdict.ACCEPTED
+    assert found.status is Status.ACCEPTED
     assert "agree" in found.reason
     assert errors([found], poses)[0] == pytest.approx([0.0, 0.0], abs=0.3)
     assert errors([found], poses)[0, 0] < 0.01
@@ -72,24 +72,24 @@ def test_a_loop_between_views_of_different_walls_goes(driven, poses):
     back_to_back = next(
         (i, j) for i in range(PER_LAP, len(poses)) for j in range(i) if abs(np.cos(poses[i, 2] - poses[j, 2]) + 1.0) < 0.05
     )
-    wrong = Proposal(900, "loop", *back_to_back, Verdict.ACCEPTED, "made up", RelativePose(np.zeros(3), 1e-4 * np.eye(3)))
+    wrong = Edge(*back_to_back, EdgeKind.LOOP, Status.ACCEPTED, "made up", RelativePose(np.zeros(3), 1e-4 * np.eye(3)), key=900)
     found = again(front_end, wrong, poses)
-    assert found.verdict is Verdict.REJECTED
+    assert found.status is Status.REJECTED
     assert found.relative is None
     assert "common view" in found.reason or "fits" in found.reason
     assert "features" in found.reason
 
 
-@pytest.mark.parametrize(("sigma", "verdict"), [(SURE, Verdict.REJECTED), (UNSURE, Verdict.ACCEPTED)])
+@pytest.mark.parametrize(("sigma", "verdict"), [(SURE, Status.REJECTED), (UNSURE, Status.ACCEPTED)])
 def test_where_views_and_map_contradict_each_other_it_depends_on_how_sure_the_map_is(driven, poses, sigma, verdict):
     """The same view twice, and a map that has the second one 1.5 m aside: a twin room, or a map that has drifted."""
     front_end, loops = driven
     loop = loops[0]
     found = again(front_end, loop, moved(poses, loop.source, np.array([0.3, 1.5, 0.6])), sigma)
-    assert found.verdict is verdict
+    assert found.status is verdict
     assert "from the map" in found.reason
     assert found.scores["off_m"] > 1.0
-    if verdict is Verdict.ACCEPTED:
+    if verdict is Status.ACCEPTED:
         assert errors([found], poses)[0, 0] < 0.01
 
 
@@ -114,24 +114,24 @@ def test_a_view_that_depth_cannot_confirm_stays_where_features_have_it_near_the_
     nothing = Verification(None, "too little depth in common view", {})
     monkeypatch.setattr(Verifier, "verify_near", lambda *_: nothing)
     found = again(front_end, loops[0], moved(poses, loops[0].source, np.array([0.05, 0.05, 0.01])), sigma=1e-3)
-    assert found.verdict is Verdict.ACCEPTED
+    assert found.status is Status.ACCEPTED
     assert errors([found], poses)[0, 0] < 0.01
 
 
 def test_without_verification_nothing_is_measured_again(poses, frames):
     config = VisionConfig(rgbd=RgbdConfig(verify="none"))
     front_end, proposals, _ = drive(config, poses, 0.0, frames)
-    loop = next(p for p in proposals.values() if p.kind == "loop")
+    loop = next(p for p in proposals.values() if p.kind is EdgeKind.LOOP)
     assert front_end.verify([Doubted(loop.key, loop.source, loop.target)], belief_of(poses)) == []
 
 
 def test_a_retracted_loop_no_longer_supports_others(poses, frames):
     front_end, proposals, _ = drive(VisionConfig(), poses, 0.0, frames)
-    loops = [p for p in proposals.values() if p.kind == "loop" and p.verdict is Verdict.ACCEPTED]
+    loops = [p for p in proposals.values() if p.kind is EdgeKind.LOOP and p.status is Status.ACCEPTED]
     support = front_end._closer._support
     before = support.accepted(loops[0].source)
     away = moved(poses, loops[0].source, np.array([0.3, 1.5, 0.6]))
-    assert again(front_end, loops[0], away).verdict is Verdict.REJECTED
+    assert again(front_end, loops[0], away).status is Status.REJECTED
     assert support.accepted(loops[0].source) == before - 1
 
 
@@ -148,8 +148,8 @@ def test_a_mapper_mends_one_loop_and_retracts_another(poses, frames, monkeypatch
     tight = 1e-5 * np.eye(3)
     spoilt, false = mapper.book.enter(
         [
-            Proposal(9000, "loop", true.source, true.target, Verdict.ACCEPTED, "spoilt", RelativePose(np.ones(3), tight)),
-            Proposal(9001, "loop", PER_LAP // 2, 0, Verdict.ACCEPTED, "made up", RelativePose(np.zeros(3), tight)),
+            Edge(true.source, true.target, EdgeKind.LOOP, Status.ACCEPTED, "spoilt", RelativePose(np.ones(3), tight), key=9000),
+            Edge(PER_LAP // 2, 0, EdgeKind.LOOP, Status.ACCEPTED, "made up", RelativePose(np.zeros(3), tight), key=9001),
         ]
     )
     held, verify = [mapper.belief().covariance_from(PER_LAP // 2)[0]], mapper.vision.verify
@@ -199,12 +199,12 @@ def test_while_driving_nodes_are_tried_again_once_the_map_has_moved_them(online,
         if node == PER_LAP + 4:
             believed = np.concatenate([drifted[: PER_LAP + 4], poses[[PER_LAP + 4]]])  # seen again at last
         found[node] = front_end.close(node, belief_of(believed[: node + 1], SURE))
-    late = {p.source for node in range(PER_LAP + 5, PER_LAP + 8) for p in found[node] if p.verdict is Verdict.ACCEPTED}
+    late = {p.source for node in range(PER_LAP + 5, PER_LAP + 8) for p in found[node] if p.status is Status.ACCEPTED}
     behind = {node for node in late if node < PER_LAP + 4}
-    assert any(p.verdict is Verdict.ACCEPTED for p in found[PER_LAP + 4])
+    assert any(p.status is Status.ACCEPTED for p in found[PER_LAP + 4])
     assert bool(behind) == bool(online)
     assert (
-        errors([p for ps in found.values() for p in ps if p.verdict is Verdict.ACCEPTED and p.kind == "loop"], poses)[
+        errors([p for ps in found.values() for p in ps if p.status is Status.ACCEPTED and p.kind is EdgeKind.LOOP], poses)[
             :, 0
         ].max()
         < 0.05

@@ -8,7 +8,7 @@ from rgbd_room import render
 from test_rgbd_front_end import VIEW, drive, errors, lap_poses
 
 from hybridmap.config.vision import MatchingConfig, VisionConfig
-from hybridmap.vision.base import Verdict
+from hybridmap.graph.edges import EdgeKind, Status
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def test_views_in_a_row_decide_where_the_configuration_says_so(lap):
     for views in (1, 4):
         config = VisionConfig(matching=MatchingConfig(sequence=views))
         _, proposals, _ = drive(config, poses, np.deg2rad(0.5), frames)
-        accepted = [p for p in proposals.values() if p.kind == "loop" and p.verdict is Verdict.ACCEPTED]
+        accepted = [p for p in proposals.values() if p.kind is EdgeKind.LOOP and p.status is Status.ACCEPTED]
         assert len(accepted) > 5
         assert errors(accepted, poses)[:, 0].max() < 0.05
         found[views] = scores_of(proposals)
