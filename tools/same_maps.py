@@ -13,6 +13,7 @@ processor time is above 1.02. Recordings are looked for in `$HYBRIDMAP_DATA`, el
 from __future__ import annotations
 
 import argparse
+import csv
 import hashlib
 import json
 import os
@@ -129,11 +130,20 @@ def measured(tree: Path, case: Case) -> dict[str, Any]:
             primary, graph_hash = output.get("primary_backend", ""), output.get("graph_hash") or graph_hash
             values = {metric["name"]: metric["value"] for metric in output["metrics"]}
             chosen = [figure.replace("PRIMARY", primary) for figure in wanted]
-            chosen += [name for name in values if name.startswith("ate_m/") and "gtsam" in name]
             figures |= {figure: values[figure] for figure in chosen if figure in values}
+        figures |= cells(folder / "out" / "cells.csv")
         lines = b"".join(path.read_bytes() for path in sorted((folder / "out").glob("trajectory/*.tum")))
         trajectories = hashlib.sha256(lines).hexdigest()[:16] if lines else ""
         return {"figures": figures, "graph_hash": graph_hash, "trajectories": trajectories, "cpu_s": round(cpu_s, 2)}
+
+
+def cells(table: Path) -> dict[str, float]:
+    """ATE of every cell of a study in m; none where there is no such table."""
+    if not table.is_file():
+        return {}
+    with table.open(newline="") as lines:
+        rows = list(csv.DictReader(lines))
+    return {f"ate/{row['false_loop_kind']}/{row['seed']}": float(row["ate_m"]) for row in rows}
 
 
 def run(tree: Path, command: str, folder: Path) -> tuple[dict[str, Any], float]:
