@@ -25,9 +25,9 @@ from hybridmap.neural.reanchoring import Reanchoring
 from hybridmap.streams.base import LaserScan, RgbdFrame, Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.rig import rig_of
 from hybridmap.streams.synchronise import Ready, Synchroniser
-from hybridmap.trajectory import NS_PER_S, stamp_ns_from_s
+from hybridmap.trajectory import NO_ANCHORS, NS_PER_S, stamp_ns_from_s
 from hybridmap.vision import create_front_end
-from hybridmap.vision.base import Belief, Retraced, RetracingFrontEnd, VerifyingFrontEnd, View
+from hybridmap.vision.base import Belief, RetracingFrontEnd, VerifyingFrontEnd, View
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ class Mapper:
         self.vision = create_front_end(config.vision, rig or rig_of(config.sensors), config.seed, self.clock)
         self.backends = Ensemble(config.backends, self.clock)
         self.calibration = OnlineCalibration(config.calibration, Gains.of(config.neural))
-        self.retraced: Retraced | None = None
+        self.anchors = NO_ANCHORS
         self._synchroniser = Synchroniser(latency_s=config.sensors.latency_s, odometry_delay_s=config.sensors.odometry_delay_s)
         self._novelty = Novelty(config.nodes)
         self._stamp_ns = 0
@@ -224,7 +224,7 @@ class Mapper:
         """Once the map is final, measure on it where the robot was between nodes."""
         if isinstance(self.vision, RetracingFrontEnd):
             with self.clock.stage("retrace"):
-                self.retraced = self.vision.retrace(replace(self.belief(), poses_map_node=self.poses()))
+                self.anchors = self.vision.retrace(replace(self.belief(), poses_map_node=self.poses()))
 
     def _calibrate(self) -> str:
         """Let the gains follow the map, where the map is sure; returns what to add to the reason."""

@@ -24,7 +24,7 @@ from hybridmap.mapper import Mapper, Update
 from hybridmap.metrics import Metric
 from hybridmap.store import MapStore
 from hybridmap.store.session_folder import SessionFolder
-from hybridmap.store.track import anchors_on, trajectory_of
+from hybridmap.store.track import trajectory_of
 from hybridmap.streams.base import Observation, Stream
 from hybridmap.trajectory import NS_PER_S
 
@@ -171,9 +171,8 @@ class _Recorder:
 
 
 def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: SessionFolder) -> Session:
-    store, found = recorder.store, mapper.retraced
-    if found is not None:
-        store.put_anchors(anchors_on(mapper.poses(), found.stamps_ns, found.nodes, found.deltas))
+    store = recorder.store
+    store.put_anchors(mapper.anchors)
     track = store.track()
     folder.write_trajectory("odometry", track.odometry)
     for name in mapper.config.backends.names:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridmap.errors import GeometryError, StreamError
-from hybridmap.geometry import Array, interpolate, quaternion_from_yaw, yaw_from_quaternion
+from hybridmap.geometry import Array, between, compose, interpolate, quaternion_from_yaw, yaw_from_quaternion
 
 NS_PER_S = 1_000_000_000
 
@@ -63,6 +63,44 @@ class Trajectory:
         """Which of the stamps lie within the trajectory's span, `slack_ns` wider on either side."""
         wanted = np.asarray(stamps_ns, dtype=np.int64)
         return np.asarray((wanted >= self.stamps_ns[0] - slack_ns) & (wanted <= self.stamps_ns[-1] + slack_ns))
+
+
+@dataclass(frozen=True, slots=True)
+class Anchors:
+    """Where the robot was at some stamps, measured on the final map: seen from the node before and from the node after.
+
+    The two say the same on the map on which they were measured; on another back-end's map they are blended.
+
+    Attributes:
+        stamps_ns: (S,) int64, increasing.
+        nodes, next_nodes: (S,) int64, the node before and the node after (the same at the last node).
+        deltas, next_deltas: (S, 3) pose of the robot in the frame of either, m and rad.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    nodes: NDArray[np.int64]
+    next_nodes: NDArray[np.int64]
+    deltas: Array
+    next_deltas: Array
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+def anchors_on(poses: Array, stamps_ns: NDArray[np.int64], nodes: NDArray[np.int64], deltas: Array) -> Anchors:
+    """Anchors of what was measured on a map.
+
+    Args:
+        poses: (N, 3) of the nodes, m and rad.
+        stamps_ns: (S,) int64, increasing.
+        nodes: (S,) int64, the node that the robot had made last.
+        deltas: (S, 3) pose of the robot in the frame of that node, m and rad.
+    """
+    after = np.minimum(nodes + 1, len(poses) - 1)
+    return Anchors(stamps_ns, nodes, after, deltas, between(poses[after], compose(poses[nodes], deltas)))
+
+
+NO_ANCHORS = anchors_on(np.zeros((1, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))
 
 
 def read_tum(path: Path) -> Trajectory:

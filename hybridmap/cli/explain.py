@@ -98,10 +98,10 @@ def _pose_lines(poses: Any, title: str) -> Iterator[str]:
 
 def _gate_lines(story: NodeStory) -> Iterator[str]:
     gate = story.gate
-    if gate:
-        inside = f"{gate['inside']:.0f} of {gate['older']:.0f} nodes that were old enough"
-        yield f"  gate         {gate['radius_m']:.2f} m and {gate['heading_deg']:.0f} deg: {inside}"
-        if gate["whole_map"]:
+    if gate is not None:
+        inside = f"{gate.inside} of {gate.older} nodes that were old enough"
+        yield f"  gate         {gate.radius_m:.2f} m and {gate.heading_deg:.0f} deg: {inside}"
+        if gate.whole_map:
             yield "               the robot was lost: the whole map was searched as well"
     if story.nearest is not None:
         node, metres, degrees = story.nearest

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from hybridmap.graph.edges import Edge, EdgeKind
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.trajectory import NS_PER_S, Trajectory, format_motion, read_tum
-from hybridmap.vision.gating import GATE_FIELDS
+from hybridmap.vision.gating import Gate
 
 _AT_NODE_NS = 1_000
 _STAMPS_FROM_S = 1e6  # a time beyond it is a stamp, not seconds since the start
@@ -91,7 +91,7 @@ class NodeStory:
         nearest: the older node that sees most nearly the same on the final map, and how far it is off: (node, m, deg).
         template, founded: its view template, and whether no earlier node has it.
         poses: name -> (3,) final pose by every back-end, `odometry` first.
-        gate: which older nodes were compared with it, by name (see `vision.gating.GATE_FIELDS`); empty where not stored.
+        gate: which older nodes were compared with it, None where not stored.
         ranked: (n, 3) the best of them by their views: node, G, shift in columns.
         chain: odometry and registration edges that end here.
         loops: closures that were considered when it was made, or proposed of it at the end.
@@ -108,7 +108,7 @@ class NodeStory:
     template: int
     founded: bool
     poses: Mapping[str, Array]
-    gate: Mapping[str, float]
+    gate: Gate | None
     ranked: Array
     chain: list[Decision]
     loops: list[Decision]
@@ -128,7 +128,7 @@ class NodeStory:
             "template": self.template,
             "founded_template": self.founded,
             "poses": {name: pose.tolist() for name, pose in self.poses.items()},
-            "gate": dict(self.gate),
+            "gate": None if self.gate is None else asdict(self.gate),
             "ranked": [{"node": int(r[0]), "profile_G": float(r[1]), "shift": int(r[2])} for r in self.ranked],
             "chain": [decision.to_json() for decision in self.chain],
             "loops": [decision.to_json() for decision in self.loops],
@@ -223,7 +223,7 @@ class Explainer:
         earlier = {n.template for n in self._map.nodes[:number]}
         edges = [self._decision(n, e) for n, e in enumerate(self._map.edges) if number in (e.source, e.target)]
         newest = [d for d in edges if max(d.edge.source, d.edge.target) == number]
-        gate = dict(zip(GATE_FIELDS, kept["gate"].tolist(), strict=False)) if "gate" in kept else {}
+        gate = Gate.of_array(kept["gate"]) if "gate" in kept else None
         loops = [d for d in newest if d.edge.kind is EdgeKind.LOOP]
         return NodeStory(
             node=number,
@@ -324,12 +324,12 @@ class Explainer:
                 out[name] = solution.poses[number]
         return out
 
-    def _why_no_loops(self, gate: Mapping[str, float]) -> str:
-        if gate:
-            if gate["older"] == 0:
+    def _why_no_loops(self, gate: Gate | None) -> str:
+        if gate is not None:
+            if gate.older == 0:
                 least = setting(self._settings, "vision.rgbd.closing.min_age_s")
                 return f"no node was old enough: {least} s (vision.rgbd.closing.min_age_s)"
-            return "no older node lay inside the gate" if gate["inside"] == 0 else ""
+            return "no older node lay inside the gate" if gate.inside == 0 else ""
         every = setting(self._settings, "vision.laser.probes.every_m")
         if self._store.rig.laser is not None and isinstance(every, int | float):
             return f"the laser looks for them every {every:g} m of travel (vision.laser.probes.every_m), inside its gate"

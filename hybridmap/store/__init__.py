@@ -2,6 +2,6 @@
 
 from hybridmap.store.map_store import MapStore
 from hybridmap.store.session_folder import MetricsFile, SessionFolder
-from hybridmap.store.track import Anchors, Track, anchors_on, trajectory_of
+from hybridmap.store.track import Track, trajectory_of
 
-__all__ = ["Anchors", "MapStore", "MetricsFile", "SessionFolder", "Track", "anchors_on", "trajectory_of"]
+__all__ = ["MapStore", "MetricsFile", "SessionFolder", "Track", "trajectory_of"]

@@ -19,9 +19,9 @@ from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.store import codec, schema
-from hybridmap.store.track import NO_ANCHORS, Anchors, Track
+from hybridmap.store.track import Track
 from hybridmap.streams.base import Rig
-from hybridmap.trajectory import Trajectory
+from hybridmap.trajectory import NO_ANCHORS, Anchors, Trajectory
 
 _KEYFRAME, _SNAPSHOT, _CODE = "keyframe", "snapshot", "code"
 

@@ -9,46 +9,10 @@ from numpy.typing import NDArray
 
 from hybridmap.errors import StoreError
 from hybridmap.geometry import Array, between, compose, interpolate, wrap_angle
-from hybridmap.trajectory import Trajectory
+from hybridmap.trajectory import NO_ANCHORS, Anchors, Trajectory
 
 _TURN_AS_TRAVEL_M = 0.3
 """Metres of travel that a turn of one radian counts for when a residual is spread over the way."""
-
-
-@dataclass(frozen=True, slots=True)
-class Anchors:
-    """Where the robot was at some stamps, measured on the final map: seen from the node before and from the node after.
-
-    The two say the same on the map on which they were measured; on another back-end's map they are blended.
-
-    Attributes:
-        stamps_ns: (S,) int64, increasing.
-        nodes, next_nodes: (S,) int64, the node before and the node after (the same at the last node).
-        deltas, next_deltas: (S, 3) pose of the robot in the frame of either, m and rad.
-    """
-
-    stamps_ns: NDArray[np.int64]
-    nodes: NDArray[np.int64]
-    next_nodes: NDArray[np.int64]
-    deltas: Array
-    next_deltas: Array
-
-    def __len__(self) -> int:
-        return len(self.stamps_ns)
-
-
-def anchors_on(poses: Array, stamps_ns: NDArray[np.int64], nodes: NDArray[np.int64], deltas: Array) -> Anchors:
-    """Anchors of what was measured on a map.
-
-    Args:
-        poses: (N, 3) of the nodes, m and rad.
-        stamps_ns, nodes, deltas: (S,), (S,) and (S, 3), as `vision.base.Retraced` has them.
-    """
-    after = np.minimum(nodes + 1, len(poses) - 1)
-    return Anchors(stamps_ns, nodes, after, deltas, between(poses[after], compose(poses[nodes], deltas)))
-
-
-NO_ANCHORS = anchors_on(np.zeros((1, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.edges import Edge
 from hybridmap.streams.base import Observation
+from hybridmap.trajectory import Anchors
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,24 +102,9 @@ class VerifyingFrontEnd(FrontEnd, Protocol):
         """Measure loops again from where their nodes lie on the map; each keeps its key. What is left out stays as it is."""
 
 
-@dataclass(frozen=True, slots=True)
-class Retraced:
-    """Where the robot was at frames between nodes, measured on the final map.
-
-    Attributes:
-        stamps_ns: (S,) int64 of the frames, increasing.
-        nodes: (S,) int64, the node that the robot had made last.
-        deltas: (S, 3) pose of the robot in the frame of that node, m and rad.
-    """
-
-    stamps_ns: NDArray[np.int64]
-    nodes: NDArray[np.int64]
-    deltas: Array
-
-
 @runtime_checkable
 class RetracingFrontEnd(FrontEnd, Protocol):
     """A front-end that can also say, once the map is final, where the robot was between nodes."""
 
-    def retrace(self, belief: Belief) -> Retraced:
+    def retrace(self, belief: Belief) -> Anchors:
         """Measure every frame on the final map; called once, after the last `finish`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import astuple, dataclass
 from functools import cache
 
 import numpy as np
@@ -12,9 +13,33 @@ from hybridmap.geometry import Array, wrap_angle
 
 Indices = NDArray[np.int64]
 
-GATE_FIELDS = ("radius_m", "heading_deg", "older", "inside", "whole_map")
-"""What a map file keeps of a node's gate: its widths, how many nodes were old enough, how many of those inside, and whether
-all of them were compared (1) because the robot was not sure where it was."""
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """Which older nodes a new one was compared with.
+
+    Attributes:
+        radius_m, heading_deg: its widths.
+        older: how many nodes were old enough.
+        inside: how many of those lay in it.
+        whole_map: the others were searched as well, because the robot was not sure where it was.
+    """
+
+    radius_m: float
+    heading_deg: float
+    older: int
+    inside: int
+    whole_map: bool = False
+
+    def to_array(self) -> Array:
+        """(5,) as a map file keeps it."""
+        return np.array(astuple(self), dtype=np.float64)
+
+    @classmethod
+    def of_array(cls, kept: Array) -> Gate:
+        """The gate that `to_array` gave."""
+        radius_m, heading_deg, older, inside, whole_map = kept.tolist()
+        return cls(radius_m, heading_deg, int(older), int(inside), bool(whole_map))
 
 
 def nodes_within(poses: Array, node: int, radius_m: float | Array, turn_rad: float, before: int | None = None) -> Indices:

@@ -153,9 +153,9 @@ def test_a_mapped_session_has_its_gates(tmp_path):
     with Explainer(done.folder.path) as explainer:
         last = explainer.node(int(next(m.value for m in done.metrics if m.name == "nodes")) - 1)
         first = explainer.node(0)
-    assert last.gate["older"] > 3
-    assert last.gate["radius_m"] >= config.vision.rgbd.closing.gate_m
-    assert last.gate["inside"] >= len(last.ranked)
+    assert last.gate.older > 3
+    assert last.gate.radius_m >= config.vision.rgbd.closing.gate_m
+    assert last.gate.inside >= len(last.ranked)
     assert (np.diff(last.ranked[:, 1]) >= 0).all()
-    assert first.gate["older"] == 0
+    assert first.gate.older == 0
     assert "vision.rgbd.closing.min_age_s" in first.no_loops

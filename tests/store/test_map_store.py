@@ -13,8 +13,9 @@ from hybridmap.errors import StoreError
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.hashing import graph_hash
-from hybridmap.store import MapStore, anchors_on
+from hybridmap.store import MapStore
 from hybridmap.streams.base import Rig
+from hybridmap.trajectory import anchors_on
 from tests.store.sessions import RIG, keyframe_of, ring_map, truth_at, write_session
 
 
@@ -106,7 +107,8 @@ def test_finished_session_is_one_file(tmp_path):
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from hybridmap.store import MapStore, anchors_on
+from hybridmap.store import MapStore
+from hybridmap.trajectory import anchors_on
 from hybridmap.streams.base import Rig
 from tests.store.sessions import ring_map
 import numpy as np

@@ -5,7 +5,8 @@ import pytest
 
 from hybridmap.errors import StoreError
 from hybridmap.geometry import between, compose, log
-from hybridmap.store import Track, anchors_on, trajectory_of
+from hybridmap.store import Track, trajectory_of
+from hybridmap.trajectory import anchors_on
 from tests.store.sessions import SECOND, odometry_of, truth_at
 
 

@@ -12,7 +12,8 @@ from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, Array, RelativePose, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.streams.base import Laser, LaserScan, Observation
-from hybridmap.vision.base import Belief, Doubted, Retraced, View
+from hybridmap.trajectory import Anchors
+from hybridmap.vision.base import Belief, Doubted, View
 from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan
 from hybridmap.vision.laser.clusters import Commitment, Settled
 from hybridmap.vision.laser.continuity import Continuity
@@ -147,7 +148,7 @@ class LaserFrontEnd:
             out.append(_loop(d.key, hypothesis, status, hypothesis.refusal or "agrees with the map"))
         return out
 
-    def retrace(self, belief: Belief) -> Retraced:
+    def retrace(self, belief: Belief) -> Anchors:
         """Register every scan to the final map."""
         scans = [s for s in self._scans if s.node >= 0] if self._config.retrace.enabled else []
         return self._retracer.retrace(scans, np.array(self._steps), belief.poses_map_node)

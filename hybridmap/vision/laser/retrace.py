@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hybridmap.config.laser import LaserConfig
 from hybridmap.geometry import Array, between, compose, interpolate, wrap_angle
 from hybridmap.streams.base import Laser, LaserScan
-from hybridmap.vision.base import Retraced
+from hybridmap.trajectory import Anchors, anchors_on
 from hybridmap.vision.laser.cloud import Cloud, clouds_of_scans, merged_at
 from hybridmap.vision.laser.likelihood import build_field
 from hybridmap.vision.laser.registration import Prior, align
@@ -38,7 +38,7 @@ class Retracer:
         self._atlas = atlas
         self._laser = laser
 
-    def retrace(self, scans: Sequence[SeenScan], steps: Array, poses: Array) -> Retraced:
+    def retrace(self, scans: Sequence[SeenScan], steps: Array, poses: Array) -> Anchors:
         """Pose of the robot at every scan that could be registered, seen from the node it had made last.
 
         Scans about a break of the chain are left out: the wheels do not tell on which side of it they were taken.
@@ -60,7 +60,7 @@ class Retracer:
         for piece in self._atlas.pieces[1:]:
             good[(nodes == piece.start - 1) & (_way(motions) > 0.0)] = False
         stamps = np.array([s.scan.stamp_ns for s in scans], dtype=np.int64)
-        return Retraced(stamps[good], nodes[good], between(poses[nodes[good]], found[good]))
+        return anchors_on(poses, stamps[good], nodes[good], between(poses[nodes[good]], found[good]))
 
     def _blocks(self) -> list[tuple[int, int]]:
         """First and one past the last node of each block; none of them goes beyond a piece of the chain."""

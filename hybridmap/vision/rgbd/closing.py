@@ -14,7 +14,7 @@ from hybridmap.geometry import Array, RelativePose, between, wrap_angle
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.metrics import StageClock
 from hybridmap.vision.base import Belief, Doubted
-from hybridmap.vision.gating import GATE_FIELDS, nodes_within
+from hybridmap.vision.gating import Gate, nodes_within
 from hybridmap.vision.profile import Profile
 from hybridmap.vision.relocalising import Relocaliser
 from hybridmap.vision.rgbd.keyframe import Keyframe
@@ -66,7 +66,7 @@ class LoopCloser:
         self._revisits = Revisits(config.closing)
         self._tried: set[tuple[int, int]] = set()
         self._travel_at_closure = 0.0
-        self._noted, self._note = -1, dict[str, Array]()
+        self._noted, self._gate_of_newest, self._ranking = -1, Gate(0.0, 0.0, 0, 0), np.zeros((0, 3))
         sigma_m, sigma_rad = config.closing.repropose_sigma_m, np.deg2rad(config.closing.repropose_sigma_deg)
         self._map_covariance = np.diag([sigma_m, sigma_m, sigma_rad]) ** 2
         self._second_look = SecondLook(keyframes, verifier, self._map_covariance)
@@ -115,8 +115,10 @@ class LoopCloser:
         return self._relocaliser.whereabouts.lost_since
 
     def note(self, node: int) -> dict[str, Array]:
-        """What the map file keeps of the newest node's search: `gate` (see `GATE_FIELDS`), `ranked` (n, 3): node, G, shift."""
-        return dict(self._note) if node == self._noted else {}
+        """What the map file keeps of the newest node's search: `gate` (see `Gate`), `ranked` (n, 3): node, G, shift."""
+        if node != self._noted:
+            return {}
+        return {"gate": self._gate_of_newest.to_array(), "ranked": self._ranking}
 
     def _relocalise(self, node: int, gated: Indices, changed: list[Edge], belief: Belief) -> list[Edge]:
         """Keep account of whether the robot knows where it is; while it does not, look for it on the whole map."""
@@ -129,7 +131,7 @@ class LoopCloser:
             whereabouts.unrecognised()
         if not whereabouts.lost:
             return []
-        self._note["gate"][GATE_FIELDS.index("whole_map")] = 1.0
+        self._gate_of_newest = replace(self._gate_of_newest, whole_map=True)
         old = np.flatnonzero(belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s)
         seen = self._whole_map.search(node, np.setdiff1d(old, gated).astype(np.int64))
         found = self._relocaliser.settle(seen, belief)
@@ -186,7 +188,8 @@ class LoopCloser:
         old = belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s
         inside = old & (np.hypot(offset[:, 0], offset[:, 1]) <= radii) & (turned <= heading)
         widths = float(radii.max(initial=radius)), float(np.rad2deg(min(heading, np.pi)))
-        self._noted, self._note = node, {"gate": np.array([*widths, old.sum(), inside.sum(), 0.0])}
+        self._noted, self._ranking = node, np.zeros((0, 3))
+        self._gate_of_newest = Gate(*widths, int(old.sum()), int(inside.sum()))
         return np.flatnonzero(inside).astype(np.int64)
 
     def _ranked(self, node: int, gated: Indices) -> dict[int, dict[str, float]]:
@@ -194,7 +197,7 @@ class LoopCloser:
         ranked = RANKED * self._closing.candidates
         with self._clock.stage("search"):
             match = self._matcher.best(self._keyframes[node].profile, ranked, gated, ending_at=node)
-        self._note["ranked"] = np.column_stack([match.indices, match.score, match.shift])
+        self._ranking = np.column_stack([match.indices, match.score, match.shift])
         chosen: dict[int, dict[str, float]] = {}
         for i, target in enumerate(match.indices.tolist()):
             if self._c_t is not None and match.score[i] >= self._c_t:

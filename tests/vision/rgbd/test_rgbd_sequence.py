@@ -9,6 +9,7 @@ from test_rgbd_front_end import VIEW, drive, errors, lap_poses
 
 from hybridmap.config.vision import MatchingConfig, VisionConfig
 from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.vision.gating import Gate
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +42,8 @@ def test_what_the_search_for_loops_saw_is_kept_with_the_node(lap):
     poses, frames = lap
     front_end, _, _ = drive(VisionConfig(), poses, np.deg2rad(0.5), frames)
     last = front_end.keyframe(len(poses) - 1)
-    assert last["gate"].shape == (5,)
-    assert last["gate"][3] <= last["gate"][2]
+    gate = Gate.of_array(last["gate"])
+    assert gate.inside <= gate.older
     assert (np.diff(last["ranked"][:, 1]) >= 0).all()
     assert set(last["ranked"][:, 0].astype(int)) <= set(range(len(poses) - 10))
     assert "gate" not in front_end.keyframe(len(poses) - 2)
