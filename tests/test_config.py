@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
+
 import pytest
 from pydantic import ValidationError
 
-from hybridmap.config import Config, named_configs
+from hybridmap.config import Config, gone, named_configs
 from hybridmap.errors import ConfigError
+from tools.configuration_page import tables
 
 
 def test_overrides_win_over_the_file_which_wins_over_defaults(tmp_path):
@@ -62,6 +65,39 @@ def test_a_refusal_names_the_file_or_who_overrode_it(tmp_path):
     with pytest.raises(ConfigError, match=r"^\S+a.yaml: seed: .*found -1"):
         Config.load(tmp_path / "a.yaml", {"nodes.distance_m": -2})
     assert Config.load(tmp_path / "a.yaml", {"seed": 2}).seed == 2
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("simulation.wheels.slip_m", 0.1, "it is the constant SLIP_M in hybridmap/simulation/wheels.py"),
+        ("neural.dtype", "float32", "every population has double precision"),
+    ],
+)
+def test_a_setting_that_has_gone_says_what_became_of_it(key, value, said):
+    with pytest.raises(ConfigError, match=f"^command line: {key} is no longer a setting: {said}$"):
+        Config.load(None, {key: value})
+
+
+def test_what_became_of_a_setting_is_true():
+    current = {setting.key for table in tables() for setting in table.settings}
+    for key, (module, name) in gone.constants().items():
+        assert key not in current
+        assert hasattr(importlib.import_module(f"hybridmap.{module.removesuffix('.py').replace('/', '.')}"), name), key
+    assert not current & (gone.RENAMED.keys() | gone.OTHERWISE.keys())
+    assert {*gone.RENAMED.values()} <= current
+
+
+def test_a_stored_configuration_is_read_without_what_has_gone():
+    old = "nodes: {distance_m: 0.4}\nneural: {dtype: float64, gain: 1.5, place: {theta_hz: 7.5}}\n"
+    assert Config.stored(old, "session") == Config.load(None, {"nodes.distance_m": 0.4, "neural.gain": 1.5})
+
+
+def test_every_setting_says_what_it_does_and_in_which_unit():
+    for table in tables():
+        for setting in table.settings:
+            assert setting.does, setting.key
+            assert setting.unit or not setting.type.startswith(("number", "integer")), setting.key
 
 
 def test_a_missing_configuration_lists_the_names():

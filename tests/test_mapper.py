@@ -73,7 +73,7 @@ def test_fed_by_hand_in_seconds_gives_the_same_map(mapped):
 
 def test_the_pose_follows_the_activity():
     """No number integrates position beside the network: with other activity the mapper believes to be elsewhere."""
-    mapper = Mapper(Config.load("laser", {"vision.sensor": "none", "neural.rectifier": "softplus", "neural.dtype": "float64"}))
+    mapper = Mapper(Config.load("laser", {"vision.sensor": "none", "neural.rectifier": "softplus"}))
     for i in range(20):
         mapper.add_odometry(0.1 * i, [0.05 * i, 0.0, 0.0])
     before = mapper.integrator.pose

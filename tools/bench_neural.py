@@ -13,10 +13,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.neural import NeuralConfig
+from hybridmap.config.mapping import NeuralConfig
 from hybridmap.metrics import Metric, to_json
 from hybridmap.neural import PathIntegrator
-from hybridmap.neural.grid import kernel_spectrum
+from hybridmap.neural.grid import FOURIER_MODES, SOFTPLUS_SHARPNESS, kernel_spectrum
 from hybridmap.verification.path_error import wander
 
 ODOMETRY_HZ = 100.0
@@ -34,13 +34,13 @@ class PlainSheets:
         side = grid.activity.shape[-1]
         self.activity = np.ascontiguousarray(grid.activity)
         p, q = np.fft.fftfreq(side, 1.0 / side)[:, None], np.arange(side // 2 + 1)
-        near = (np.abs(p) <= config.fourier_modes) & (q <= config.fourier_modes)
+        near = (np.abs(p) <= FOURIER_MODES) & (q <= FOURIER_MODES)
         squared = (p * p + q * q - p * q)[near].astype(np.int64)
         gains = np.zeros(near.shape, dtype=self.activity.dtype)
-        gains[near] = kernel_spectrum(squared, config.kernel_gain_first, config.kernel_gain_zero, config.kernel_widths)
+        gains[near] = kernel_spectrum(squared)
         self._gains, self._p, self._q = gains, p[:, 0].astype(gains.dtype), q.astype(gains.dtype)
         self._stripe = 0.5 * config.band_drive * side**2
-        self._softplus = config.softplus_sharpness if config.rectifier == "softplus" else None
+        self._softplus = SOFTPLUS_SHARPNESS if config.rectifier == "softplus" else None
 
     def step(self, shift_cycles: NDArray[np.floating], phasors: NDArray[np.complexfloating]) -> None:
         """Advance the sheets by shifts (M, 2), cycles, with the stripes of bands at phasors (M, 3)."""
@@ -72,8 +72,8 @@ def rates(steps: dict[Callable[[], None], int], repeats: int = 150) -> list[floa
 
 def measure(dtype: str, rectifier: str, steps: int) -> dict[str, float]:
     """Rates of one precision and rectifier, steps per CPU-second."""
-    config = NeuralConfig.model_validate({"dtype": dtype, "rectifier": rectifier})
-    integrator = PathIntegrator(config)
+    config = NeuralConfig.model_validate({"rectifier": rectifier})
+    integrator = PathIntegrator(config, dtype=dtype)
     plain = PlainSheets(integrator)
     motion = integrator.bands.step(np.array([0.005, 0.002]))
     shift = motion.advance[:, ::2].astype(dtype)
@@ -87,9 +87,9 @@ def measure(dtype: str, rectifier: str, steps: int) -> dict[str, float]:
             lambda: plain.step(shift, motion.phasors): max(steps // 8, 1),
         }
     )
-    whole = PathIntegrator(config)
+    whole = PathIntegrator(config, dtype=dtype)
     front, every = rates({Driving(whole, NODE_M): steps, Driving(whole, STEP_M): max(steps // 4, 1)})
-    wandered, cells = wandering(config)
+    wandered, cells = wandering(config, dtype)
     return {
         "baseline": baseline,
         "sheets": sheets,
@@ -129,10 +129,10 @@ def metrics_of(rows: dict[str, dict[str, float]]) -> list[Metric]:
     return metrics
 
 
-def wandering(config: NeuralConfig, way_m: float = 120.0) -> tuple[float, int]:
+def wandering(config: NeuralConfig, dtype: str, way_m: float = 120.0) -> tuple[float, int]:
     """Steps per CPU-second on a walk at random, the best of its last parts, and how many place cells it has by then."""
     drive = wander(np.random.default_rng(1), way_m, ODOMETRY_HZ)
-    integrator = PathIntegrator(config)
+    integrator = PathIntegrator(config, dtype=dtype)
     ways, gone_m, part, times = np.hypot(drive.deltas[:, 0], drive.deltas[:, 1]), 0.0, len(drive.deltas) // 40, []
     for first in range(0, len(drive.deltas) - part, part):
         begin = time.process_time()

@@ -25,7 +25,7 @@ from rgbd_study import figures_of
 
 from hybridmap.cli.choose import parse_settings
 from hybridmap.config import Config
-from hybridmap.config.simulation import WheelErrorConfig
+from hybridmap.config.inputs import WheelErrorConfig
 from hybridmap.metrics import Metric, to_json
 from hybridmap.simulation.wheels import wheel_odometry
 from hybridmap.streams.base import RgbdFrame, Rig, Sample, SelfMotion, Stream, StreamReport

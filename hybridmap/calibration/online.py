@@ -13,12 +13,14 @@ from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.gains import Gains
 from hybridmap.calibration.legs import Motion
 from hybridmap.calibration.regression import Sighting, regress
-from hybridmap.config.calibration import CalibrationConfig
+from hybridmap.config.mapping import CalibrationConfig
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
 
+FIRST_M, EVERY_M = 50.0, 25.0
+"""Travel before the first estimate and between two, m: legs between closures are then long enough to tell gains from noise."""
 _logger = logging.getLogger(__name__)
 
 
@@ -62,7 +64,7 @@ class OnlineCalibration:
         self._steps: list[Array] = []
         self._node_stamps_ns: list[int] = []
         self._travel_m = 0.0
-        self._due_m = config.first_m
+        self._due_m = FIRST_M
 
     def observe(self, stamp_ns: int, delta_robot: Array) -> None:
         """Take in a raw step (3,) that ends at a stamp; a second step at one stamp must not move."""
@@ -86,7 +88,7 @@ class OnlineCalibration:
         self._node_stamps_ns.append(stamp_ns)
         if self._travel_m < self._due_m or not np.any(graph().kinds != EdgeKind.ODOMETRY):
             return None
-        self._due_m = self._travel_m + self._config.every_m
+        self._due_m = self._travel_m + EVERY_M
         motion = Motion(np.array(self._stamps_ns, dtype=np.int64), np.array(self._steps))
         stamps: NDArray[np.int64] = np.array(self._node_stamps_ns, dtype=np.int64)
         try:

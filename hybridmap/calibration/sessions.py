@@ -17,6 +17,7 @@ from hybridmap.calibration.gains import GAIN_KEYS, Gains, remove
 from hybridmap.calibration.legs import Legs, Motion
 from hybridmap.calibration.regression import Sighting, regress, require_leg
 from hybridmap.config import Config
+from hybridmap.config.gone import without_gone
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array, between
 from hybridmap.graph.edges import EdgeKind
@@ -265,7 +266,7 @@ def _understood(tree: dict[str, Any], origin: str) -> Config:
         for section, keys in _IN_USE.items()
     }
     backends = {"backends": tree["backends"]} if "backends" in tree else {}
-    return Config.from_tree(in_use | backends, origin)
+    return Config.from_tree(without_gone(in_use | backends), origin)
 
 
 def _in_use(config: Config) -> dict[str, float]:

@@ -11,6 +11,7 @@ import yaml
 from hybridmap.cli.choose import parse_settings
 from hybridmap.config import Config
 from hybridmap.config.backends import BackendsConfig
+from hybridmap.config.gone import without_gone
 from hybridmap.errors import GraphError
 from hybridmap.graph.carries import Carry, carries
 from hybridmap.graph.hashing import graph_hash
@@ -70,7 +71,8 @@ def settings_of(source: GraphSource, config: str | None, setting: list[str] | No
     if config is not None or not source.is_session or not own.is_file():
         return Config.load(config, parse_settings(setting)).backends
     saved = yaml.safe_load(own.read_text(encoding="utf-8")) or {}
-    return Config.load(None, {"backends": saved.get("backends", {}), **parse_settings(setting)}).backends
+    backends = without_gone({"backends": saved.get("backends", {})})
+    return Config.load(None, {**backends, **parse_settings(setting)}).backends
 
 
 def _head(path: Path, graph: PoseGraph) -> dict[str, Any]:

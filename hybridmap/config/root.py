@@ -12,12 +12,10 @@ import yaml
 from pydantic import Field, ValidationError
 
 from hybridmap.config.backends import BackendsConfig
-from hybridmap.config.calibration import CalibrationConfig
-from hybridmap.config.mapping import EdgesConfig, NodesConfig
-from hybridmap.config.neural import NeuralConfig
+from hybridmap.config.gone import without_gone
+from hybridmap.config.inputs import SensorsConfig, SimulationConfig
+from hybridmap.config.mapping import CalibrationConfig, EdgesConfig, NeuralConfig, NodesConfig
 from hybridmap.config.section import Section, said
-from hybridmap.config.sensors import SensorsConfig
-from hybridmap.config.simulation import SimulationConfig
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import ConfigError
 
@@ -79,6 +77,15 @@ class Config(Section):
             return cls.model_validate(tree)
         except ValidationError as error:
             raise ConfigError(f"{origin}: {said(error)}") from None
+
+    @classmethod
+    def stored(cls, text: str, origin: str) -> Self:
+        """The configuration that a session was saved with, without the settings that have gone since.
+
+        Raises:
+            ConfigError: as `load`.
+        """
+        return cls.from_tree(without_gone(yaml.safe_load(text) or {}), origin)
 
     def to_yaml(self) -> str:
         """The resolved configuration as YAML that `load` reads back to an equal one."""

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import yaml
-
 from hybridmap.backends import Solution, create, names
 from hybridmap.config import Config
 from hybridmap.errors import ExportError
@@ -67,7 +65,7 @@ class SessionView:
         if stored is not None:
             return stored
         log.warning("%s: no result of %s in it, solving its graph now", self.store.path, self.backend)
-        config = Config.from_tree(yaml.safe_load(self.store.config_yaml) or {}, str(self.store.path))
+        config = Config.stored(self.store.config_yaml, str(self.store.path))
         return create(self.backend, config.backends).solve(self.experiences)
 
     @cached_property

@@ -10,6 +10,9 @@ from numpy.typing import DTypeLike, NDArray
 from hybridmap.geometry import Array
 from hybridmap.neural.torus import split_shift
 
+ATTRACTOR_WIDTH_CELLS = 1.4
+"""Standard deviation of the attractor's bump, cells: wide enough to move smoothly from cell to cell."""
+
 
 class PlaceAttractor:
     """Sheet of N x N place-attractor cells (paper eq. 10).
@@ -22,7 +25,9 @@ class PlaceAttractor:
         activity: (N, N) rates of sum one, first index x, second y; the whole state.
     """
 
-    def __init__(self, side: int, cell_m: float, width_cells: float, dtype: DTypeLike = np.float64) -> None:
+    def __init__(
+        self, side: int, cell_m: float, width_cells: float = ATTRACTOR_WIDTH_CELLS, dtype: DTypeLike = np.float64
+    ) -> None:
         self.cell_m = cell_m
         self._side = side
         wave = 2.0 * np.pi * np.arange(side // 2) / side

@@ -9,6 +9,10 @@ from numpy.typing import DTypeLike, NDArray
 
 from hybridmap.neural.torus import Metric
 
+BAND_CELLS = 32
+"""Cells of a band ring (three rings a module): a stripe is then some three cells wide."""
+BAND_WIDTH = 0.1
+"""Stripe width r as a share of the period; the rate is exp(-(s - l/2)^2 / (2 r^2))."""
 ORIENTATIONS_DEG = (0.0, 60.0, 120.0)
 SQUARE_ORIENTATIONS_DEG = (0.0, 45.0, 90.0)
 
@@ -46,8 +50,8 @@ class BandRings:
         self,
         spacings_m: NDArray[np.float64],
         orientations_rad: NDArray[np.float64],
-        cells: int,
-        width: float,
+        cells: int = BAND_CELLS,
+        width: float = BAND_WIDTH,
         dtype: DTypeLike = np.float64,
         metric: Metric = "hexagonal",
     ) -> None:

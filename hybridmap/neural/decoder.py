@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from hybridmap.geometry import Array
 
+DECODE_BOX_M = 1.0
+"""Half side of the box around the prior in which all modules together resolve the wrap, m: about twice the coarsest spacing."""
 _AGREEMENT_CYCLES = 0.06
 
 
@@ -39,7 +41,7 @@ class PhaseDecoder:
     which repetition is meant, and enters nowhere else: anywhere inside its basin the answer is the same.
     """
 
-    def __init__(self, wave_vectors: NDArray[np.float64], box_m: float) -> None:
+    def __init__(self, wave_vectors: NDArray[np.float64], box_m: float = DECODE_BOX_M) -> None:
         """Take wave vectors (M, 3, 2), cycles per metre, and the half side of the scanned box, m."""
         self._waves = wave_vectors.reshape(-1, 2)
         self._solve = np.linalg.pinv(self._waves)

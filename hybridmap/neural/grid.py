@@ -11,6 +11,17 @@ from numpy.typing import DTypeLike, NDArray
 from hybridmap.errors import ConfigError
 from hybridmap.neural.torus import LowModes, Metric
 
+FOURIER_MODES = 4
+"""K, the Fourier modes along each axis of a sheet that its recurrent weights carry; beyond them all gains are below 1e-3."""
+KERNEL_GAIN_FIRST, KERNEL_GAIN_ZERO = 1.4, -1.0
+"""Fourier gains of the recurrent weights at the first hexagonal mode and at mode zero: one hexagonal bump grows and settles,
+uniform activity dies away (`docs/paper.md`, Kernel)."""
+KERNEL_WIDTHS = (1.5, 0.3)
+"""Widths of the excitatory and the inhibitory Gaussian's spectrum, in squared wave numbers of the first mode: every other
+mode then has a gain below 1."""
+SOFTPLUS_SHARPNESS = 2.0
+"""beta of softplus, log(1 + exp(beta x)) / beta: soft enough that no bump is pinned, sharp enough that silent cells are."""
+
 Rectifier = Callable[[NDArray[np.floating], NDArray[np.floating]], NDArray[np.floating]]
 """From the drive and zeros of its shape, which `maximum` takes several times faster than the number, to the rates."""
 
@@ -21,7 +32,7 @@ def relu(drive: NDArray[np.floating], zeros: NDArray[np.floating]) -> NDArray[np
     return drive
 
 
-def softplus(sharpness: float) -> Rectifier:
+def softplus(sharpness: float = SOFTPLUS_SHARPNESS) -> Rectifier:
     """Return f(x) = log(1 + exp(beta x)) / beta, smooth and therefore free of pinning."""
 
     def f(drive: NDArray[np.floating], zeros: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -39,9 +50,9 @@ def softplus(sharpness: float) -> Rectifier:
 
 def kernel_spectrum(
     squared_wave_number: NDArray[np.int64],
-    gain_first: float,
-    gain_zero: float,
-    widths: tuple[float, float],
+    gain_first: float = KERNEL_GAIN_FIRST,
+    gain_zero: float = KERNEL_GAIN_ZERO,
+    widths: tuple[float, float] = KERNEL_WIDTHS,
     kernel: Literal["two-amplitudes", "printed"] = "two-amplitudes",
 ) -> NDArray[np.float64]:
     """Return the Fourier gains of w0(x) = a exp(-gamma |x|^2) - c exp(-beta |x|^2) at the given |k|^2.
@@ -153,7 +164,7 @@ class GridModules:
             found = f"no pattern becomes stationary (change {change:.3g} at a peak of {peak:.3g} after 300 steps)"
         return (
             f"{found}; the recurrent weights have Fourier gain {zero:.3g} at mode zero and {most:.3g} at most, where one step "
-            "of dt = tau needs about -1 and 1.4: take two amplitudes (kernel), or lower kernel_gain_first or kernel_widths"
+            "of dt = tau needs about -1 and 1.4: take neural.kernel: two-amplitudes"
         )
 
     def step(self, band_advance: NDArray[np.floating], band_phasors: NDArray[np.complexfloating]) -> None:

@@ -7,15 +7,15 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from hybridmap.config.neural import NeuralConfig
+from hybridmap.config.mapping import NeuralConfig
 from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import Array
 from hybridmap.neural.attractor import PlaceAttractor
 from hybridmap.neural.band import BandRings
 from hybridmap.neural.decoder import Decoded, PhaseDecoder
-from hybridmap.neural.grid import GridModules, kernel_spectrum, relu, softplus
+from hybridmap.neural.grid import FOURIER_MODES, GridModules, kernel_spectrum, relu, softplus
 from hybridmap.neural.head_direction import HeadDirectionRing
 from hybridmap.neural.place import PlaceCells, PlaceProjection
 from hybridmap.neural.torus import LowModes, shift_sheets
@@ -25,6 +25,13 @@ log = logging.getLogger(__name__)
 Snapshot = dict[str, NDArray[Any]]
 """State of the cells by name, as `PathIntegrator.snapshot` gives it."""
 
+ORIENTATION_DEG, ORIENTATION_STEP_DEG = 7.0, 7.5
+"""Orientation of the finest module's first band, and the rotation of each module against the one before it, degrees: eight
+modules share the 60 degrees after which a hexagonal lattice repeats, and none lies along a wall."""
+THETA_HZ = 7.5
+"""Learning steps a second of motion: the theta rhythm of a moving rat (6-10 Hz)."""
+NEURON_NOISE_SEED = 0
+"""Seed of `neural.neuron_noise` where no generator is handed in."""
 _LARGEST_STEP_M = 1000.0
 _PART_OF_WRAP = 0.1
 _WRAPS = np.array(sorted(((x, y) for x in range(-8, 9) for y in range(-8, 9)), key=lambda w: (w[0] ** 2 + w[1] ** 2, w)), float)
@@ -40,34 +47,34 @@ class PathIntegrator:
     activity means another pose.
     """
 
-    def __init__(self, config: NeuralConfig, rng: np.random.Generator | None = None) -> None:
+    def __init__(self, config: NeuralConfig, rng: np.random.Generator | None = None, dtype: DTypeLike = np.float64) -> None:
         """Make every population and let it settle at the origin.
 
         Args:
             config: settings of the cells.
-            rng: of the neuron noise; by default one is made from `neuron_noise_seed`.
+            rng: of the neuron noise; by default one is made from `NEURON_NOISE_SEED`.
+            dtype: precision of every population.
 
         Raises:
             ConfigError: the grid sheets do not settle with this kernel.
         """
         self.config = config
-        dtype = np.dtype(config.dtype)
         self.spacings_m: NDArray[np.float64] = np.geomspace(config.spacing_min_m, config.spacing_max_m, config.modules)
-        turned = np.radians(config.orientation_deg + config.orientation_step_deg * np.arange(config.modules))
+        turned = np.radians(ORIENTATION_DEG + ORIENTATION_STEP_DEG * np.arange(config.modules))
         self.head_direction = HeadDirectionRing(config.head_direction_cells, dtype)
-        self.bands = BandRings(self.spacings_m, turned, config.band_cells, config.band_width, dtype, config.metric)
-        self.grid = _grid(config)
+        self.bands = BandRings(self.spacings_m, turned, dtype=dtype, metric=config.metric)
+        self.grid = _grid(config, dtype)
         place = config.place
         self.place = PlaceCells(place, config.sheet_side, self.spacings_m)
-        self.attractor = PlaceAttractor(place.attractor_side, place.attractor_cell_m, place.attractor_width_cells, dtype)
+        self.attractor = PlaceAttractor(place.attractor_side, place.attractor_cell_m, dtype=dtype)
         self._projection = PlaceProjection(place.attractor_side**2)
-        self._rng = np.random.default_rng(config.neuron_noise_seed) if rng is None else rng
-        self._decoder = PhaseDecoder(self.bands.wave_vectors, config.decode_box_m)
+        self._rng = np.random.default_rng(NEURON_NOISE_SEED) if rng is None else rng
+        self._decoder = PhaseDecoder(self.bands.wave_vectors)
         self._last_decoded_m: Array = np.zeros(2)
         self._since_theta_s = 0.0
         self._since_decoding_m = 0.0
         self._read_out_every_m = _PART_OF_WRAP * self.attractor.extent_m
-        self._theta_period_s = 1.0 / place.theta_hz - 1e-9
+        self._theta_period_s = 1.0 / THETA_HZ - 1e-9
         self._warned = False
         self.place.learn(self.grid.activity)
 
@@ -104,7 +111,7 @@ class PathIntegrator:
             self._translate(c * forward - s * left, s * forward + c * left, dt_s)
 
     def use_gains(self, gain: float, turn_gain: float, heading_bias_rad_m: float) -> None:
-        """Integrate the steps to come with other gains (their meaning: `config/neural.py: NeuralConfig`)."""
+        """Integrate the steps to come with other gains (their meaning: `config/mapping.py: NeuralConfig`)."""
         gains = {"gain": gain, "turn_gain": turn_gain, "heading_bias_rad_m": heading_bias_rad_m}
         self.config = self.config.model_copy(update=gains)
 
@@ -285,16 +292,16 @@ def _unwrapped(difference: NDArray[np.float64], expected: NDArray[np.float64]) -
     return np.asarray(difference - np.round(difference - expected))
 
 
-def _grid(config: NeuralConfig) -> GridModules:
-    squared = LowModes(config.sheet_side, config.fourier_modes).squared_wave_number(config.metric)
-    gains = kernel_spectrum(squared, config.kernel_gain_first, config.kernel_gain_zero, config.kernel_widths, config.kernel)
+def _grid(config: NeuralConfig, dtype: DTypeLike) -> GridModules:
+    squared = LowModes(config.sheet_side, FOURIER_MODES).squared_wave_number(config.metric)
+    gains = kernel_spectrum(squared, kernel=config.kernel)
     return GridModules(
         config.modules,
         config.sheet_side,
-        config.fourier_modes,
+        FOURIER_MODES,
         gains,
-        relu if config.rectifier == "relu" else softplus(config.softplus_sharpness),
+        relu if config.rectifier == "relu" else softplus(),
         config.band_drive,
-        np.dtype(config.dtype),
+        dtype,
         config.metric,
     )

@@ -8,7 +8,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.neural import PlaceConfig
+from hybridmap.config.mapping import PlaceConfig
+
+GRID_INPUTS_SIDE = 4
+"""Grid cells along a side of each sheet that project to place cells; it divides every sheet's side."""
+RECRUIT_THRESHOLD = 0.3
+"""A cell is recruited where no other responds above this share of its peak: fields overlap a little, none is left out."""
+INHIBITION = 0.6
+"""C_inh_p, as a share of a field's peak drive: fields are some 7 cm wide, and 97 % and more have one peak."""
 
 log = logging.getLogger(__name__)
 
@@ -24,11 +31,11 @@ class PlaceCells:
 
     def __init__(self, config: PlaceConfig, sheet_side: int, spacings_m: NDArray[np.float64]) -> None:
         self.config = config
-        self._stride = sheet_side // config.grid_inputs_side
+        self._stride = sheet_side // GRID_INPUTS_SIDE
         self._module_weight = np.sqrt(spacings_m / spacings_m.max()).astype(np.float32)[:, None]
-        inputs = config.grid_inputs_side**2
+        inputs = GRID_INPUTS_SIDE**2
         self._less_mean = np.eye(inputs, dtype=np.float32) - np.float32(1.0 / inputs)
-        self._weights = np.zeros((256, len(spacings_m) * config.grid_inputs_side**2), dtype=np.float32)
+        self._weights = np.zeros((256, len(spacings_m) * GRID_INPUTS_SIDE**2), dtype=np.float32)
         self._recruited = 0
 
     @property
@@ -48,7 +55,7 @@ class PlaceCells:
         """
         drive = self.inputs(sheets)
         rates = self.respond(drive)
-        if rates.size == 0 or float(rates.max()) < self.config.recruit_threshold:
+        if rates.size == 0 or float(rates.max()) < RECRUIT_THRESHOLD:
             self._recruit(drive)
             return self.respond(drive)
         for cell in rates.nonzero()[0].tolist():
@@ -59,7 +66,7 @@ class PlaceCells:
 
     def respond(self, drive: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the rates (cells,) or (cells, P) to inputs (inputs,) or (inputs, P), as `inputs` gives them."""
-        inhibition = np.float32(self.config.inhibition)
+        inhibition = np.float32(INHIBITION)
         above = self.weights.dot(drive)
         above -= inhibition
         np.maximum(above, np.float32(0.0), out=above)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.simulation import CameraConfig
+from hybridmap.config.inputs import CameraConfig
 from hybridmap.geometry import Array, rotation_from_quaternion
 from hybridmap.simulation.paints import smooth_noise
 from hybridmap.simulation.scene import Hits, Scene
@@ -16,6 +16,22 @@ from hybridmap.streams.base import Camera, RgbdFrame
 
 OPTICAL_QUATERNION_XYZW: tuple[float, float, float, float] = (-0.5, 0.5, -0.5, 0.5)
 """A level camera that looks along x of `base_link`: optical frame with x right, y down, z forward."""
+FORWARD_M = 0.1
+"""The camera stands this far in front of `base_link`, as on the head of a small robot."""
+HEIGHT_M = 1.0
+"""Height above the floor, m: furniture and pictures on the walls are both in view."""
+RANGE_MIN_M = 0.4
+"""No depth nearer than this, m along the optical axis: the limit of a structured-light camera."""
+DEPTH_NOISE_M, DEPTH_NOISE_PER_M = 0.0012, 0.0019
+"""Standard deviation of depth at 0.4 m, and its growth with the square of the distance beyond (Nguyen et al. 2012)."""
+DEPTH_NOISE_WIDTH_PX = 1.0
+"""Pixels (one sigma) over which the noise of depth is alike, as matching windows make it; 0: each pixel its own."""
+HOLE_FRACTION = 0.01
+"""Share of the image that patches without depth cover: dark and shiny spots of a usual room."""
+EXPOSURE_CHANGE = 0.12
+"""Relative slow change of brightness, as an automatic exposure makes it."""
+COLOR_NOISE = 1.5
+"""Standard deviation of a colour value, of 255: a camera in room light."""
 _MM_PER_M = 1000.0
 _GRAZING_COSINE = 0.14
 _EDGE_JUMP = 0.06
@@ -27,7 +43,7 @@ def camera_of(config: CameraConfig) -> Camera:
     focal = 0.5 * config.width_px / float(np.tan(np.deg2rad(0.5 * config.field_of_view_deg)))
     mounting = np.eye(4)
     mounting[:3, :3] = rotation_from_quaternion(OPTICAL_QUATERNION_XYZW)
-    mounting[:3, 3] = config.forward_m, 0.0, config.height_m
+    mounting[:3, 3] = FORWARD_M, 0.0, HEIGHT_M
     center = 0.5 * (config.width_px - 1), 0.5 * (config.height_px - 1)
     return Camera(config.width_px, config.height_px, focal, focal, *center, mounting)
 
@@ -57,7 +73,7 @@ class CameraModel:
         ray = np.stack([(columns - c.cx_px) / c.fx_px, (rows - c.cy_px) / c.fy_px, np.ones(columns.shape)], axis=-1)
         self._rays_base = ray @ c.T_base_camera[:3, :3].T
         self._ray_length = np.linalg.norm(ray, axis=-1).astype(np.float32)
-        self._exposure = _Exposure(config.exposure_change, rng.uniform(0.02, 0.25, 4), rng.uniform(0, 2 * np.pi, 4))
+        self._exposure = _Exposure(config.noise * EXPOSURE_CHANGE, rng.uniform(0.02, 0.25, 4), rng.uniform(0, 2 * np.pi, 4))
 
     def frame(self, stamp_ns: int, time_s: float, pose_world_base: Array, rng: np.random.Generator) -> RgbdFrame:
         """What the camera sees from a pose.
@@ -86,14 +102,13 @@ class CameraModel:
         seen = self._scene.atlas.sample(hits.surface, hits.across, hits.down, footprint)
         seen[~hits.hit] = _SKY
         seen *= np.float32(gain)
-        seen += np.float32(self._config.color_noise) * rng.standard_normal(seen.shape, dtype=np.float32)
+        seen += np.float32(self._config.noise * COLOR_NOISE) * rng.standard_normal(seen.shape, dtype=np.float32)
         return np.asarray(np.clip(seen + np.float32(0.5), 0, 255), dtype=np.uint8)
 
     def _depth(self, hits: Hits, cosine: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
         """Depth (H, W) float32 in whole millimetres; axial noise after Nguyen et al. 2012, growing with z^2."""
-        config = self._config
         z = np.where(hits.hit, hits.length, np.float32(99.0))
-        sigma = config.depth_noise_m + config.depth_noise_per_m * (z - 0.4) ** 2
+        sigma = self._config.noise * (DEPTH_NOISE_M + DEPTH_NOISE_PER_M * (z - 0.4) ** 2)
         noisy = z + sigma.astype(np.float32) * self._noise(z.shape, rng)
         lost = (
             ~hits.hit
@@ -101,14 +116,14 @@ class CameraModel:
             | (cosine < _GRAZING_COSINE * rng.random(z.shape, dtype=np.float32) ** 0.5)
         )
         lost |= self._shadow(z, rng) | self._patches(z.shape, rng)
-        lost |= (noisy < config.range_min_m) | (noisy > config.range_max_m)
+        lost |= (noisy < RANGE_MIN_M) | (noisy > self._config.range_max_m)
         millimetres = np.where(lost, 0.0, np.rint(noisy.astype(np.float64) * _MM_PER_M))
         return (millimetres / _MM_PER_M).astype(np.float32)
 
     def _noise(self, shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float32]:
         """Noise (H, W) of unit deviation, alike in neighbouring pixels because they share most of a matching window."""
         white = rng.standard_normal(shape, dtype=np.float32)
-        width = self._config.depth_noise_width_px
+        width = DEPTH_NOISE_WIDTH_PX
         if width <= 0.0:
             return white
         kernel = cv2.getGaussianKernel(2 * int(np.ceil(3.0 * width)) + 1, width, cv2.CV_32F)
@@ -123,7 +138,8 @@ class CameraModel:
 
     def _patches(self, shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.bool_]:
         """Blobs without depth, as dark or shiny spots give."""
-        if self._config.hole_fraction <= 0.0:
+        share = self._config.noise * HOLE_FRACTION
+        if share <= 0.0:
             return np.zeros(shape, dtype=np.bool_)
         field = smooth_noise(rng, (shape[0], shape[1]), shape[1] / 28.0)
-        return np.asarray(field > np.quantile(field, 1.0 - self._config.hole_fraction))
+        return np.asarray(field > np.quantile(field, 1.0 - share))

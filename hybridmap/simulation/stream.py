@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.simulation import SimulationConfig
+from hybridmap.config.inputs import SimulationConfig
 from hybridmap.errors import ConfigError
 from hybridmap.geometry import Array
 from hybridmap.simulation.carry import Carry, carry
@@ -23,6 +23,10 @@ from hybridmap.trajectory import NS_PER_S, Trajectory
 if TYPE_CHECKING:
     from hybridmap.simulation.scene import Scene
 
+SPEED_M_S, TURN_RATE_RAD_S = 0.5, 0.8
+"""Cruising speed and fastest turn of the drives: a robot that moves among people."""
+ODOMETRY_RATE_HZ = 30.0
+"""Odometry messages a second."""
 _START_NS = 1_700_000_000 * NS_PER_S
 _WHEELS, _CAMERA, _LASER = range(3)
 
@@ -48,14 +52,14 @@ class SimulatedStream:
         self._seed = seed
         self._world: World = build_world(config.world)
         self._report = StreamReport()
-        step_s = 1.0 / config.odometry_rate_hz
-        truth = felt = drive(self._world.legs, DriveLimits(config.speed_m_s, config.turn_rate_rad_s), step_s)
+        step_s = 1.0 / ODOMETRY_RATE_HZ
+        truth = felt = drive(self._world.legs, DriveLimits(SPEED_M_S, TURN_RATE_RAD_S), step_s)
         self._carry = None if config.carried_m is None else carry(truth, config.carried_m, step_s)
         if self._carry is not None:
             truth, felt = self._carry.truth, self._carry.felt
         odometry = wheel_odometry(felt, config.wheels, self._generators()[_WHEELS])
-        count = len(truth) if config.duration_s is None else max(3, int(config.duration_s * config.odometry_rate_hz) + 1)
-        stamps = _stamps_ns(len(truth), config.odometry_rate_hz)[:count]
+        count = len(truth) if config.duration_s is None else max(3, int(config.duration_s * ODOMETRY_RATE_HZ) + 1)
+        stamps = _stamps_ns(len(truth), ODOMETRY_RATE_HZ)[:count]
         self._truth = Trajectory(stamps, np.column_stack([truth[:, :2], as_transmitted(truth[:, 2])])[:count])
         self._odometry = Trajectory(stamps, odometry[:count])
         if self._carry is not None and self._carry.last >= count:

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.sensors import SensorsConfig
+from hybridmap.config.inputs import SensorsConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array
 from hybridmap.streams.bagindex import BagIndex

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.sensors import CameraIntrinsics, CameraMounting, SensorsConfig
+from hybridmap.config.inputs import CameraIntrinsics, CameraMounting, SensorsConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array
 from hybridmap.streams.base import Camera

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hybridmap.config.sensors import SensorsConfig
+from hybridmap.config.inputs import SensorsConfig
 from hybridmap.streams.base import Rig
 from hybridmap.streams.cameras import from_intrinsics, mounted, pinhole
 

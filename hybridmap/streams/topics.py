@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from hybridmap.config.sensors import SensorsConfig
+from hybridmap.config.inputs import SensorsConfig
 from hybridmap.errors import StreamError
 from hybridmap.streams.bagfile import Topic
 

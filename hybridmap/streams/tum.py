@@ -13,8 +13,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from hybridmap.config.inputs import CameraIntrinsics, CameraMounting, SensorsConfig
 from hybridmap.config.root import Config
-from hybridmap.config.sensors import CameraIntrinsics, CameraMounting, SensorsConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array
 from hybridmap.streams.base import RgbdFrame, Rig, Sample, SelfMotion, StreamReport

@@ -249,7 +249,7 @@ def backend_settings(variant: BackendVariant) -> BackendsConfig:
     try:
         return BackendsConfig.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError(f"backends: {variant.title}: settings: {said(error)}") from None
+        raise ConfigError(f"backends: {variant.title}: settings: {said(error, 'backends')}") from None
 
 
 def nested(dotted: str, value: Any) -> dict[str, Any]:

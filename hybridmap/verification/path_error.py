@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybridmap import geometry
-from hybridmap.config.neural import NeuralConfig
+from hybridmap.config.mapping import NeuralConfig
 from hybridmap.geometry import Array
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.head_direction import HeadDirectionRing

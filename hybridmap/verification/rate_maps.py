@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.neural import NeuralConfig
+from hybridmap.config.mapping import NeuralConfig
 from hybridmap.geometry import Array
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.place import PlaceProjection
@@ -52,7 +52,7 @@ def lattice_maps(
     drive = raster(side_m, pitch_m, angle)
     modules, side = integrator.grid.activity.shape[:2]
     picked = rng.integers(0, side, (modules, cells, 2))
-    at, of_ring = np.arange(modules), rng.integers(0, integrator.config.band_cells, (modules, 3))
+    at, of_ring = np.arange(modules), rng.integers(0, integrator.bands.activity.shape[-1], (modules, 3))
     count = round(side_m / pitch_m)
     grid = np.zeros((modules, cells, count, count), dtype=np.float32)
     bands = np.zeros((modules, 3, count, count), dtype=np.float32)

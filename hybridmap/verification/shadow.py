@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from hybridmap.config.neural import NeuralConfig
+from hybridmap.config.mapping import NeuralConfig
 from hybridmap.geometry import Array
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.torus import shift_sheets

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from hybridmap.config.neural import NeuralConfig
+from hybridmap.config.mapping import NeuralConfig
 from hybridmap.errors import ConfigError
 from hybridmap.neural import PathIntegrator
 from hybridmap.verification import path_error, rate_maps, shadow

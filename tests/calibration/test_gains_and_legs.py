@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hybridmap.calibration.gains import NEUTRAL, Gains, apply, remove
 from hybridmap.calibration.legs import Legs, Motion, chain
-from hybridmap.config.neural import NeuralConfig
+from hybridmap.config.mapping import NeuralConfig
 from hybridmap.geometry import between, compose, log
 from hybridmap.neural.path_integrator import PathIntegrator
 

@@ -5,17 +5,24 @@ import logging
 import numpy as np
 import pytest
 
+from hybridmap.calibration import online
 from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.gains import NEUTRAL, Gains, remove
 from hybridmap.calibration.online import OnlineCalibration
 from hybridmap.config import Config
-from hybridmap.config.calibration import CalibrationConfig
+from hybridmap.config.mapping import CalibrationConfig
 from hybridmap.geometry import compose
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.mapper import Mapper
 from tests.calibration.drives import GAINS, STEP_NS, drive, experience_map
 
-ON = CalibrationConfig(online=True, first_m=30.0, every_m=20.0)
+ON = CalibrationConfig(online=True)
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch):
+    monkeypatch.setattr(online, "FIRST_M", 30.0)
+    monkeypatch.setattr(online, "EVERY_M", 20.0)
 
 
 def run(config, gains, registered=True, seed=0):
@@ -50,8 +57,6 @@ def test_a_clear_error_is_corrected_and_said(caplog):
 
 
 def test_a_gain_that_was_not_measured_stays_and_is_not_said(monkeypatch):
-    from hybridmap.calibration import online
-
     covariance = np.diag([np.inf, 1e-6, 1e-6, 1e-4])
     estimate = Estimate(Gains(1.0, 0.9, 0.02), 0.0, covariance, 4.0, 20.0, 80.0, 1.0, 0.0)
     monkeypatch.setattr(online, "regress", lambda _: estimate)
@@ -81,9 +86,7 @@ def test_a_map_of_odometry_alone_says_nothing():
 
 
 def test_the_mapper_changes_its_integrator_and_says_why(monkeypatch):
-    from hybridmap.calibration import online
-
-    tree = {"vision": {"sensor": "none"}, "calibration": {"online": True, "first_m": 1.0, "every_m": 1.0}}
+    tree = {"vision": {"sensor": "none"}, "calibration": {"online": True}}
     mapper = Mapper(Config.from_tree(tree, "test"))
     wanted = Gains(1.1, 0.9, 0.02)
 

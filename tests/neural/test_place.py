@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hybridmap.config.neural import NeuralConfig, PlaceConfig
+from hybridmap.config.mapping import NeuralConfig, PlaceConfig
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.place import PlaceCells
 from hybridmap.neural.torus import shift_sheets

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from hybridmap.config.neural import NeuralConfig
+from hybridmap.config.mapping import NeuralConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import between, compose
 from hybridmap.neural import PathIntegrator

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from neural_drives import wander
 
 from hybridmap import geometry
-from hybridmap.config.neural import NeuralConfig
+from hybridmap.config.mapping import NeuralConfig
 from hybridmap.errors import ConfigError
 from hybridmap.neural import PathIntegrator
-from hybridmap.neural.grid import kernel_spectrum
+from hybridmap.neural.grid import GridModules, kernel_spectrum, relu
 from hybridmap.neural.place import PlaceProjection
 from hybridmap.neural.torus import LowModes
 
@@ -39,7 +39,7 @@ def test_the_bands_of_the_square_metric_are_orthogonal_and_the_third_is_their_su
 
 def test_the_printed_kernel_has_no_local_excitation_and_inhibits_far_too_much():
     squared = LowModes(32, 15).squared_wave_number()
-    gains = kernel_spectrum(squared, 1.4, -1.0, (1.5, 0.3), "printed")
+    gains = kernel_spectrum(squared, kernel="printed")
     assert gains[squared == 1] == pytest.approx(1.4)
     assert gains[squared == 0] < -10.0
     in_space = LowModes(32, 15).inverse(gains[:, None].astype(complex))[:, 0]
@@ -52,12 +52,20 @@ def test_the_printed_kernel_has_no_local_excitation_and_inhibits_far_too_much():
     [
         ({"kernel": "printed"}, "period-two oscillation"),
         ({"kernel": "printed", "rectifier": "softplus"}, "period-two oscillation"),
-        ({"kernel_gain_first": 3.0}, "grows without bound"),
     ],
 )
 def test_an_unstable_kernel_is_refused_with_what_happens(setting, named):
     with pytest.raises(ConfigError, match=named):
         PathIntegrator(NeuralConfig.model_validate(setting))
+
+
+@pytest.mark.parametrize(
+    ("gain_first", "widths", "named"), [(3.0, (1.5, 0.3), "grows without bound"), (1.4, (3.0, 1.0), "do not settle")]
+)
+def test_gains_of_no_stationary_pattern_are_refused(gain_first, widths, named):
+    gains = kernel_spectrum(LowModes(32, 4).squared_wave_number(), gain_first, -1.0, widths)
+    with pytest.raises(ConfigError, match=named):
+        GridModules(8, 32, 4, gains, relu, 0.1)
 
 
 def test_noise_comes_from_the_generator_and_costs_accuracy():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridmap.config.simulation import CameraConfig, SimulationConfig
+from hybridmap.config.inputs import CameraConfig, SimulationConfig
 from hybridmap.errors import ConfigError
 from hybridmap.geometry import between, compose, wrap_angle
 from hybridmap.simulation import SimulatedStream

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hybridmap.config.simulation import CameraConfig, LaserScannerConfig
+from hybridmap.config.inputs import CameraConfig, LaserScannerConfig
+from hybridmap.simulation import camera, laser
 from hybridmap.simulation.atlas import build_atlas
 from hybridmap.simulation.camera import CameraModel
 from hybridmap.simulation.laser import LaserModel
@@ -38,7 +39,7 @@ def points_in_base(model, depth_m):
 
 
 def test_depth_puts_walls_floor_and_ceiling_where_they_are():
-    model, seen = frame(pose=(9.0, 1.0, 0.0), depth_noise_m=0.0, depth_noise_per_m=0.0, hole_fraction=0.0)
+    model, seen = frame(pose=(9.0, 1.0, 0.0), noise=0.0)
     x, y, z = points_in_base(model, seen.depth_m).T
     assert (x > 0.4).all()
     left, right = np.abs(y - 1.4) < 0.01, np.abs(y + 1.0) < 0.01
@@ -58,17 +59,21 @@ def test_depth_is_whole_millimetres_within_its_range():
 
 
 @pytest.mark.parametrize("distance_m", [1.0, 2.5, 4.5])
-def test_depth_noise_grows_with_the_square_of_the_distance(distance_m):
-    _, seen = frame(pose=(LENGTH_M - 0.1 - distance_m, 1.2, 0.0), hole_fraction=0.0)
+def test_depth_noise_grows_with_the_square_of_the_distance(distance_m, monkeypatch):
+    monkeypatch.setattr(camera, "HOLE_FRACTION", 0.0)
+    _, seen = frame(pose=(LENGTH_M - 0.1 - distance_m, 1.2, 0.0))
     middle = seen.depth_m[50:70, 70:90].astype(np.float64)
     expected = 0.0012 + 0.0019 * (distance_m - 0.4) ** 2
     assert middle.mean() == pytest.approx(distance_m, abs=0.01)
     assert middle.std() == pytest.approx(expected, rel=0.2)
 
 
-def test_holes_where_depth_jumps_and_in_patches():
-    _, whole = frame("lab", (2.0, 0.72, 0.0), hole_fraction=0.0)
-    _, patchy = frame("lab", (2.0, 0.72, 0.0), hole_fraction=0.05)
+def test_holes_where_depth_jumps_and_in_patches(monkeypatch):
+    found = []
+    for share in (0.0, 0.05):
+        monkeypatch.setattr(camera, "HOLE_FRACTION", share)
+        found.append(frame("lab", (2.0, 0.72, 0.0))[1])
+    whole, patchy = found
     assert np.count_nonzero(patchy.depth_m == 0) > np.count_nonzero(whole.depth_m == 0) + 100
     clean = cv2.medianBlur(whole.depth_m, 5)
     torn = (cv2.dilate(clean, np.ones((3, 3))) - cv2.erode(clean, np.ones((3, 3)))) > 0.5
@@ -78,7 +83,7 @@ def test_holes_where_depth_jumps_and_in_patches():
 
 def test_exposure_changes_over_time_and_can_be_turned_off():
     bright = [frame(time_s=t)[1].color.mean() for t in (0.0, 3.0, 7.0, 12.0)]
-    steady = [frame(time_s=t, exposure_change=0.0)[1].color.mean() for t in (0.0, 3.0, 7.0, 12.0)]
+    steady = [frame(time_s=t, noise=0.0)[1].color.mean() for t in (0.0, 3.0, 7.0, 12.0)]
     assert np.ptp(bright) > 8
     assert np.ptp(steady) < 1
 
@@ -103,8 +108,9 @@ def test_the_same_place_gives_features_that_match_from_elsewhere():
     assert sum(first.distance < 0.75 * second.distance for first, second in pairs) > 25
 
 
-def test_laser_measures_the_corridor():
-    model = LaserModel(scene("corridor"), LaserScannerConfig(drop_fraction=0.0, range_max_m=8.0))
+def test_laser_measures_the_corridor(monkeypatch):
+    monkeypatch.setattr(laser, "DROP_FRACTION", 0.0)
+    model = LaserModel(scene("corridor"), LaserScannerConfig(range_max_m=8.0))
     bearings = model.laser.bearings_rad
     np.testing.assert_array_equal(bearings, bearings[0] + np.arange(180) * np.float64(np.float32(np.pi / 179)))
     errors = []

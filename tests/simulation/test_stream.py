@@ -7,24 +7,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hybridmap.config.simulation import CameraConfig, LaserScannerConfig, SimulationConfig, WheelErrorConfig
+from hybridmap.config.inputs import CameraConfig, LaserScannerConfig, SimulationConfig, WheelErrorConfig
 from hybridmap.errors import ConfigError
 from hybridmap.geometry import align, between, compose, wrap_angle
-from hybridmap.simulation import SimulatedStream, world_names
+from hybridmap.simulation import SimulatedStream, wheels, world_names
 from hybridmap.simulation.drive import DriveLimits, drive
 from hybridmap.simulation.wheels import wheel_odometry
 from hybridmap.streams.base import LaserScan, RgbdFrame, SelfMotion
 
 SMALL = CameraConfig(width_px=80, height_px=60)
-PERFECT_WHEELS = WheelErrorConfig(
-    scale_bias=0,
-    turn_bias=0,
-    heading_bias_deg_per_m=0,
-    translation_m_per_sqrt_m=0,
-    rotation_deg_per_sqrt_m=0,
-    rotation_per_turn=0,
-    slips_per_m=0,
-)
+PERFECT_WHEELS = WheelErrorConfig(scale_bias=0, turn_bias=0, heading_bias_deg_per_m=0, noise=0)
 
 
 def fingerprint(samples) -> list[tuple]:
@@ -157,7 +149,7 @@ def test_perfect_wheels_report_the_truth():
     np.testing.assert_allclose(compose(truth[0], odometry)[:, :2], truth[:, :2], atol=2e-3)
 
 
-def test_each_wheel_error_does_what_it_says():
+def test_each_wheel_error_does_what_it_says(monkeypatch):
     straight = np.column_stack([np.linspace(0.0, 10.0, 601), np.zeros((601, 2))])
     on_the_spot = np.column_stack([np.zeros((601, 2)), wrap_angle(np.linspace(0.0, np.pi / 2, 601))])
     rng = np.random.default_rng(0)
@@ -168,10 +160,13 @@ def test_each_wheel_error_does_what_it_says():
     np.testing.assert_allclose(end(straight, scale_bias=0.02), [10.2, 0.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(end(straight, heading_bias_deg_per_m=1.0)[2], np.deg2rad(10.0), atol=1e-6)
     np.testing.assert_allclose(end(on_the_spot, turn_bias=0.1)[2], 1.1 * np.pi / 2, atol=1e-6)
-    ends = np.array([end(straight, rotation_deg_per_sqrt_m=1.0, translation_m_per_sqrt_m=0.05) for _ in range(300)])
-    assert np.rad2deg(ends[:, 2].std()) == pytest.approx(np.sqrt(10.0), rel=0.15)
-    assert ends[:, 0].std() == pytest.approx(0.05 * np.sqrt(10.0), rel=0.25)
-    slipped = np.array([end(straight, slips_per_m=1.0, slip_m=0.1)[0] for _ in range(20)])
+    monkeypatch.setattr(wheels, "SLIPS_PER_M", 0.0)
+    ends = np.array([end(straight, noise=2.0) for _ in range(300)])
+    assert np.rad2deg(ends[:, 2].std()) == pytest.approx(2 * wheels.ROTATION_DEG_PER_SQRT_M * np.sqrt(10.0), rel=0.15)
+    assert ends[:, 0].std() == pytest.approx(2 * wheels.TRANSLATION_M_PER_SQRT_M * np.sqrt(10.0), rel=0.25)
+    monkeypatch.setattr(wheels, "SLIPS_PER_M", 1.0)
+    monkeypatch.setattr(wheels, "SLIP_M", 0.1)
+    slipped = np.array([end(straight, noise=1.0)[0] for _ in range(20)])
     assert slipped.max() < 10.0
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybridmap.config import Config
-from hybridmap.config.simulation import CameraConfig, SimulationConfig
+from hybridmap.config.inputs import CameraConfig, SimulationConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import quaternion_from_yaw, rotation_from_quaternion, yaw_from_quaternion
 from hybridmap.simulation import SimulatedStream

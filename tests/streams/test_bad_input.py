@@ -9,7 +9,7 @@ import pytest
 from recordings import KINDS, NS, Recording, color_pixels, depth_mm, laser_drive, rgbd_drive
 
 from hybridmap.config import Config
-from hybridmap.config.sensors import SensorsConfig
+from hybridmap.config.inputs import SensorsConfig
 from hybridmap.errors import StreamError
 from hybridmap.streams import open_stream
 

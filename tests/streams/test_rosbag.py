@@ -10,7 +10,7 @@ import pytest
 from recordings import KINDS, NS, OPTICAL_XYZW, Recording, color_pixels, depth_mm, laser_drive, rgbd_drive
 
 from hybridmap.config import Config
-from hybridmap.config.sensors import SensorsConfig
+from hybridmap.config.inputs import SensorsConfig
 from hybridmap.streams import open_stream
 from hybridmap.streams.base import LaserScan, RgbdFrame, SelfMotion
 

@@ -8,7 +8,7 @@ import pytest
 from recordings import NS, color_pixels, depth_mm
 
 from hybridmap.config import Config
-from hybridmap.config.sensors import SensorsConfig
+from hybridmap.config.inputs import SensorsConfig
 from hybridmap.errors import StreamError
 from hybridmap.streams import open_stream
 from hybridmap.streams.base import RgbdFrame, SelfMotion

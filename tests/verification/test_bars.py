@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hybridmap.config.neural import NeuralConfig
+from hybridmap.config.mapping import NeuralConfig
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.attractor import PlaceAttractor
 from hybridmap.verification import path_error, rate_maps, rows_of, shadow

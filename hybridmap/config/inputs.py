@@ -1,0 +1,188 @@
+"""What comes in: the sensors of a recording or robot, and the simulated world with its sensors."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from hybridmap.config.section import Section
+
+
+class LaserMounting(Section):
+    """Where the laser sits on the base; takes the place of the recording's transforms."""
+
+    x_m: float = 0.0
+    """Forward of the base's origin, m."""
+    y_m: float = 0.0
+    """To the left of the base's origin, m."""
+    yaw_rad: float = 0.0
+    """Direction of the laser's x axis seen from the base, rad."""
+    upside_down: bool = False
+    """Whether the laser hangs upside down: its beams then turn the other way."""
+
+
+class CameraMounting(Section):
+    """Where the camera's OPTICAL frame (x right, y down, z forward) sits on the base; takes the place of the recording's."""
+
+    translation_m: tuple[float, float, float]
+    """Origin of the optical frame in the base, m."""
+    quaternion_xyzw: tuple[float, float, float, float] = (-0.5, 0.5, -0.5, 0.5)
+    """Rotation of the optical frame in the base; the default looks forward and level.
+
+    Watch: an error of 1 degree in the tilt makes the floor look like a ramp."""
+
+
+class CameraIntrinsics(Section):
+    """Calibration of the colour camera; takes the place of the recording's."""
+
+    width_px: int = Field(gt=0)
+    """Image width, pixels."""
+    height_px: int = Field(gt=0)
+    """Image height, pixels."""
+    fx_px: float = Field(gt=0)
+    """Focal length along x, pixels."""
+    fy_px: float = Field(gt=0)
+    """Focal length along y, pixels."""
+    cx_px: float
+    """Principal point, x, pixels."""
+    cy_px: float
+    """Principal point, y, pixels."""
+    distortion: tuple[float, ...] = ()
+    """Lens distortion k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty: none."""
+
+
+class SensorsConfig(Section):
+    """Where the sensor data come from; None means: find it."""
+
+    odometry_topic: str | None = None
+    """Topic of nav_msgs/Odometry, or a tf2_msgs/TFMessage topic to take `odom_frame` -> base from."""
+    scan_topic: str | None = None
+    """Topic of sensor_msgs/LaserScan."""
+    color_topic: str | None = None
+    """Topic of the colour pictures, sensor_msgs/Image or CompressedImage."""
+    depth_topic: str | None = None
+    """Topic of the depth pictures, sensor_msgs/Image or CompressedImage."""
+    camera_info_topic: str | None = None
+    """Topic of the colour camera's sensor_msgs/CameraInfo."""
+    depth_info_topic: str | None = None
+    """Topic of the depth camera's sensor_msgs/CameraInfo."""
+    groundtruth_topic: str | None = None
+    """Topic of nav_msgs/Odometry that holds the true pose of the base."""
+    odometry_file: str | None = None
+    """File of a TUM folder with the odometry; None: `odometry.txt`."""
+    odom_frame: str = "odom"
+    """Frame that odometry in /tf starts from, where there is no Odometry topic."""
+    base_frame: str | None = None
+    """Frame of the robot that is mapped; None: the child frame of the odometry."""
+    laser_mounting: LaserMounting | None = None
+    """Mounting of the laser; None: from the recording's transforms."""
+    camera_mounting: CameraMounting | None = None
+    """Mounting of the camera; None: from the recording's transforms or camera.yaml."""
+    camera_intrinsics: CameraIntrinsics | None = None
+    """Calibration of the colour camera; None: from CameraInfo or camera.yaml."""
+    depth_scale: float | None = Field(default=None, gt=0)
+    """Units of a 16 bit depth value per metre; None: 1000 in bags, camera.yaml in a TUM folder.
+
+    Watch: TUM recordings of a Kinect have 5000; a wrong factor scales every depth."""
+    sync_tolerance_s: float = Field(default=0.02, ge=0)
+    """Colour and depth belong together when their stamps differ by no more than this, s.
+
+    Watch: while the robot turns, a pair this far apart shows two different views."""
+    latency_s: float = Field(default=0.0, ge=0)
+    """Live input: how long samples wait to be sorted by stamp, s; recordings are sorted by their reader.
+
+    Watch: the pose comes later by as much."""
+    odometry_delay_s: float = Field(default=0.0, ge=-1, le=1)
+    """Added to the stamps of odometry: how much later views are stamped than odometry, s. `hybridmap calibrate` finds it.
+
+    Watch: updates of a live robot come later by as much."""
+    range_min_m: float | None = Field(default=None, ge=0)
+    """Laser returns nearer than this are dropped, m; None: the recording's limit alone.
+
+    Watch: set it where the laser sees the robot itself."""
+    range_max_m: float | None = Field(default=None, gt=0)
+    """Laser returns at or beyond this are dropped, m; None: the recording's limit alone.
+
+    Watch: a long hall needs the far walls."""
+    depth_min_m: float | None = Field(default=None, ge=0)
+    """Depth nearer than this is dropped, m; None: all depth is kept.
+
+    Watch: many cameras give wrong depth below 0.3 m."""
+    depth_max_m: float | None = Field(default=None, gt=0)
+    """Depth beyond this is dropped, m; None: all depth is kept.
+
+    Watch: the noise of depth grows with the square of the distance."""
+
+
+class WheelErrorConfig(Section):
+    """How wrong the simulated wheel odometry is."""
+
+    scale_bias: float = Field(default=0.02, gt=-1)
+    """Relative error of every distance; 0.02 reports 2 % too much."""
+    turn_bias: float = Field(default=0.01, gt=-1)
+    """Relative error of every turn."""
+    heading_bias_deg_per_m: float = 0.16
+    """Pull to the left, degrees per metre driven.
+
+    Watch: of the three biases it bends a map most."""
+    noise: float = Field(default=1.0, ge=0, le=100)
+    """Factor on the white noise and on the number and size of slips; 0: none.
+
+    Watch: the noise of odometry edges (`edges`) does not follow it."""
+
+
+class CameraConfig(Section):
+    """The simulated RGB-D camera."""
+
+    width_px: int = Field(default=240, ge=16, le=1920)
+    """Image width, pixels.
+
+    Watch: rendering costs time in proportion to the pixels."""
+    height_px: int = Field(default=180, ge=12, le=1080)
+    """Image height, pixels."""
+    field_of_view_deg: float = Field(default=62.0, gt=10, lt=150)
+    """Horizontal field of view, degrees."""
+    rate_hz: float = Field(default=5.0, gt=0, le=60)
+    """Frames a second."""
+    range_max_m: float = Field(default=5.0, gt=0, lt=13)
+    """No depth beyond this, m along the optical axis."""
+    noise: float = Field(default=1.0, ge=0, le=10)
+    """Factor on the noise of depth and colour, the holes in depth and the change of exposure; 0: a perfect camera."""
+
+
+class LaserScannerConfig(Section):
+    """The simulated planar laser."""
+
+    beams: int = Field(default=180, ge=8, le=4096)
+    """Beams a scan."""
+    field_of_view_deg: float = Field(default=180.0, gt=1, le=360)
+    """Angle between the first and the last beam, degrees; 360 leaves out the last, which is the first again."""
+    rate_hz: float = Field(default=5.0, gt=0, le=60)
+    """Scans a second."""
+    range_max_m: float = Field(default=12.0, gt=0)
+    """No return beyond this, m."""
+    noise: float = Field(default=1.0, ge=0, le=100)
+    """Factor on the noise of ranges and the share of lost beams; 0: a perfect laser."""
+
+
+class SimulationConfig(Section):
+    """World, drive, sensors and their noise."""
+
+    world: str = "lab"
+    """Name of the world and its drive."""
+    sensors: Literal["rgbd", "laser", "both"] = "rgbd"
+    """What the robot carries besides its wheels."""
+    duration_s: float | None = Field(default=None, gt=0)
+    """Stop the drive after so many seconds; None: drive to its end."""
+    carried_m: float | None = Field(default=None, gt=0)
+    """Kidnap the robot in the middle of its drive: put it down in a known place so far away, m. The wheels feel nothing and
+    there are no frames. None: never.
+
+    Watch: in a smaller world it is put down as far away as there is a known place."""
+    wheels: WheelErrorConfig = WheelErrorConfig()
+    """Errors of the wheel odometry."""
+    camera: CameraConfig = CameraConfig()
+    """RGB-D camera."""
+    laser: LaserScannerConfig = LaserScannerConfig()
+    """Planar laser."""
