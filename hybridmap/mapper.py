@@ -22,8 +22,10 @@ from hybridmap.graph.uncertainty import relative_covariances
 from hybridmap.metrics import StageClock
 from hybridmap.neural.path_integrator import PathIntegrator
 from hybridmap.neural.reanchoring import Reanchoring
-from hybridmap.streams.base import LaserScan, RgbdFrame, Rig, Sample, SelfMotion, Velocity
-from hybridmap.streams.rig import rig_of
+from hybridmap.streams.base import Rig, Sample, SelfMotion, Velocity
+from hybridmap.streams.laser import LaserScan
+from hybridmap.streams.rgbd import RgbdFrame
+from hybridmap.streams.sensors import rig_of
 from hybridmap.streams.synchronise import Ready, Synchroniser
 from hybridmap.trajectory import NO_ANCHORS, NS_PER_S, stamp_ns_from_s
 from hybridmap.vision import create_front_end

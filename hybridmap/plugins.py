@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from hybridmap.errors import HybridMapError
 
@@ -26,6 +26,7 @@ class Table(Generic[T]):
         self._what, self._group, self._error = what, group, error
         self._own = dict(own)
         self._registered: dict[str, T] = {}
+        self._points: tuple[EntryPoint, ...] | None = None
 
     def register(self, name: str, factory: T) -> None:
         """Add an implementation for this process.
@@ -40,6 +41,10 @@ class Table(Generic[T]):
     def names(self) -> tuple[str, ...]:
         """Every name, ours first."""
         return tuple(dict.fromkeys((*self._own, *self._registered, *(point.name for point in self._entry_points()))))
+
+    def values(self) -> tuple[T, ...]:
+        """What every name stands for, ours first."""
+        return tuple(self[name] for name in self.names())
 
     def __getitem__(self, name: str) -> T:
         """The factory of a name.
@@ -56,7 +61,9 @@ class Table(Generic[T]):
         raise self._error(f"unknown {self._what} {name!r}; there are {', '.join(self.names())}")
 
     def _entry_points(self) -> tuple[EntryPoint, ...]:
-        return tuple(entry_points(group=self._group))
+        if self._points is None:
+            self._points = tuple(entry_points(group=self._group))
+        return self._points
 
     def _loaded(self, point: EntryPoint) -> T:
         try:
@@ -64,3 +71,8 @@ class Table(Generic[T]):
         except (ImportError, AttributeError) as error:
             raise self._error(f"{self._what} {point.name!r}: {point.value} cannot be imported: {error}") from error
         return factory
+
+
+def loaded(path: str) -> Any:
+    """What `module:name` names, imported now: heavy modules wait until they are needed."""
+    return EntryPoint(path, path, "").load()

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hybridmap.geometry import compose
-from hybridmap.streams.base import Laser, LaserScan, Rig, Sample, SelfMotion, StreamReport
+from hybridmap.streams.base import Rig, Sample, SelfMotion, StreamReport
+from hybridmap.streams.laser import Laser, LaserScan
 from hybridmap.trajectory import NS_PER_S, Trajectory
 
 BEARINGS = np.deg2rad(np.arange(-135.0, 135.1, 1.5))

@@ -12,7 +12,8 @@ from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.hashing import graph_hash
 from hybridmap.mapper import Mapper
-from hybridmap.streams.base import LaserScan, SelfMotion
+from hybridmap.streams.base import SelfMotion
+from hybridmap.streams.laser import LaserScan
 from hybridmap.trajectory import Trajectory
 from tests.streams_for_tests import RoomDrive
 

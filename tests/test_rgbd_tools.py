@@ -8,7 +8,8 @@ import pytest
 
 from hybridmap.config import Config
 from hybridmap.graph.edges import EdgeKind
-from hybridmap.streams.base import RgbdFrame, SelfMotion
+from hybridmap.streams.base import SelfMotion
+from hybridmap.streams.rgbd import RgbdFrame
 
 ROOT = Path(__file__).resolve().parents[1]
 

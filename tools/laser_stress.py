@@ -24,7 +24,8 @@ from hybridmap.config import Config
 from hybridmap.geometry import Array, between, compose
 from hybridmap.metrics import Metric, to_json
 from hybridmap.store import MapStore
-from hybridmap.streams.base import LaserScan, Sample, SelfMotion, Stream
+from hybridmap.streams.base import Sample, SelfMotion, Stream
+from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.open import open_stream
 
 Steps = Callable[[Array, np.random.Generator], Array]

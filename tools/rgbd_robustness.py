@@ -28,8 +28,9 @@ from hybridmap.config import Config
 from hybridmap.config.inputs import WheelErrorConfig
 from hybridmap.metrics import Metric, to_json
 from hybridmap.simulation.wheels import wheel_odometry
-from hybridmap.streams.base import RgbdFrame, Rig, Sample, SelfMotion, Stream, StreamReport
+from hybridmap.streams.base import Rig, Sample, SelfMotion, Stream, StreamReport
 from hybridmap.streams.open import open_stream
+from hybridmap.streams.rgbd import RgbdFrame
 from hybridmap.trajectory import NS_PER_S, Trajectory
 
 MAP = "ate_gtsam-gnc"
@@ -145,8 +146,8 @@ class Spoilt:
             return frame.color
         ends: Floats = self.groundtruth.at([frame.stamp_ns - half_ns, frame.stamp_ns + half_ns])
         turn = abs(float(np.angle(np.exp(1j * (ends[1, 2] - ends[0, 2])))))
-        assert self.rig.camera is not None
-        width = max(1, round(turn * self.rig.camera.fx_px))
+        assert "camera" in self.rig.sensors
+        width = max(1, round(turn * self.rig.sensors["camera"].fx_px))
         return np.asarray(cv2.blur(frame.color, (width, 1)), dtype=np.uint8)
 
 

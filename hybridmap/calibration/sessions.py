@@ -23,7 +23,7 @@ from hybridmap.geometry import Array, between
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.store import MapStore, SessionFolder
-from hybridmap.streams.base import Rig
+from hybridmap.streams.sensors import words
 from hybridmap.trajectory import NS_PER_S, Trajectory
 
 log = logging.getLogger(__name__)
@@ -77,7 +77,8 @@ def read_drive(folder: Path) -> Drive:
         track, experiences, solutions = store.track(), store.map(), store.solutions()
         tree = yaml.safe_load(store.config_yaml) or {}
         config = _understood(tree, f"{store.path}: configuration")
-        changes, primary, sensors = store.info(GAIN_CHANGES) or [], store.primary, _sensors(store.rig)
+        changes, primary = store.info(GAIN_CHANGES) or [], store.primary
+        sensors = " and ".join(words(store.rig)) or "no sensor but odometry"
     if len(track) < 2:
         raise EvaluationError(f"{folder}: holds no odometry to calibrate")
     steps = between(track.poses_odom[:-1], track.poses_odom[1:])
@@ -114,7 +115,7 @@ def estimate_of(
     for drive in drives[1:]:
         if drive.sensors != drives[0].sensors:
             log.warning(
-                "%s has %s, %s has %s: hardly of one kind of robot, yet calibrated as one",
+                "%s maps with %s, %s maps with %s: hardly of one kind of robot, yet calibrated as one",
                 *(drives[0].name, drives[0].sensors, drive.name, drive.sensors),
             )
     if references:
@@ -271,13 +272,6 @@ def _understood(tree: dict[str, Any], origin: str) -> Config:
 
 def _in_use(config: Config) -> dict[str, float]:
     return {f"{section}.{key}": getattr(getattr(config, section), key) for section, keys in _IN_USE.items() for key in keys}
-
-
-def _sensors(rig: Rig) -> str:
-    laser, camera = rig.laser, rig.camera
-    found = [f"a laser of {len(laser.bearings_rad)} beams"] if laser is not None else []
-    found += [f"a camera of {camera.width_px} x {camera.height_px} pixels"] if camera is not None else []
-    return " and ".join(found) or "no sensor but odometry"
 
 
 def _same_recording(one: Motion, other: Motion) -> bool:

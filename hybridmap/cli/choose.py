@@ -9,10 +9,12 @@ from typing import Any
 import yaml
 
 from hybridmap.config import Config
+from hybridmap.config.root import named_configs
 from hybridmap.errors import ConfigError
 from hybridmap.streams import open_stream
 from hybridmap.streams.base import Rig, Stream
 from hybridmap.streams.open import world_of
+from hybridmap.streams.sensors import carried
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,7 @@ def choose(
 
 
 def _config_for(rig: Rig, overrides: Mapping[str, Any]) -> Config:
-    if rig == Rig():
-        return Config.load(None, {**overrides, "vision.sensor": "none"})
-    return Config.load("laser" if rig.laser is not None else "rgbd", overrides)
+    """The configuration that comes with the first kind of sensor found; its defaults where none does."""
+    for kind, _ in carried(rig):
+        return Config.load(kind.name if kind.name in named_configs() else None, overrides)
+    return Config.load(None, {**overrides, "vision.sensor": "none"})

@@ -80,11 +80,9 @@ def _metrics(found: Inspection) -> list[Metric]:
 
 
 def _sensor(found: Inspection) -> str:
-    if found.rig.laser is not None:
-        return f"laser, {len(found.rig.laser.bearings_rad)} beams, {found.rig.laser.range_max_m:.2f} m"
-    if found.rig.camera is not None:
-        return f"RGB-D, {found.rig.camera.width_px}x{found.rig.camera.height_px} pixels"
-    return "none"
+    from hybridmap.streams.sensors import words
+
+    return next(iter(words(found.rig)), "none")
 
 
 def _show(found: Inspection) -> None:

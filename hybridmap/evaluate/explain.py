@@ -19,8 +19,10 @@ from hybridmap.geometry import Array, between
 from hybridmap.graph.edges import Edge, EdgeKind
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.store import MapStore, SessionFolder
+from hybridmap.streams.sensors import carried
 from hybridmap.trajectory import NS_PER_S, Trajectory, format_motion, read_tum
 from hybridmap.vision.gating import Gate
+from hybridmap.vision.rgbd.keyframe import tilt_measured
 
 _AT_NODE_NS = 1_000
 _STAMPS_FROM_S = 1e6  # a time beyond it is a stamp, not seconds since the start
@@ -330,9 +332,10 @@ class Explainer:
                 least = setting(self._settings, "vision.rgbd.closing.min_age_s")
                 return f"no node was old enough: {least} s (vision.rgbd.closing.min_age_s)"
             return "no older node lay inside the gate" if gate.inside == 0 else ""
-        every = setting(self._settings, "vision.laser.probes.every_m")
-        if self._store.rig.laser is not None and isinstance(every, int | float):
-            return f"the laser looks for them every {every:g} m of travel (vision.laser.probes.every_m), inside its gate"
+        for kind, _ in carried(self._store.rig):
+            every = setting(self._settings, kind.seeks_every)
+            if isinstance(every, int | float):
+                return f"the {kind.name} looks for them every {every:g} m of travel ({kind.seeks_every}), inside its gate"
         return ""
 
     def _nearest(self, number: int) -> tuple[int, float, float] | None:
@@ -363,10 +366,7 @@ class Explainer:
     def _held(self, node: int) -> bool:
         """The camera's tilt was measured at a node and not taken from the mounting."""
         if node not in self._held_at:
-            camera, kept = self._store.rig.camera, self._store.keyframe(node).get("T_base_camera")
-            self._held_at[node] = (
-                camera is not None and kept is not None and not np.allclose(kept, camera.T_base_camera, atol=1e-6)
-            )
+            self._held_at[node] = tilt_measured(self._store.keyframe(node), self._store.rig)
         return self._held_at[node]
 
     def _error(self, edge: Edge) -> tuple[float, float] | None:

@@ -25,12 +25,10 @@ from hybridmap.evaluate.candidates import (
 )
 from hybridmap.metrics import Metric
 from hybridmap.store import MapStore, SessionFolder
-from hybridmap.streams.base import Laser, RgbdFrame
 from hybridmap.trajectory import Trajectory, read_tum
-from hybridmap.vision.profile import Profile, image_profile
+from hybridmap.vision.profile import Profile, sees_all_around
 from hybridmap.vision.templates import Mode
 
-FULL_CIRCLE_RAD = float(np.deg2rad(355.0))
 Progress = Callable[[int, int | None], None]
 
 
@@ -99,8 +97,9 @@ def every_mode(
     named = list(all_readings())
     with MapStore.open(folder) as store:
         settings, stamps = view_settings(store), node_stamps(store)
-        if store.rig.camera is None:
-            yield from _modes_of_laser(store, settings, stamps, truth)
+        stored = stored_profiles(store)
+        if not stored or len(stored[0]) == 1:
+            yield from _modes_of_ranges(store, settings, stamps, truth)
             return
         pairs = judge_pairs(stamps, truth)
         for bands in (1, 4):
@@ -111,7 +110,7 @@ def every_mode(
                 yield name, candidate_errors(row, pairs)
 
 
-def _modes_of_laser(
+def _modes_of_ranges(
     store: MapStore, settings: ViewSettings, stamps: np.ndarray[Any, np.dtype[np.int64]], truth: Trajectory
 ) -> Iterator[tuple[str, CandidateErrors]]:
     profiles = stored_profiles(store)
@@ -159,15 +158,8 @@ def view_settings(store: MapStore) -> ViewSettings:
         MatchingConfig.model_validate(tree.get("matching") or {}),
         rgbd.get("matching", "four-band"),
         int(rgbd.get("max_width_px", 320)),
-        _sees_all_around(store.rig.laser),
+        sees_all_around(store.rig),
     )
-
-
-def _sees_all_around(laser: Laser | None) -> bool:
-    if laser is None:
-        return False
-    span = float(np.ptp(laser.bearings_rad))
-    return span + span / max(len(laser.bearings_rad) - 1, 1) >= FULL_CIRCLE_RAD
 
 
 def node_stamps(store: MapStore) -> np.ndarray[Any, np.dtype[np.int64]]:
@@ -189,17 +181,15 @@ def profiles_again(
     Raises:
         EvaluationError: a node holds no frame.
     """
-    from hybridmap.vision.rgbd.keyframe import working_factor, working_image
+    from hybridmap.vision.rgbd.keyframe import image_profile_again
 
-    camera = store.rig.camera
+    rig = store.rig
     out = []
     for node in range(count):
-        kept = store.keyframe(node)
-        if camera is None or "color" not in kept or "depth_mm" not in kept:
+        profile = image_profile_again(store.keyframe(node), rig, settings.max_width_px, settings.profile, bands)
+        if profile is None:
             raise EvaluationError(f"{store.path}: node {node} holds no colour with depth; expected an RGB-D session")
-        frame = RgbdFrame(0, kept["color"], (kept["depth_mm"] / np.float32(1000.0)).astype(np.float32))
-        image = working_image(frame, working_factor(camera, settings.max_width_px))
-        out.append(image_profile(image.grey, image.depth_m, settings.profile.width, bands, settings.profile.normalise))
+        out.append(profile)
         if progress is not None:
             progress(node + 1, count)
     return out

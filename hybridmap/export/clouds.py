@@ -1,4 +1,4 @@
-"""The merged point cloud: depth or laser of every keyframe at the pose that a back-end gives it."""
+"""The merged point cloud: what every keyframe saw, at the pose that a back-end gives it."""
 
 from __future__ import annotations
 
@@ -6,23 +6,20 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hybridmap.errors import ExportError
 from hybridmap.export.graphs import planar_matrix
-from hybridmap.export.keyframes import Points, depth_points, laser_points
 from hybridmap.export.view import SessionView
 from hybridmap.metrics import Metric
+from hybridmap.streams.sensors import see
 
 _MERGE_EVERY = 50
-_LASER_GREY = 0.25
 
 
 def write_cloud(view: SessionView, path: Path) -> list[Metric]:
     """Thin the points of all keyframes to one a voxel and write PLY or PCD, by the suffix.
 
     Raises:
-        ExportError: the session keeps neither depth nor ranges, or nothing valid in them.
+        ExportError: the session's keyframes hold no point.
     """
     import open3d as o3d
 
@@ -46,7 +43,7 @@ def merged_cloud(view: SessionView) -> Any:
         if number % _MERGE_EVERY == _MERGE_EVERY - 1:
             merged = merged.voxel_down_sample(view.options.voxel_m)
     if len(merged.points) == 0:
-        raise ExportError("cloud: the session's keyframes hold no valid depth and no valid range; map with a camera or a laser")
+        raise ExportError("cloud: the session's keyframes hold no point; map with a sensor that measures distances")
     return merged.voxel_down_sample(view.options.voxel_m)
 
 
@@ -54,22 +51,12 @@ def _clouds(view: SessionView) -> Iterator[Any]:
     """The points of each keyframe in `map`."""
     import open3d as o3d
 
+    rig = view.store.rig
     for node, pose in enumerate(view.poses):
-        points = _points(view, node)
-        if points is None or len(points.xyz) == 0:
+        seen = see(view.store.keyframe(node), rig, view.options.max_depth_m)
+        if seen is None or len(seen.xyz) == 0:
             continue
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.xyz))
-        if points.rgb is not None:
-            cloud.colors = o3d.utility.Vector3dVector(points.rgb)
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(seen.xyz))
+        if seen.rgb is not None:
+            cloud.colors = o3d.utility.Vector3dVector(seen.rgb)
         yield cloud.transform(planar_matrix(pose))
-
-
-def _points(view: SessionView, node: int) -> Points | None:
-    keyframe, rig = view.store.keyframe(node), view.store.rig
-    if "depth_mm" in keyframe and rig.camera is not None:
-        return depth_points(keyframe, rig.camera, view.options.max_depth_m)
-    if "ranges_m" in keyframe and rig.laser is not None:
-        ends, valid = laser_points(keyframe, rig.laser)
-        xyz = np.column_stack([ends[valid], np.zeros(np.count_nonzero(valid))])
-        return Points(xyz, np.full_like(xyz, _LASER_GREY))
-    return None

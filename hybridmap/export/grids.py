@@ -1,4 +1,4 @@
-"""The occupancy grid that `map_server` of ROS reads, ray-cast from laser scans or depth keyframes.
+"""The occupancy grid that `map_server` of ROS reads, ray-cast from what the keyframes saw.
 
 Log-odds as in S. Thrun, W. Burgard, D. Fox, "Probabilistic Robotics", 2005, section 9.2; the files as documented by
 `map_server` (trinary mode).
@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.errors import ExportError
-from hybridmap.export.keyframes import depth_points, laser_points, mounting
 from hybridmap.export.view import ExportOptions, SessionView
 from hybridmap.geometry import Array, compose, transform_points
 from hybridmap.metrics import Metric
+from hybridmap.streams.base import Seen
+from hybridmap.streams.sensors import see
 from hybridmap.trajectory import write_text_atomic
 
 _HIT, _MISS, _LIMIT = 0.9, -0.4, 4.0
@@ -60,7 +61,7 @@ def write_grid(view: SessionView, path: Path) -> list[Metric]:
     """Write `path` (yaml) and the picture beside it (pgm): 0 occupied, 254 free, 205 unknown, top row = largest y.
 
     Raises:
-        ExportError: the session keeps neither ranges nor depth, or the grid would be too large.
+        ExportError: the session's keyframes hold no obstacle, or the grid would be too large.
     """
     grid = build_grid(view)
     occupancy = 1.0 / (1.0 + np.exp(-grid.log_odds))
@@ -96,9 +97,7 @@ def build_grid(view: SessionView) -> Grid:
     """
     fans = list(_fans(view))
     if not fans:
-        raise ExportError(
-            "grid: the session's keyframes hold no valid range and no obstacle in depth; map with a laser or camera"
-        )
+        raise ExportError("grid: the session's keyframes hold no obstacle; map with a sensor that measures distances")
     resolution = view.options.resolution_m
     corners = np.concatenate([np.vstack([fan.origin[None], fan.ends]) for fan in fans])
     low = np.floor(corners.min(axis=0) / resolution).astype(np.int64) - _MARGIN_CELLS
@@ -144,26 +143,24 @@ def _wedges(origin: Array, ends: Array, bearings: Array) -> Array:
 def _fans(view: SessionView) -> Iterator[_Fan]:
     rig = view.store.rig
     for node, pose in enumerate(view.poses):
-        keyframe = view.store.keyframe(node)
-        if "ranges_m" in keyframe and rig.laser is not None:
-            ends, valid = laser_points(keyframe, rig.laser)
-            order = np.argsort(rig.laser.bearings_rad[valid], kind="stable")
-            fan = _Fan(rig.laser.pose_base_laser[:2], ends[valid][order], rig.laser.bearings_rad[valid][order])
-        elif "depth_mm" in keyframe and rig.camera is not None:
-            points = depth_points(keyframe, rig.camera, view.options.max_depth_m).xyz
-            fan = _fan_of_depth(points, mounting(keyframe, rig.camera)[:2, 3], 2.0 / rig.camera.fx_px, view.options)
-        else:
+        seen = see(view.store.keyframe(node), rig, view.options.max_depth_m)
+        if seen is None:
             continue
+        fan = _fan(seen, view.options)
         if len(fan.ends):
             yield _Fan(compose(pose, [*fan.origin, 0.0])[:2], transform_points(pose, fan.ends), fan.bearings)
 
 
-def _fan_of_depth(points: Array, origin: Array, step_rad: float, options: ExportOptions) -> _Fan:
-    """The nearest obstacle in each bearing, one every two columns of the picture, seen from the camera at `origin` (2,)."""
+def _fan(seen: Seen, options: ExportOptions) -> _Fan:
+    """The beams of a level sweep; of points of any height the nearest obstacle in each column of bearings."""
+    if seen.bearings is not None:
+        order = np.argsort(seen.bearings, kind="stable")
+        return _Fan(seen.origin, seen.xyz[order, :2], seen.bearings[order])
+    points, origin = seen.xyz, seen.origin
     tall = (points[:, 2] >= options.obstacle_low_m) & (points[:, 2] <= options.obstacle_high_m)
     offset = points[tall, :2] - origin
     bearing, reach = np.arctan2(offset[:, 1], offset[:, 0]), np.hypot(offset[:, 0], offset[:, 1])
-    column = np.floor(bearing / step_rad).astype(np.int64)
+    column = np.floor(bearing / seen.column_rad).astype(np.int64)
     order = np.lexsort((reach, column))
     _, first = np.unique(column[order], return_index=True)
     nearest = order[first]

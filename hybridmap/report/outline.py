@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.export.keyframes import depth_points, laser_points
 from hybridmap.geometry import Array, transform_points
 from hybridmap.store import MapStore
 from hybridmap.streams.base import Rig
+from hybridmap.streams.sensors import see
 
 _HEIGHTS_M = (0.1, 2.0)
 _DEPTH_POINTS = 4000
@@ -37,14 +37,13 @@ class Raster:
 
 def outline(keyframe: Mapping[str, NDArray[Any]], rig: Rig) -> Array:
     """Points (M, 2) of what a node saw, in `base_link`, m; empty where it saw nothing that can be drawn."""
-    if "ranges_m" in keyframe and rig.laser is not None:
-        ends, returned = laser_points(keyframe, rig.laser)
-        return ends[returned]
-    if "depth_mm" in keyframe and rig.camera is not None:
-        seen = depth_points(keyframe, rig.camera, _MAX_DEPTH_M).xyz
-        walls = seen[(seen[:, 2] > _HEIGHTS_M[0]) & (seen[:, 2] < _HEIGHTS_M[1]), :2]
-        return walls[:: max(1, len(walls) // _DEPTH_POINTS)]
-    return np.zeros((0, 2))
+    seen = see(keyframe, rig, _MAX_DEPTH_M)
+    if seen is None:
+        return np.zeros((0, 2))
+    if seen.bearings is not None:
+        return seen.xyz[:, :2]
+    walls = seen.xyz[(seen.xyz[:, 2] > _HEIGHTS_M[0]) & (seen.xyz[:, 2] < _HEIGHTS_M[1]), :2]
+    return walls[:: max(1, len(walls) // _DEPTH_POINTS)]
 
 
 def outlines(store: MapStore, count: int) -> dict[int, Array]:

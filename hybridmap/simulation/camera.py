@@ -12,7 +12,7 @@ from hybridmap.config.inputs import CameraConfig
 from hybridmap.geometry import Array, rotation_from_quaternion
 from hybridmap.simulation.paints import smooth_noise
 from hybridmap.simulation.scene import Hits, Scene
-from hybridmap.streams.base import Camera, RgbdFrame
+from hybridmap.streams.rgbd import Camera, RgbdFrame
 
 OPTICAL_QUATERNION_XYZW: tuple[float, float, float, float] = (-0.5, 0.5, -0.5, 0.5)
 """A level camera that looks along x of `base_link`: optical frame with x right, y down, z forward."""

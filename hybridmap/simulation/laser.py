@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hybridmap.config.inputs import LaserScannerConfig
 from hybridmap.geometry import Array
 from hybridmap.simulation.scene import Scene
-from hybridmap.streams.base import Laser, LaserScan
+from hybridmap.streams.laser import Laser, LaserScan
 
 FORWARD_M = 0.15
 """The laser stands this far in front of `base_link`, m."""

@@ -81,7 +81,7 @@ class SimulatedStream:
 
         camera = camera_of(self._config.camera) if self._config.sensors != "laser" else None
         laser = laser_of(self._config.laser) if self._config.sensors != "rgbd" else None
-        return Rig(camera, laser)
+        return Rig(camera=camera, laser=laser)
 
     @property
     def groundtruth(self) -> Trajectory:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from hybridmap.backends.base import SolveReport, SolveStatus
 from hybridmap.errors import StoreError
-from hybridmap.streams.base import Camera, Laser, Rig
+from hybridmap.streams.base import Rig
+from hybridmap.streams.sensors import kinds
 
 _PNG_LEVEL = 1
 _ZLIB_LEVEL = 1
@@ -82,18 +83,18 @@ def unpack_floats(data: bytes, columns: int) -> NDArray[np.float64]:
 
 def rig_to_json(rig: Rig) -> dict[str, Any]:
     """The sensors as plain values."""
-    return {
-        name: None if part is None else _plain(asdict(part)) for name, part in (("camera", rig.camera), ("laser", rig.laser))
-    }
+    return {name: _plain(asdict(sensor)) for name, sensor in rig.sensors.items()}
 
 
 def rig_from_json(tree: dict[str, Any]) -> Rig:
-    """The sensors that `rig_to_json` gave."""
-    camera, laser = tree["camera"], tree["laser"]
-    return Rig(
-        None if camera is None else Camera(**{**camera, "T_base_camera": np.array(camera["T_base_camera"])}),
-        None if laser is None else Laser(**{**laser, **{k: np.array(laser[k]) for k in ("bearings_rad", "pose_base_laser")}}),
-    )
+    """The sensors that `rig_to_json` gave; those of kinds that are not known here are left out."""
+    types = {kind.sensor_name: kind.sensor for kind in kinds()}
+    found = {name: fields for name, fields in tree.items() if fields is not None and name in types}
+    return Rig(**{name: types[name](**{key: _array(value) for key, value in found[name].items()}) for name in found})
+
+
+def _array(value: Any) -> Any:
+    return np.array(value) if isinstance(value, list) else value
 
 
 def _plain(fields: dict[str, Any]) -> dict[str, Any]:

@@ -1,16 +1,25 @@
-"""What a sensor stream is: samples in time order, the mounting of the sensors, and what was lost on the way."""
+"""What a sensor stream is: samples in time order, the sensors, what a kind of sensor is, and what was lost on the way."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
-import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.config.inputs import SensorsConfig
 from hybridmap.geometry import Array
 from hybridmap.trajectory import NS_PER_S, Trajectory
+
+if TYPE_CHECKING:
+    from hybridmap.streams.bagindex import BagIndex
+    from hybridmap.streams.topics import TopicChooser
+
+Keyframe = Mapping[str, NDArray[Any]]
+"""What a map keeps of a node's observation: arrays by name."""
+MessageKey = tuple[str, int]
+"""A message of a bag: topic, and its place within the topic."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +31,7 @@ class SelfMotion:
         pose_odom_robot: (3,) float64, m and rad.
     """
 
+    precedence: ClassVar[int] = 0
     stamp_ns: int
     pose_odom_robot: Array
 
@@ -30,85 +40,149 @@ class SelfMotion:
 class Velocity:
     """One velocity command or wheel-speed reading; it holds until the next one (zero-order hold)."""
 
+    precedence: ClassVar[int] = 0
     stamp_ns: int
     v_m_s: float
     omega_rad_s: float
 
 
 @dataclass(frozen=True, slots=True)
-class LaserScan:
-    """One planar scan.
+class Observation:
+    """What an exteroceptive sensor saw at one instant; each kind of sensor has its own subclass.
 
     Attributes:
+        precedence: at equal stamps the sample with the lower one comes first; self-motion has 0.
         stamp_ns: header stamp, ns.
-        ranges_m: (B,) float32; NaN where there is no valid return (REP-117 and the range limits are applied by the reader).
     """
 
+    precedence: ClassVar[int] = 1
     stamp_ns: int
-    ranges_m: NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True)
-class RgbdFrame:
-    """One colour frame with its registered depth.
-
-    Attributes:
-        stamp_ns: header stamp of the colour image, ns.
-        color: (H, W, 3) uint8, RGB (grey images repeat their channel).
-        depth_m: (H, W) float32, m along the optical axis; 0 where invalid.
-    """
-
-    stamp_ns: int
-    color: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
 
 
 Motion = SelfMotion | Velocity
-Observation = LaserScan | RgbdFrame
 Sample = Motion | Observation
 
 
-@dataclass(frozen=True, slots=True)
-class Camera:
-    """Pinhole camera of undistorted, registered frames.
-
-    Attributes:
-        width_px, height_px: image size.
-        fx_px, fy_px, cx_px, cy_px: intrinsics.
-        T_base_camera: (4, 4) pose of the camera OPTICAL frame (x right, y down, z forward) in `base_link`, m.
-    """
-
-    width_px: int
-    height_px: int
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    T_base_camera: Array
-
-
-@dataclass(frozen=True, slots=True)
-class Laser:
-    """Planar range finder.
-
-    Attributes:
-        bearings_rad: (B,) float64, bearing of each beam in the laser's frame, counter-clockwise positive.
-        range_min_m, range_max_m: valid ranges lie between them.
-        pose_base_laser: (3,) mounting in `base_link`, m and rad (a laser mounted upside down has its bearings negated).
-    """
-
-    bearings_rad: Array
-    range_min_m: float
-    range_max_m: float
-    pose_base_laser: Array
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, init=False)
 class Rig:
-    """Which exteroceptive sensors a stream has, and where they sit; None where there is none."""
+    """The exteroceptive sensors of a stream and where they sit: `Rig(laser=laser, camera=camera)`.
 
-    camera: Camera | None = None
-    laser: Laser | None = None
+    Attributes:
+        sensors: by the name that their kind gives them; only those that are there.
+    """
+
+    sensors: Mapping[str, Any]
+
+    def __init__(self, **sensors: Any) -> None:
+        object.__setattr__(self, "sensors", {name: sensor for name, sensor in sensors.items() if sensor is not None})
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What a keyframe shows, in `base_link`.
+
+    Attributes:
+        xyz: (P, 3) points, m.
+        rgb: (P, 3) their colours in 0..1, None without colour.
+        origin: (2,) where the sensor sits, m.
+        bearings: (P,) rad, increasing along the sweep, of a sensor that scans a level plane; None: points of any height.
+        column_rad: width of the columns in which the nearest of such points hides those behind it, rad.
+    """
+
+    xyz: Array
+    rgb: Array | None
+    origin: Array
+    bearings: Array | None = None
+    column_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """An observation that is to come: its stamp, and the messages that it is made of."""
+
+    stamp_ns: int
+    needs: tuple[MessageKey, ...]
+
+
+class Decoder(Protocol):
+    """Makes an observation of the messages that it needs; counts what was odd about them."""
+
+    counts: dict[str, int]
+
+    def __call__(self, stamp_ns: int, parts: tuple[Any, ...]) -> Observation:
+        """Decode the messages of one observation."""
+
+
+@dataclass(slots=True)
+class SensorPlan:
+    """All observations of a bag.
+
+    Attributes:
+        rig: the sensor, with its mounting.
+        planned: in order of stamp.
+        decode: makes an observation of a stamp and the decoded messages.
+        losses: counts of what found no partner.
+        remarks: what was assumed.
+    """
+
+    rig: Rig = field(default_factory=Rig)
+    planned: list[Planned] = field(default_factory=list)
+    decode: Decoder | None = None
+    losses: dict[str, int] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class InBag:
+    """How a kind of sensor is found in a bag, and what is made of its messages.
+
+    Attributes:
+        types: message types, each with a header.
+        find: chooses the topics: role -> topic, empty where the bag has none.
+        plan: (topics, index, base frame, settings, file) -> every observation. It raises a StreamError where something is
+            missing, also for empty topics, as the user may have asked for this kind.
+    """
+
+    types: tuple[str, ...]
+    find: Callable[[TopicChooser], dict[str, str]]
+    plan: Callable[[Mapping[str, str], BagIndex, str, SensorsConfig, str], SensorPlan]
+
+
+@dataclass(frozen=True, slots=True)
+class SensorKind:
+    """All that tells one kind of exteroceptive sensor from another; `streams.sensors` has the table of them.
+
+    Attributes:
+        name: what `vision.sensor` calls it.
+        sensor_name: what the rig and the map file call its sensor.
+        sensor: type of the sensor, a dataclass of numbers and arrays.
+        sample: type of its observations.
+        counted: what observations are called in counts (`scans`).
+        needs: what a source must have for it (`laser scans`).
+        words: says in a few words what a sensor is.
+        front_end: makes what closes loops with it, a `vision.Factory`; or its `module:name`, imported when it is needed.
+        compact: what the map file keeps of an observation.
+        restore: the observation that `compact` was given; None where a keyframe has none. The stamp is the node's.
+        see: points of a keyframe up to a range, m; None where it holds nothing of this kind.
+        seeks_every: setting of the travel after which its front-end looks for loops, m; empty: it looks at every node.
+        in_bag: how it is found in a bag; None: it never is.
+        configured: the sensor that a configuration alone describes, for those who feed the mapper themselves.
+    """
+
+    name: str
+    sensor_name: str
+    sensor: type[Any]
+    sample: type[Observation]
+    counted: str
+    needs: str
+    words: Callable[[Any], str]
+    front_end: str | Callable[..., Any]
+    compact: Callable[[Any], dict[str, NDArray[Any]]]
+    restore: Callable[[Keyframe, int], Observation | None]
+    see: Callable[[Keyframe, Any, float], Seen | None]
+    seeks_every: str = ""
+    in_bag: InBag | None = None
+    configured: Callable[[SensorsConfig], Any | None] = lambda _: None
 
 
 @dataclass(slots=True)

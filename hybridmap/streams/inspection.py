@@ -145,10 +145,12 @@ def _gaps(part: Part) -> list[str]:
 
 def _bag_parts(path: Path, problems: list[str]) -> list[Part]:
     from hybridmap.streams.bagfile import BagFile
-    from hybridmap.streams.topics import CAMERA_INFO, IMAGE, ODOMETRY, SCAN
+    from hybridmap.streams.sensors import message_types
+    from hybridmap.streams.topics import ODOMETRY
 
     bag = BagFile(path)
-    stamped = [topic.name for topic in bag.topics if topic.msgtype in ODOMETRY + SCAN + IMAGE + CAMERA_INFO and topic.count]
+    types = ODOMETRY + message_types()
+    stamped = [topic.name for topic in bag.topics if topic.msgtype in types and topic.count]
     stamps: dict[str, list[int]] = {name: [] for name in stamped}
     try:
         for message in bag.raw(stamped):

@@ -11,7 +11,6 @@ from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, rotation_from_quaternion
 
 _CONSTANT_TOLERANCE = 1e-4  # m, or of a rotation matrix' entries
-_MOST_TILT_COS = 0.9  # a planar laser may lean by 25 deg at most
 
 
 def clean_frame(frame: str) -> str:
@@ -111,16 +110,3 @@ class TransformTree:
             f"{what}: no transform {base!r} -> {sensor!r} in /tf_static or /tf (frames found: {known}); "
             f"give {setting} in the configuration"
         )
-
-
-def laser_pose(T_base_laser: Array, what: str) -> tuple[Array, bool]:
-    """Planar mounting (3,) of a laser, and whether it hangs upside down.
-
-    Raises:
-        StreamError: the laser does not scan level.
-    """
-    up = T_base_laser[2, 2]
-    if abs(up) < _MOST_TILT_COS:
-        tilt = np.degrees(np.arccos(np.clip(abs(up), 0.0, 1.0)))
-        raise StreamError(f"{what}: the laser leans by {tilt:.0f} deg; expected a level one; check sensors.laser_mounting")
-    return planar(T_base_laser), bool(up < 0)

@@ -11,10 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.errors import StreamError
-from hybridmap.streams.base import LaserScan, RgbdFrame, Sample, SelfMotion, Velocity
+from hybridmap.streams.base import Sample
 from hybridmap.trajectory import NS_PER_S, format_stamp
-
-_RANK: dict[type, int] = {SelfMotion: 0, Velocity: 0, LaserScan: 1, RgbdFrame: 2}
 
 Stamps = NDArray[np.int64]
 
@@ -133,7 +131,7 @@ def _span(stamps_ns: Stamps) -> str:
 
 def sort_key(sample: Sample) -> tuple[int, int]:
     """Order of a stream: by stamp; at equal stamps motion, then scans, then frames."""
-    return sample.stamp_ns, _RANK[type(sample)]
+    return sample.stamp_ns, sample.precedence
 
 
 class ReorderBuffer:

@@ -14,24 +14,19 @@ from hybridmap.errors import StreamError
 from hybridmap.geometry import Array
 from hybridmap.streams.bagfile import BagFile, RawMessage
 from hybridmap.streams.bagindex import PoseTrack, build_index
-from hybridmap.streams.bagsensors import MessageKey, SensorPlan, plan_frames, plan_scans
-from hybridmap.streams.base import LaserScan, RgbdFrame, Sample, SelfMotion, StreamReport
+from hybridmap.streams.base import MessageKey, Observation, Sample, SelfMotion, SensorPlan, StreamReport
 from hybridmap.streams.mounting import clean_frame, planar
 from hybridmap.streams.order import Window, check_overlap, merge
-from hybridmap.streams.topics import CAMERA_INFO, IMAGE, ODOMETRY, SCAN, TRANSFORM, select
+from hybridmap.streams.sensors import kind_of, kinds, message_types, wanted
+from hybridmap.streams.topics import ODOMETRY, TRANSFORM, select
 from hybridmap.trajectory import Trajectory
-
-_READ = ODOMETRY + SCAN + IMAGE + CAMERA_INFO + TRANSFORM
-
-
-_COUNT_OF: dict[type, str] = {SelfMotion: "odometry", LaserScan: "scans", RgbdFrame: "frames"}
 
 
 class BagStream:
     """ROS 1 bag, ROS 2 folder, `.mcap` or `.db3` file.
 
-    Samples carry header stamps. The rig holds the sensor that is mapped with: `vision.sensor`, or with any other name the laser
-    if the bag has one, else the camera.
+    Samples carry header stamps. The rig holds the sensor that is mapped with: `vision.sensor`, or with `auto` the first
+    kind of the table that the bag has.
     """
 
     def __init__(self, path: Path, config: Config, window: Window | None = None) -> None:
@@ -43,11 +38,11 @@ class BagStream:
         self._bag = BagFile(path)
         self._config, self._sensors = config, config.sensors
         self.name = path.name
-        self._index = build_index(
-            self._bag, (topic.name for topic in self._bag.topics if topic.msgtype in _READ), self._sensors.odom_frame
-        )
+        read = ODOMETRY + TRANSFORM + message_types()
+        named = (topic.name for topic in self._bag.topics if topic.msgtype in read)
+        self._index = build_index(self._bag, named, self._sensors.odom_frame)
         topics = [replace(topic, count=self._index.counts.get(topic.name, 0)) for topic in self._bag.topics]
-        self.selection = select(topics, self._sensors, self._index.frame_of, str(path))
+        self.selection = select(topics, self._sensors, kinds(), self._index.frame_of, str(path))
         self.remarks = list(self.selection.remarks)
         self.remarks += [f"transform {name} holds NaN or no rotation: ignored" for name in self._index.unusable_transforms]
         track, what = self._self_motion()
@@ -65,9 +60,7 @@ class BagStream:
     @property
     def uses(self) -> dict[str, str]:
         """Role -> topic that the samples come from."""
-        needless = {"scan"} if self.rig.laser is None else set()
-        needless |= {"color", "depth", "color_info", "depth_info"} if self.rig.camera is None else set()
-        return {role: topic for role, topic in self.selection.uses().items() if role not in needless}
+        return self.selection.uses(self.rig)
 
     @property
     def groundtruth(self) -> Trajectory | None:
@@ -88,7 +81,7 @@ class BagStream:
         """
         self.report = StreamReport(dict(self.losses), list(self.remarks))
         for sample in merge(self._motions(), self._observations()):
-            self.report.count(_COUNT_OF[type(sample)])
+            self.report.count(kind_of(sample).counted if isinstance(sample, Observation) else "odometry")
             yield sample
         if self._plan_made.decode is not None:
             self.report.counts |= self._plan_made.decode.counts
@@ -160,16 +153,15 @@ class BagStream:
         return planar(T)
 
     def _plan(self) -> SensorPlan:
-        wanted, chosen, source = self._config.vision.sensor, self.selection, str(self._bag.path)
-        if wanted == "none":
+        looked_for, source = wanted(self._config.vision.sensor), str(self._bag.path)
+        for kind in looked_for:
+            topics = self.selection.sensors.get(kind.sensor_name, {})
+            if kind.in_bag is not None and (topics or len(looked_for) == 1):
+                return kind.in_bag.plan(topics, self._index, self._base_frame, self._sensors, source)
+        if not looked_for:
             return SensorPlan()
-        if wanted != "rgbd" and chosen.scan is not None:
-            return plan_scans(chosen.scan, self._index, self._base_frame, self._sensors, source)
-        if wanted == "laser":
-            raise StreamError(f"{source}: no laser: expected a topic of type sensor_msgs/LaserScan")
-        if wanted != "rgbd" and chosen.color is None and chosen.depth is None:
-            return SensorPlan(remarks=["neither scans nor colour and depth pictures: self-motion alone"])
-        return plan_frames(chosen, self._index, self._base_frame, self._sensors, source)
+        lacking = " and no ".join(kind.needs for kind in looked_for if kind.in_bag is not None)
+        return SensorPlan(remarks=[f"no {lacking}: self-motion alone"])
 
     def _apply(self, window: Window) -> None:
         starts = [int(self._motion_ns[0])] + [planned.stamp_ns for planned in self._planned[:1]]

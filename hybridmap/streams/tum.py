@@ -17,7 +17,7 @@ from hybridmap.config.inputs import CameraIntrinsics, CameraMounting, SensorsCon
 from hybridmap.config.root import Config
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array
-from hybridmap.streams.base import RgbdFrame, Rig, Sample, SelfMotion, StreamReport
+from hybridmap.streams.base import Rig, Sample, SelfMotion, StreamReport
 from hybridmap.streams.cameras import (
     Calibration,
     check_size,
@@ -25,10 +25,11 @@ from hybridmap.streams.cameras import (
     depth_from_units,
     from_intrinsics,
     mounted,
-    pinhole,
 )
 from hybridmap.streams.mounting import invert, matrix, planar
 from hybridmap.streams.order import Window, check_overlap, merge, pair_nearest, sorted_order
+from hybridmap.streams.rgbd import RGBD, RgbdFrame, pinhole
+from hybridmap.streams.sensors import wanted
 from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
 
 
@@ -54,10 +55,11 @@ class TumStream:
         self._odometry = self._read_odometry()
         self._calibration, self._T_base_camera, self._units_per_m = _read_calibration(folder, config.sensors)
         self._pairs, self.losses = _read_pairs(folder, config.sensors.sync_tolerance_s)
-        if config.vision.sensor == "laser":
-            raise StreamError(f"{folder}: no laser: a TUM folder holds colour and depth; set vision.sensor to rgbd")
-        if config.vision.sensor == "none":
+        kinds = wanted(config.vision.sensor)
+        if not kinds:
             self._pairs = []
+        elif all(kind.sensor_name != RGBD.sensor_name for kind in kinds):
+            raise StreamError(f"{folder}: no {kinds[0].needs}: a TUM folder holds {RGBD.needs}; set vision.sensor to rgbd")
         for path in (path for pair in self._pairs for path in (pair.color, pair.depth)):
             if not path.is_file():
                 raise StreamError(f"{path}: no such picture, though the folder's lists name it")
@@ -83,7 +85,7 @@ class TumStream:
         """
         self.report = StreamReport(dict(self.losses), list(self.remarks))
         for sample in merge(self._motions(), self._frames()):
-            self.report.count("odometry" if isinstance(sample, SelfMotion) else "frames")
+            self.report.count("odometry" if isinstance(sample, SelfMotion) else RGBD.counted)
             yield sample
 
     @property

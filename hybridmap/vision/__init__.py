@@ -7,7 +7,8 @@ from collections.abc import Callable
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import ConfigError, StreamError
 from hybridmap.metrics import StageClock
-from hybridmap.plugins import Table
+from hybridmap.plugins import Table, loaded
+from hybridmap.streams import sensors
 from hybridmap.streams.base import Rig
 from hybridmap.vision.base import FrontEnd
 
@@ -17,34 +18,19 @@ Factory = Callable[[VisionConfig, Rig, int, StageClock], FrontEnd | None]
 """Makes a front-end from its settings, the sensors of the source, a seed, and a clock for stages of its own."""
 
 
-def _laser(config: VisionConfig, rig: Rig, seed: int, clock: StageClock) -> FrontEnd:
-    from hybridmap.vision.laser.front_end import LaserFrontEnd
-
-    del clock
-    if rig.laser is None:
-        raise StreamError("vision.sensor is laser, but the source has no laser scans: choose rgbd or none")
-    return LaserFrontEnd(config, rig.laser, seed)
-
-
-def _rgbd(config: VisionConfig, rig: Rig, seed: int, clock: StageClock) -> FrontEnd:
-    from hybridmap.vision.rgbd.front_end import RgbdFrontEnd
-
-    if rig.camera is None:
-        raise StreamError("vision.sensor is rgbd, but the source has no colour with depth: choose laser or none")
-    return RgbdFrontEnd(config, rig.camera, seed, clock)
-
-
 def _none(config: VisionConfig, rig: Rig, seed: int, clock: StageClock) -> None:
     del config, rig, seed, clock
 
 
-_FRONT_ENDS: Table[Factory] = Table(
-    "front-end", {"laser": _laser, "rgbd": _rgbd, "none": _none}, "hybridmap.front_ends", ConfigError
+_FRONT_ENDS: Table[str | Factory] = Table(
+    "front-end", {**{kind.name: kind.front_end for kind in sensors.kinds()}, "none": _none}, "hybridmap.front_ends", ConfigError
 )
 
 
 def register(name: str, factory: Factory) -> None:
     """Add a front-end, which `vision.sensor` then takes by its name; packages have entry points `hybridmap.front_ends`.
+
+    A new kind of sensor brings its front-end with it, see `streams.sensors.register`.
 
     Raises:
         ConfigError: there is one of this name already.
@@ -53,7 +39,7 @@ def register(name: str, factory: Factory) -> None:
 
 
 def create_front_end(config: VisionConfig, rig: Rig, seed: int, clock: StageClock | None = None) -> FrontEnd | None:
-    """The front-end for a source: `auto` takes laser if there is one, else RGB-D; None for `none` (dead reckoning).
+    """The front-end for a source: `auto` takes that of the first kind of sensor there; None for dead reckoning.
 
     Args:
         config: settings of the visual side.
@@ -65,7 +51,18 @@ def create_front_end(config: VisionConfig, rig: Rig, seed: int, clock: StageCloc
         ConfigError: there is no front-end of this name.
         StreamError: the configuration asks for a sensor that the source does not have.
     """
-    sensor = config.sensor
-    if sensor == "auto":
-        sensor = "laser" if rig.laser is not None else "rgbd" if rig.camera is not None else "none"
-    return _FRONT_ENDS[sensor](config, rig, seed, clock or StageClock())
+    if config.sensor == "auto":
+        chosen: str | Factory = next((kind.front_end for kind, _ in sensors.carried(rig)), _none)
+    else:
+        chosen = _named(config.sensor, rig)
+    factory: Factory = loaded(chosen) if isinstance(chosen, str) else chosen
+    return factory(config, rig, seed, clock or StageClock())
+
+
+def _named(name: str, rig: Rig) -> str | Factory:
+    for kind in sensors.kinds():
+        if kind.name == name and kind.sensor_name in rig.sensors:
+            return kind.front_end
+        if kind.name == name:
+            raise StreamError(f"vision.sensor is {name}, but the source has no {kind.needs}: choose another sensor or none")
+    return _FRONT_ENDS[name]

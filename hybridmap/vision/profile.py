@@ -13,7 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.geometry import Array
+from hybridmap.streams.base import Rig
+from hybridmap.streams.laser import LASER
 
+FULL_CIRCLE_RAD = float(np.deg2rad(355.0))
 Profile = NDArray[np.float32]
 Normalise = Literal["z", "mean"]
 
@@ -96,3 +99,12 @@ def _cell_means(image: NDArray[np.generic], width: int, bands: int) -> NDArray[n
     edges = np.linspace(0, height, bands + 1).round().astype(int)
     rows = [cv2.reduce(image[a:b], 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F) for a, b in pairwise(edges)]
     return np.asarray(cv2.resize(np.concatenate(rows), (width, bands), interpolation=cv2.INTER_AREA), dtype=np.float64)
+
+
+def sees_all_around(rig: Rig) -> bool:
+    """Whether there is a laser whose profiles go full circle."""
+    laser = rig.sensors.get(LASER.sensor_name)
+    if laser is None:
+        return False
+    span = float(np.ptp(laser.bearings_rad))
+    return span + span / max(len(laser.bearings_rad) - 1, 1) >= FULL_CIRCLE_RAD

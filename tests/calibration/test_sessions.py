@@ -102,8 +102,8 @@ def test_drives_of_other_sensors_are_pooled_with_a_warning(one, tmp_path, caplog
     assert caplog.text == ""
     unlike = read_drive(write_session(tmp_path / "c", other, np.random.default_rng(0), rig=RIG))
     estimate_of([first, unlike])
-    assert "a has no sensor but odometry, " in caplog.text
-    assert "c has a laser of 181 beams and a camera of 32 x 24 pixels: hardly of one kind of robot" in caplog.text
+    assert "a maps with no sensor but odometry, " in caplog.text
+    assert "c maps with laser, 181 beams, 20.00 m and RGB-D, 32x24 pixels: hardly of one kind of robot" in caplog.text
 
 
 def test_drives_of_two_configurations_have_none_in_common(one, tmp_path):

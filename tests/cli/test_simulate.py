@@ -12,7 +12,7 @@ from hybridmap.config import Config
 from hybridmap.evaluate.association import travel
 from hybridmap.simulation import world_names
 from hybridmap.streams import open_stream
-from hybridmap.streams.base import LaserScan
+from hybridmap.streams.laser import LaserScan
 
 SHORT = ["--duration", "1", "--set", "simulation.camera.width_px=32", "--set", "simulation.camera.height_px=24"]
 

@@ -97,7 +97,7 @@ def test_a_laser_that_sees_all_around_knows_places_from_any_side(tmp_path, monke
 
 def test_a_session_without_frames_or_truth_is_refused(tmp_path):
     session = write_session(tmp_path / "s", ring_map(), keyframes=False)
-    with pytest.raises(EvaluationError, match="no colour with depth"):
+    with pytest.raises(EvaluationError, match="no views"):
         dict(every_mode(tmp_path / "s"))
     session.groundtruth.unlink()
     with pytest.raises(EvaluationError, match="--reference"):

@@ -162,7 +162,7 @@ def test_depth_cloud_is_where_the_camera_looked_and_coloured(depth_folder, tmp_p
     assert points[:, 2].min() > 0.3 - 2.0 * 12 / 30 - 0.05
     assert points[:, 2].max() < 0.3 + 2.0 * 10.5 / 30
     np.testing.assert_allclose(colors[:, 0], 200 / 255, atol=0.01)
-    with pytest.raises(ExportError, match="no valid depth"):
+    with pytest.raises(ExportError, match="hold no point"):
         export_session(depth_folder, "ply", tmp_path / "y.ply", options=ExportOptions(max_depth_m=1.0))
 
 
@@ -213,8 +213,8 @@ def test_what_the_session_cannot_give_is_said_and_leaves_nothing(tmp_path, folde
     for name, match in (
         ("posegraph", "no edge"),
         ("lineset", "no edge"),
-        ("ply", "no valid depth"),
-        ("grid", "no valid range"),
+        ("ply", "hold no point"),
+        ("grid", "hold no obstacle"),
     ):
         with pytest.raises(ExportError, match=match):
             export_session(tmp_path / "bare", name, tmp_path / "new" / f"x{FORMATS[name].suffix}")

@@ -13,7 +13,9 @@ from hybridmap.geometry import align, between, compose, wrap_angle
 from hybridmap.simulation import SimulatedStream, wheels, world_names
 from hybridmap.simulation.drive import DriveLimits, drive
 from hybridmap.simulation.wheels import wheel_odometry
-from hybridmap.streams.base import LaserScan, RgbdFrame, SelfMotion
+from hybridmap.streams.base import SelfMotion
+from hybridmap.streams.laser import LaserScan
+from hybridmap.streams.rgbd import RgbdFrame
 
 SMALL = CameraConfig(width_px=80, height_px=60)
 PERFECT_WHEELS = WheelErrorConfig(scale_bias=0, turn_bias=0, heading_bias_deg_per_m=0, noise=0)
@@ -78,13 +80,13 @@ def test_order_stamps_and_counts():
 
 def test_sensors_that_were_not_asked_for_are_absent():
     laser = short(sensors="laser", laser=LaserScannerConfig(beams=360, field_of_view_deg=360))
-    assert laser.rig.camera is None
+    assert "camera" not in laser.rig.sensors
     assert {type(sample) for sample in laser} == {SelfMotion, LaserScan}
-    steps = np.diff(laser.rig.laser.bearings_rad)
+    steps = np.diff(laser.rig.sensors["laser"].bearings_rad)
     assert len(steps) == 359
     assert np.allclose(np.rad2deg(steps), 1.0)
     camera = short(sensors="rgbd")
-    assert camera.rig.laser is None
+    assert "laser" not in camera.rig.sensors
     assert {type(sample) for sample in camera} == {SelfMotion, RgbdFrame}
 
 

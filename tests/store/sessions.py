@@ -11,7 +11,9 @@ from hybridmap.geometry import RelativePose, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.store import MapStore, SessionFolder, trajectory_of
-from hybridmap.streams.base import Camera, Laser, Rig
+from hybridmap.streams.base import Rig
+from hybridmap.streams.laser import Laser
+from hybridmap.streams.rgbd import Camera
 from hybridmap.trajectory import Trajectory
 
 SECOND = 1_000_000_000

@@ -16,7 +16,7 @@ from hybridmap.graph.hashing import graph_hash
 from hybridmap.store import MapStore
 from hybridmap.streams.base import Rig
 from hybridmap.trajectory import anchors_on
-from tests.store.sessions import RIG, keyframe_of, ring_map, truth_at, write_session
+from tests.store.sessions import CAMERA, LASER, keyframe_of, ring_map, truth_at, write_session
 
 
 def test_map_comes_back_with_every_edge_and_the_same_hash(tmp_path):
@@ -55,9 +55,9 @@ def test_keyframes_snapshots_rig_and_solutions_come_back_exactly(tmp_path):
             np.testing.assert_array_equal(back, array)
         np.testing.assert_array_equal(store.snapshot(3)["phases"], np.arange(4.0))
         assert store.keyframe(10_000) == {}
-        np.testing.assert_array_equal(store.rig.camera.T_base_camera, RIG.camera.T_base_camera)
-        np.testing.assert_array_equal(store.rig.laser.bearings_rad, RIG.laser.bearings_rad)
-        assert store.rig.camera.fx_px == RIG.camera.fx_px
+        np.testing.assert_array_equal(store.rig.sensors["camera"].T_base_camera, CAMERA.T_base_camera)
+        np.testing.assert_array_equal(store.rig.sensors["laser"].bearings_rad, LASER.bearings_rad)
+        assert store.rig.sensors["camera"].fx_px == CAMERA.fx_px
         assert store.primary == "gtsam-lm"
         assert store.source == "circle"
         solution = store.solutions()["gtsam-lm"]

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from hybridmap.streams.base import LaserScan, SelfMotion
+from hybridmap.streams.base import SelfMotion
+from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.synchronise import Synchroniser
 
 MS = 1_000_000

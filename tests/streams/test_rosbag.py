@@ -12,7 +12,9 @@ from recordings import KINDS, NS, OPTICAL_XYZW, Recording, color_pixels, depth_m
 from hybridmap.config import Config
 from hybridmap.config.inputs import SensorsConfig
 from hybridmap.streams import open_stream
-from hybridmap.streams.base import LaserScan, RgbdFrame, SelfMotion
+from hybridmap.streams.base import SelfMotion
+from hybridmap.streams.laser import LaserScan
+from hybridmap.streams.rgbd import RgbdFrame
 
 
 def _config(**sensors) -> Config:
@@ -38,8 +40,8 @@ def test_every_format_gives_the_same_samples(tmp_path, kind, folder):
         np.testing.assert_array_equal(samples[5].ranges_m, np.float32([1, 2, 3, 4, 7]))
         assert stream.report.counts == {"odometry": 6, "scans": 6}
     assert stream.expected_observations == 6
-    np.testing.assert_allclose(stream.rig.laser.bearings_rad, [-1.0, -0.5, 0.0, 0.5, 1.0])
-    np.testing.assert_allclose(stream.rig.laser.pose_base_laser, [0.2, 0.0, 0.0])
+    np.testing.assert_allclose(stream.rig.sensors["laser"].bearings_rad, [-1.0, -0.5, 0.0, 0.5, 1.0])
+    np.testing.assert_allclose(stream.rig.sensors["laser"].pose_base_laser, [0.2, 0.0, 0.0])
     assert stream.groundtruth is None
 
 
@@ -52,7 +54,7 @@ def test_every_format_gives_the_same_frames(tmp_path, kind):
         np.testing.assert_array_equal(frame.color, color_pixels(i))
         np.testing.assert_array_equal(frame.depth_m, (depth_mm(i) / 1000.0).astype(np.float32))
         assert frame.depth_m.dtype == np.float32
-    camera = stream.rig.camera
+    camera = stream.rig.sensors["camera"]
     assert (camera.width_px, camera.height_px, camera.fx_px, camera.cx_px) == (8, 6, 10.0, 3.5)
     np.testing.assert_allclose(camera.T_base_camera[:3, 3], [0.1, 0.0, 0.5])
     np.testing.assert_allclose(camera.T_base_camera[:3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-12)
@@ -69,13 +71,13 @@ def test_configured_range_limits_narrow_those_of_the_recording(tmp_path):
     stream = open_stream(path, _config(range_min_m=1.5, range_max_m=4.0))
     scan = next(sample for sample in stream if isinstance(sample, LaserScan))
     np.testing.assert_array_equal(scan.ranges_m, np.float32([np.nan, 2, 3, np.nan, np.nan]))
-    assert (stream.rig.laser.range_min_m, stream.rig.laser.range_max_m) == (1.5, 4.0)
+    assert (stream.rig.sensors["laser"].range_min_m, stream.rig.sensors["laser"].range_max_m) == (1.5, 4.0)
 
 
 def _seen_from_base(stream) -> np.ndarray:
     """(B, 2) directions of the beams in the base, with the range of the first scan."""
     scan = next(sample for sample in stream if isinstance(sample, LaserScan))
-    angle = stream.rig.laser.bearings_rad + stream.rig.laser.pose_base_laser[2]
+    angle = stream.rig.sensors["laser"].bearings_rad + stream.rig.sensors["laser"].pose_base_laser[2]
     points = scan.ranges_m[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return points[np.argsort(scan.ranges_m)]
 
@@ -94,7 +96,7 @@ def test_either_beam_order_and_a_laser_upside_down_give_the_same_points(tmp_path
         recording.odometry(NS)
         recording.scan(NS, ranges, angle_min=start, step=step)
         stream = open_stream(recording.write(tmp_path / f"{name.replace(' ', '_')}.mcap"), Config())
-        assert (np.diff(stream.rig.laser.bearings_rad) > 0).all()
+        assert (np.diff(stream.rig.sensors["laser"].bearings_rad) > 0).all()
         seen[name] = _seen_from_base(stream)
     np.testing.assert_allclose(seen["clockwise"], seen["plain"], atol=1e-6)
     np.testing.assert_allclose(seen["upside down"], seen["plain"], atol=1e-6)
@@ -122,13 +124,13 @@ def test_mounting_along_a_chain_of_static_and_constant_transforms(tmp_path):
     recording.transform("mast", "laser", (0.5, 0.0, 0.0))
     recording.scan(100 * NS + 2, [1, 2, 3])
     stream = open_stream(recording.write(tmp_path / "a.mcap"), Config())
-    np.testing.assert_allclose(stream.rig.laser.pose_base_laser, [1.0, 0.5, np.pi / 2], atol=1e-12)
+    np.testing.assert_allclose(stream.rig.sensors["laser"].pose_base_laser, [1.0, 0.5, np.pi / 2], atol=1e-12)
 
 
 def test_the_configured_mounting_wins(tmp_path):
     path = laser_drive().write(tmp_path / "a.mcap")
     config = _config(laser_mounting={"x_m": 1.0, "y_m": 2.0, "yaw_rad": 0.3, "upside_down": True})
-    laser = open_stream(path, config).rig.laser
+    laser = open_stream(path, config).rig.sensors["laser"]
     np.testing.assert_allclose(laser.pose_base_laser, [1.0, 2.0, 0.3])
 
 
@@ -137,7 +139,7 @@ def test_a_base_other_than_the_odometry_s_is_reached_through_the_transforms(tmp_
     recording.transform("base_link", "centre", (0.5, 0.0, 0.0))
     stream = open_stream(recording.write(tmp_path / "a.mcap"), _config(base_frame="centre"))
     np.testing.assert_allclose(next(iter(stream)).pose_odom_robot, [0.5, 0.0, 0.0])
-    np.testing.assert_allclose(stream.rig.laser.pose_base_laser, [-0.3, 0.0, 0.0])
+    np.testing.assert_allclose(stream.rig.sensors["laser"].pose_base_laser, [-0.3, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -188,8 +190,8 @@ def test_colour_is_taken_from_the_camera_that_gives_the_depth(tmp_path):
     for i in range(9):
         recording.image(100 * NS + i, color_pixels(), "rgb8", topic="/rear/color/image_raw")
     stream = open_stream(recording.write(tmp_path / "a.mcap"), Config())
-    assert stream.selection.color == "/camera/color/image_raw"
-    assert stream.selection.depth == "/camera/aligned_depth_to_color/image_raw"
+    assert stream.uses["color"] == "/camera/color/image_raw"
+    assert stream.uses["depth"] == "/camera/aligned_depth_to_color/image_raw"
 
 
 def test_the_sensor_to_map_with_is_chosen_by_the_configuration(tmp_path):
@@ -197,11 +199,11 @@ def test_the_sensor_to_map_with_is_chosen_by_the_configuration(tmp_path):
     recording.transform("base_link", "laser")
     recording.scan(100 * NS, [1, 2, 3])
     path = recording.write(tmp_path / "a.mcap")
-    assert open_stream(path, Config()).rig.camera is None
+    assert "camera" not in open_stream(path, Config()).rig.sensors
     rig = open_stream(path, Config.from_tree({"vision": {"sensor": "rgbd"}}, "test")).rig
-    assert (rig.laser, rig.camera.width_px) == (None, 8)
+    assert (list(rig.sensors), rig.sensors["camera"].width_px) == (["camera"], 8)
     alone = open_stream(path, Config.from_tree({"vision": {"sensor": "none"}}, "test"))
-    assert (alone.rig.laser, alone.rig.camera, alone.expected_observations) == (None, None, 0)
+    assert (dict(alone.rig.sensors), alone.expected_observations) == ({}, 0)
 
 
 def test_samples_are_sorted_across_topics_whatever_the_order_of_recording(tmp_path):
@@ -375,7 +377,7 @@ def test_a_rectified_picture_takes_the_projection_matrix(tmp_path):
     recording.image(NS, color_pixels(), "rgb8", topic="/camera/rgb/image_rect_color")
     recording.image(NS, depth_mm(), "16UC1", topic="/camera/depth_registered/image_rect")
     stream = open_stream(recording.write(tmp_path / "a.mcap"), Config())
-    camera = stream.rig.camera
+    camera = stream.rig.sensors["camera"]
     assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) == (20.0, 21.0, 4.0, 3.0)
     frame = next(sample for sample in stream if isinstance(sample, RgbdFrame))
     np.testing.assert_array_equal(frame.color, color_pixels())

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from hybridmap import geometry
 from hybridmap.errors import StreamError
-from hybridmap.streams.base import LaserScan, SelfMotion, Velocity
+from hybridmap.streams.base import SelfMotion, Velocity
+from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.order import merge
 from hybridmap.streams.synchronise import Synchroniser
 

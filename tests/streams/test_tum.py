@@ -11,7 +11,8 @@ from hybridmap.config import Config
 from hybridmap.config.inputs import SensorsConfig
 from hybridmap.errors import StreamError
 from hybridmap.streams import open_stream
-from hybridmap.streams.base import RgbdFrame, SelfMotion
+from hybridmap.streams.base import SelfMotion
+from hybridmap.streams.rgbd import RgbdFrame
 
 CAMERA = """
 camera: {width: 8, height: 6, fx: 10.0, fy: 10.5, cx: 3.5, cy: 2.5, distortion: [0, 0, 0, 0, 0], depth_scale: 5000.0}
@@ -59,7 +60,7 @@ def test_frames_and_odometry_in_order(folder):
             np.testing.assert_array_equal(frame.color, color_pixels(i))
             np.testing.assert_array_equal(frame.depth_m, (depth_mm(i) / 5000.0).astype(np.float32))
     assert stream.report.counts == {"odometry": 6, "frames": 3, "unmatched color": 0, "unmatched depth": 0}
-    camera = stream.rig.camera
+    camera = stream.rig.sensors["camera"]
     assert (camera.width_px, camera.height_px, camera.fy_px) == (8, 6, 10.5)
     np.testing.assert_allclose(camera.T_base_camera[:3, 3], [0.1, 0.0, 0.5])
     assert stream.expected_observations == 3
@@ -111,8 +112,8 @@ def test_calibration_of_the_configuration_stands_in_for_camera_yaml(folder):
         depth_scale=1000.0,
     )
     stream = open_stream(folder, config)
-    assert stream.rig.camera.fy_px == 11
-    np.testing.assert_allclose(stream.rig.camera.T_base_camera[:3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+    assert stream.rig.sensors["camera"].fy_px == 11
+    np.testing.assert_allclose(stream.rig.sensors["camera"].T_base_camera[:3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-12)
     np.testing.assert_array_equal(_frames(stream)[0].depth_m, (depth_mm(0) / 1000.0).astype(np.float32))
 
 

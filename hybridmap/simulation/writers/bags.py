@@ -9,7 +9,9 @@ from typing import Any, Literal
 from hybridmap.errors import StreamError
 from hybridmap.simulation.writers.messages import TF_TYPE, WORLD_FRAME, MessageFactory, twist_between
 from hybridmap.simulation.writers.staging import Progress, silent, staged
-from hybridmap.streams.base import LaserScan, RgbdFrame, SelfMotion, Stream
+from hybridmap.streams.base import SelfMotion, Stream
+from hybridmap.streams.laser import LaserScan
+from hybridmap.streams.rgbd import RgbdFrame
 
 ODOMETRY, SCAN, TRUTH, TF_STATIC = "/odom", "/scan", "/groundtruth", "/tf_static"
 COLOR, DEPTH, CAMERA_INFO = "/camera/color/image_raw", "/camera/depth/image_raw", "/camera/color/camera_info"
@@ -124,7 +126,8 @@ def _record(
 
 def _messages(stream: Stream, make: MessageFactory, progress: Progress) -> Iterator[_Written]:
     """Topic, stamp and message of every sample, the mounting first, the truth beside the odometry."""
-    rig, truth, total = stream.rig, stream.groundtruth, stream.expected_observations
+    truth, total = stream.groundtruth, stream.expected_observations
+    camera, laser = (stream.rig.sensors.get(name) for name in ("camera", "laser"))
     true_pose = {} if truth is None else dict(zip(truth.stamps_ns.tolist(), truth.poses, strict=True))
     before: dict[str, SelfMotion] = {}
     mounted = False
@@ -133,7 +136,7 @@ def _messages(stream: Stream, make: MessageFactory, progress: Progress) -> Itera
         stamp = sample.stamp_ns
         if not mounted:
             mounted = True
-            yield TF_STATIC, stamp, make.mounting(stamp, rig.camera, rig.laser)
+            yield TF_STATIC, stamp, make.mounting(stamp, camera, laser)
         if isinstance(sample, SelfMotion):
             yield ODOMETRY, stamp, make.odometry(sample, twist_between(before.get(ODOMETRY), sample))
             before[ODOMETRY] = sample
@@ -142,12 +145,12 @@ def _messages(stream: Stream, make: MessageFactory, progress: Progress) -> Itera
                 yield TRUTH, stamp, make.odometry(real, twist_between(before.get(TRUTH), real), WORLD_FRAME)
                 before[TRUTH] = real
             continue
-        if isinstance(sample, RgbdFrame) and rig.camera is not None:
+        if isinstance(sample, RgbdFrame) and camera is not None:
             yield COLOR, stamp, make.color(sample)
             yield DEPTH, stamp, make.depth(sample)
-            yield CAMERA_INFO, stamp, make.camera_info(stamp, rig.camera)
-        elif isinstance(sample, LaserScan) and rig.laser is not None:
-            yield SCAN, stamp, make.scan(sample, rig.laser)
+            yield CAMERA_INFO, stamp, make.camera_info(stamp, camera)
+        elif isinstance(sample, LaserScan) and laser is not None:
+            yield SCAN, stamp, make.scan(sample, laser)
         else:
             raise StreamError(f"{stream.name}: a bag holds poses, frames and scans; found {type(sample).__name__}")
         done += 1

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from hybridmap.geometry import Array, between, log
 from hybridmap.simulation.writers.mounting import quaternion_of_rotation
 from hybridmap.simulation.writers.quaternions import quaternion_of
-from hybridmap.streams.base import Camera, Laser, LaserScan, RgbdFrame, SelfMotion
+from hybridmap.streams.base import SelfMotion
+from hybridmap.streams.laser import Laser, LaserScan
+from hybridmap.streams.rgbd import Camera, RgbdFrame
 from hybridmap.trajectory import NS_PER_S
 
 BASE_FRAME, ODOM_FRAME, WORLD_FRAME = "base_link", "odom", "world"

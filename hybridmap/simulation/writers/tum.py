@@ -14,7 +14,8 @@ from hybridmap.simulation.writers.messages import millimetres
 from hybridmap.simulation.writers.mounting import quaternion_of_rotation
 from hybridmap.simulation.writers.quaternions import quaternion_of
 from hybridmap.simulation.writers.staging import Progress, silent, staged
-from hybridmap.streams.base import Camera, RgbdFrame, SelfMotion, Stream
+from hybridmap.streams.base import SelfMotion, Stream
+from hybridmap.streams.rgbd import Camera, RgbdFrame
 from hybridmap.trajectory import format_stamp
 
 UNITS_PER_M = 5000
@@ -38,7 +39,7 @@ def write_tum(stream: Stream, folder: Path, *, overwrite: bool = False, progress
     Raises:
         StreamError: the stream has no camera, the place is taken or cannot be written to, depth beyond 13.1 m.
     """
-    camera = stream.rig.camera
+    camera = stream.rig.sensors.get("camera")
     if camera is None:
         raise StreamError(f"{folder}: a TUM folder holds colour and depth, and {stream.name} has no camera; write a bag")
     left_out = 0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.laser import ScanConfig
 from hybridmap.geometry import Array
-from hybridmap.streams.base import Laser
+from hybridmap.streams.laser import Laser
 
 NEIGHBOURS = 3
 

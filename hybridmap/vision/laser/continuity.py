@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hybridmap.config.laser import LaserConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, inverse
 from hybridmap.graph.edges import Edge
-from hybridmap.streams.base import Laser, LaserScan
+from hybridmap.streams.laser import Laser, LaserScan
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import nodes_within
 from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan, merged_at

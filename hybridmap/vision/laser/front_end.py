@@ -11,7 +11,9 @@ from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, Array, RelativePose, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Status
-from hybridmap.streams.base import Laser, LaserScan, Observation
+from hybridmap.metrics import StageClock
+from hybridmap.streams.base import Observation, Rig
+from hybridmap.streams.laser import LASER, Laser, LaserScan
 from hybridmap.trajectory import Anchors
 from hybridmap.vision.base import Belief, Doubted, View
 from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan
@@ -36,9 +38,8 @@ MOST_BETWEEN = 30
 class LaserFrontEnd:
     """Submap registration and commitment by cluster, as a `vision.base.FrontEnd`."""
 
-    def __init__(self, config: VisionConfig, laser: Laser, seed: int) -> None:
-        """Start without a node; nothing here is random, `seed` is taken for the sake of the interface."""
-        del seed
+    def __init__(self, config: VisionConfig, laser: Laser) -> None:
+        """Start without a node."""
         self._config = config.laser
         self._laser = laser
         self._atlas = Atlas(self._config)
@@ -160,7 +161,7 @@ class LaserFrontEnd:
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
         """Profile and ranges of a node's scan."""
-        return {"profile": self._profiles[node], "ranges_m": self._atlas.ranges[node]}
+        return {"profile": self._profiles[node], **LASER.compact(LaserScan(0, self._atlas.ranges[node]))}
 
     def _next_key(self) -> int:
         self._keys += 1
@@ -184,6 +185,12 @@ class LaserFrontEnd:
             key=self._next_key(),
             contradicts_odometry=step.contradicts_odometry,
         )
+
+
+def create(config: VisionConfig, rig: Rig, seed: int, clock: StageClock) -> LaserFrontEnd:
+    """As `vision.Factory`; nothing here is random, and nothing has a stage of its own."""
+    del seed, clock
+    return LaserFrontEnd(config, rig.sensors[LASER.sensor_name])
 
 
 def _loop(key: int, h: Hypothesis, status: Status, reason: str) -> Edge:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.laser import LaserConfig
 from hybridmap.geometry import Array, between, compose, interpolate, wrap_angle
-from hybridmap.streams.base import Laser, LaserScan
+from hybridmap.streams.laser import Laser, LaserScan
 from hybridmap.trajectory import Anchors, anchors_on
 from hybridmap.vision.laser.cloud import Cloud, clouds_of_scans, merged_at
 from hybridmap.vision.laser.likelihood import build_field

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.laser import LaserConfig
 from hybridmap.geometry import Array, between, inverse, invert_relative, wrap_angle
-from hybridmap.streams.base import Laser
+from hybridmap.streams.laser import Laser
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.hypotheses import Hypothesis
 from hybridmap.vision.laser.likelihood import score_starts

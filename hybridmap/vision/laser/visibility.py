@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.geometry import Array, compose, inverse
-from hybridmap.streams.base import Laser
+from hybridmap.streams.laser import Laser
 from hybridmap.vision.laser.cloud import Cloud
 from hybridmap.vision.laser.submap import Submap
 

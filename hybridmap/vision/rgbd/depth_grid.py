@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.geometry import Array
-from hybridmap.streams.base import Camera
+from hybridmap.streams.rgbd import Camera
 from hybridmap.vision.rgbd.spatial import inverse_rigid
 from hybridmap.vision.rgbd.stance import Stance
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.geometry import Array
-from hybridmap.streams.base import Camera
+from hybridmap.streams.rgbd import Camera
 
 MAX_SPREAD = 0.05
 """A keypoint on a depth edge (neighbouring depths differ by more than this share) has no point in space."""

@@ -14,7 +14,8 @@ from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.edges import Edge
 from hybridmap.metrics import StageClock
-from hybridmap.streams.base import Camera, Observation, RgbdFrame
+from hybridmap.streams.base import Observation, Rig
+from hybridmap.streams.rgbd import RGBD, Camera, RgbdFrame
 from hybridmap.vision.base import Belief, Doubted, View
 from hybridmap.vision.profile import image_profile
 from hybridmap.vision.rgbd.closing import LoopCloser
@@ -23,7 +24,6 @@ from hybridmap.vision.rgbd.features import detect
 from hybridmap.vision.rgbd.keyframe import (
     Keyframe,
     WorkingImage,
-    depth_in_mm,
     working_camera,
     working_factor,
     working_image,
@@ -135,7 +135,7 @@ class RgbdFrontEnd:
         return self._closer.lost_since
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
-        """`profile` float32, `color` (H, W, 3) uint8 RGB, `depth_mm` (H, W) uint16, `T_base_camera` (4, 4) as it was then.
+        """`profile` float32, the frame in its compact form, `T_base_camera` (4, 4) as it was then.
 
         Of the newest node also what its search for loops found, see `LoopCloser.note`.
 
@@ -151,8 +151,7 @@ class RgbdFrontEnd:
             )
         return {
             "profile": kept.profile,
-            "color": held[0].color,
-            "depth_mm": depth_in_mm(held[0].depth_m),
+            **RGBD.compact(held[0]),
             "T_base_camera": kept.surface.stance.T_base_camera,
             **self._closer.note(node),
         }
@@ -161,3 +160,8 @@ class RgbdFrontEnd:
         """Yaw of the stored view seen from the query: things farther right in the query mean that it looks farther left."""
         pixels = shift * self._camera.width_px / self._config.profile.width
         return -float(np.arctan2(pixels, self._camera.fx_px))
+
+
+def create(config: VisionConfig, rig: Rig, seed: int, clock: StageClock) -> RgbdFrontEnd:
+    """As `vision.Factory`."""
+    return RgbdFrontEnd(config, rig.sensors[RGBD.sensor_name], seed, clock)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.streams.base import Camera, RgbdFrame
-from hybridmap.vision.profile import Profile
+from hybridmap.config.vision import ProfileConfig
+from hybridmap.streams.base import Rig
+from hybridmap.streams.rgbd import RGBD, Camera, RgbdFrame
+from hybridmap.vision.profile import Profile, image_profile
 from hybridmap.vision.rgbd.depth_grid import Surface, reduced
 from hybridmap.vision.rgbd.features import Features
 
@@ -67,7 +70,18 @@ def working_image(frame: RgbdFrame, factor: int) -> WorkingImage:
     return WorkingImage(grey, depth)
 
 
-def depth_in_mm(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Depth in whole millimetres, 0 where invalid."""
-    millimetres = np.rint(np.nan_to_num(depth_m, posinf=0.0) * 1000.0)
-    return np.asarray(np.clip(millimetres, 0, 65535), dtype=np.uint16)
+def image_profile_again(
+    kept: Mapping[str, NDArray[np.generic]], rig: Rig, max_width_px: int, settings: ProfileConfig, bands: int
+) -> Profile | None:
+    """Profile of a stored keyframe with another number of row bands; None where it or the rig has no colour with depth."""
+    frame, camera = RGBD.restore(kept, 0), rig.sensors.get(RGBD.sensor_name)
+    if not isinstance(frame, RgbdFrame) or camera is None:
+        return None
+    image = working_image(frame, working_factor(camera, max_width_px))
+    return image_profile(image.grey, image.depth_m, settings.width, bands, settings.normalise)
+
+
+def tilt_measured(kept: Mapping[str, NDArray[np.generic]], rig: Rig) -> bool:
+    """Whether the camera's tilt was measured at a stored keyframe and not taken from the mounting."""
+    camera, own = rig.sensors.get(RGBD.sensor_name), kept.get("T_base_camera")
+    return camera is not None and own is not None and not np.allclose(own, camera.T_base_camera, atol=1e-6)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.rgbd import FeaturesConfig, PnpConfig, RegistrationConfig
 from hybridmap.geometry import Array, RelativePose, between, loosest_direction, wrap_angle
-from hybridmap.streams.base import Camera
+from hybridmap.streams.rgbd import Camera
 from hybridmap.vision.rgbd.depth_registration import Registration, register
 from hybridmap.vision.rgbd.features import Correspondences, match
 from hybridmap.vision.rgbd.keyframe import Keyframe

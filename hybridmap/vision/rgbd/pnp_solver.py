@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.rgbd import PnpConfig
 from hybridmap.geometry import Array
-from hybridmap.streams.base import Camera
+from hybridmap.streams.rgbd import Camera
 from hybridmap.vision.rgbd.features import Features
 
 

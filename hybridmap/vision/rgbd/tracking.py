@@ -10,7 +10,7 @@ import numpy as np
 from hybridmap.config.rgbd import RgbdConfig
 from hybridmap.geometry import Array, RelativePose, between, compose, compose_relative, log, loosest_direction
 from hybridmap.graph.edges import Edge, EdgeKind, Status
-from hybridmap.streams.base import Camera
+from hybridmap.streams.rgbd import Camera
 from hybridmap.vision.rgbd.depth_grid import place
 from hybridmap.vision.rgbd.depth_registration import Registration, register
 from hybridmap.vision.rgbd.features import match

@@ -9,7 +9,7 @@ import numpy as np
 from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import IDENTITY, RelativePose, between, compose
 from hybridmap.graph.edges import EdgeKind
-from hybridmap.streams.base import Laser, LaserScan
+from hybridmap.streams.laser import Laser, LaserScan
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.front_end import LaserFrontEnd
 
@@ -102,7 +102,7 @@ class Run:
 
     def __init__(self, world, truth, odometry, every=5, config=None, seed=0):
         rng = np.random.default_rng(seed)
-        self.front_end = LaserFrontEnd(config or VisionConfig(), LASER, 0)
+        self.front_end = LaserFrontEnd(config or VisionConfig(), LASER)
         self.proposals, self.poses, self.travel, last = [], [IDENTITY], [0.0], 0
         self.truth, self.node_at = truth, []
         for i, pose in enumerate(truth):

@@ -9,7 +9,7 @@ from laser_worlds import LASER, box, cast, ring, ring_drive, room
 from hybridmap.config.laser import LaserConfig, LaserRelocalisingConfig, ScanConfig
 from hybridmap.geometry import IDENTITY, RelativePose, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Status
-from hybridmap.streams.base import LaserScan
+from hybridmap.streams.laser import LaserScan
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.cloud import cloud_of_scan
 from hybridmap.vision.laser.continuity import Continuity

@@ -9,7 +9,8 @@ from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, between, compose, log
 from hybridmap.graph.edges import EdgeKind, Status
-from hybridmap.streams.base import LaserScan, RgbdFrame
+from hybridmap.streams.laser import LaserScan
+from hybridmap.streams.rgbd import RgbdFrame
 from hybridmap.vision.base import Doubted, RetracingFrontEnd, VerifyingFrontEnd
 from hybridmap.vision.laser.front_end import LaserFrontEnd
 
@@ -154,7 +155,7 @@ def test_scans_found_view_templates_and_are_recognised():
     views = {}
     for on in (True, False):
         config = VisionConfig(laser=LaserConfig(scan=ScanConfig(templates=on)))
-        front_end = LaserFrontEnd(config, LASER, 0)
+        front_end = LaserFrontEnd(config, LASER)
         views[on] = [front_end.observe(scan, IDENTITY) for scan in scans]
     numbers, lap = np.array([view.template for view in views[True]]), len(truth) // 2
     founded = [i for i, view in enumerate(views[True]) if view.new_template]
@@ -166,7 +167,7 @@ def test_scans_found_view_templates_and_are_recognised():
 
 
 def test_frames_of_another_kind_are_refused():
-    front_end = LaserFrontEnd(VisionConfig(), LASER, 0)
+    front_end = LaserFrontEnd(VisionConfig(), LASER)
     with pytest.raises(StreamError, match="expected a LaserScan"):
         front_end.observe(RgbdFrame(0, np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), np.float32)), IDENTITY)
     with pytest.raises(StreamError, match="271 ranges, found"):
@@ -174,7 +175,7 @@ def test_frames_of_another_kind_are_refused():
 
 
 def test_a_keyframe_holds_profile_and_ranges():
-    front_end = LaserFrontEnd(VisionConfig(laser=LaserConfig()), LASER, 0)
+    front_end = LaserFrontEnd(VisionConfig(laser=LaserConfig()), LASER)
     ranges = cast(room(), IDENTITY)
     front_end.add_node(0, front_end.observe(LaserScan(5, ranges), IDENTITY))
     assert front_end.track(0, None) == []

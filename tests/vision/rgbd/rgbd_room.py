@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridmap.streams.base import Camera, RgbdFrame
+from hybridmap.streams.rgbd import Camera, RgbdFrame
 from hybridmap.vision.rgbd.spatial import from_planar
 
 LOW, HIGH = np.array([-3.0, -2.0, 0.0]), np.array([3.0, 2.0, 2.4])

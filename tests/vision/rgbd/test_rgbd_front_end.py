@@ -9,7 +9,9 @@ from hybridmap.config.vision import RelocalisingConfig, VisionConfig
 from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import RelativePose, between, compose
 from hybridmap.graph.edges import EdgeKind, Status
-from hybridmap.streams.base import LaserScan, RgbdFrame, Rig
+from hybridmap.streams.base import Rig
+from hybridmap.streams.laser import LaserScan
+from hybridmap.streams.rgbd import RgbdFrame
 from hybridmap.vision import create_front_end
 from hybridmap.vision.base import Belief
 from hybridmap.vision.rgbd.front_end import RgbdFrontEnd

@@ -3,7 +3,7 @@ import pytest
 from rgbd_room import camera, render
 
 from hybridmap.config.rgbd import PnpConfig
-from hybridmap.streams.base import Camera
+from hybridmap.streams.rgbd import Camera
 from hybridmap.vision.rgbd.depth_grid import make_grid
 from hybridmap.vision.rgbd.features import detect
 from hybridmap.vision.rgbd.pnp_solver import PnpSolver

@@ -1,0 +1,77 @@
+"""The kinds of sensors, by name, and what can be said of any of them.
+
+A new kind is one `SensorKind`, given to `register`. Nothing else in the package has to know of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from hybridmap.config.inputs import SensorsConfig
+from hybridmap.errors import ConfigError
+from hybridmap.plugins import Table
+from hybridmap.streams.base import Keyframe, Observation, Rig, Seen, SensorKind
+from hybridmap.streams.laser import LASER
+from hybridmap.streams.rgbd import RGBD
+
+SENSORS: Table[SensorKind] = Table(
+    "kind of sensor", {kind.name: kind for kind in (LASER, RGBD)}, "hybridmap.sensors", ConfigError
+)
+"""`vision.sensor: auto` takes the first kind that a source has."""
+
+
+def register(kind: SensorKind) -> None:
+    """Add a kind of sensor: sources, map files, exports, pages and `vision.sensor` know it from now on.
+
+    Packages have entry points `hybridmap.sensors`.
+
+    Raises:
+        ConfigError: there is one of this name already.
+    """
+    SENSORS.register(kind.name, kind)
+
+
+def kinds() -> tuple[SensorKind, ...]:
+    """Every kind there is, in the order in which they are looked for."""
+    return SENSORS.values()
+
+
+def wanted(sensor: str) -> tuple[SensorKind, ...]:
+    """The kinds that a value of `vision.sensor` can map with: one by its name, none; all for `auto` and other front-ends."""
+    if sensor == "none":
+        return ()
+    return tuple(kind for kind in kinds() if kind.name == sensor) or kinds()
+
+
+def carried(rig: Rig) -> Iterator[tuple[SensorKind, Any]]:
+    """Kind and sensor of everything in a rig."""
+    for kind in kinds():
+        if kind.sensor_name in rig.sensors:
+            yield kind, rig.sensors[kind.sensor_name]
+
+
+def kind_of(observation: Observation) -> SensorKind:
+    """The kind of sensor that made an observation."""
+    return next(kind for kind in kinds() if isinstance(observation, kind.sample))
+
+
+def rig_of(config: SensorsConfig) -> Rig:
+    """The rig that a configuration alone gives, for those who feed the mapper themselves."""
+    return Rig(**{kind.sensor_name: kind.configured(config) for kind in kinds()})
+
+
+def message_types() -> tuple[str, ...]:
+    """Message types of a bag that any kind of sensor reads."""
+    return tuple(name for kind in kinds() if kind.in_bag is not None for name in kind.in_bag.types)
+
+
+def words(rig: Rig) -> list[str]:
+    """Each sensor of a rig in a few words."""
+    return [kind.words(sensor) for kind, sensor in carried(rig)]
+
+
+def see(keyframe: Keyframe, rig: Rig, max_range_m: float) -> Seen | None:
+    """What a keyframe shows, by the first sensor of the rig that made it; None where it shows nothing."""
+    seen = (kind.see(keyframe, sensor, max_range_m) for kind, sensor in carried(rig))
+    return next((found for found in seen if found is not None), None)
