@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -195,7 +196,7 @@ class Mapper:
             poses_map_node=graph.initial if own else self.backends.poses(graph),
             stamps_s=np.array([node.stamp_ns for node in self.map.nodes]) / NS_PER_S,
             travel_m=np.array([node.travel_m for node in self.map.nodes]),
-            covariance_from=lambda node: relative_covariances(graph, node),
+            covariance_from=cache(lambda node: relative_covariances(graph, node)),
         )
 
     def _correct(self, final: bool = False) -> None:

@@ -146,8 +146,6 @@ class CommitmentConfig(Section):
     """Travel that they must cover beside that for each factor e by which the gate is wider, m."""
     rival: float = Field(default=0.75, gt=0, le=1)
     """The best rival cluster must score less than this share of the cluster."""
-    heading_deg_per_sqrt_m: float = Field(default=0.45, gt=0)
-    """Growth of the chain's heading error, degrees per sqrt(m), for the consistency of two hypotheses."""
 
 
 class RevisitConfig(Section):

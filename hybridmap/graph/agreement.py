@@ -21,6 +21,15 @@ Ways = Callable[[Indices, Indices], RelativePose]
 """How the robot came from nodes (P,) to nodes (P,): the latter seen from the former. Not finite where nothing is known."""
 
 
+def chi2_quantile(probability: float) -> float:
+    """Quantile of chi2 with 3 degrees of freedom; `scipy.stats` has it too, and takes half a second to import."""
+    return float(2.0 * gammaincinv(1.5, probability))
+
+
+BOUND = chi2_quantile(0.99)
+"""Squared Mahalanobis distance up to which two loops agree: one pair of true ones in a hundred does not."""
+
+
 @dataclass(frozen=True, slots=True)
 class Loops:
     """Measured loops, all told from the older node.
@@ -82,19 +91,22 @@ def ring(first: Loops, second: Loops, ways: Ways) -> Ring:
     return Ring(error, along_new.covariance + along_old.covariance)
 
 
-def agreement(loops: Loops, ways: Ways, bound: float) -> NDArray[np.bool_]:
-    """Which loops agree in pairs: (L, L), symmetric, with a true diagonal. Costs L^2 / 2 rings.
+def agreement(loops: Loops, ways: Ways, bound: float = BOUND, known: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+    """Which loops agree in pairs: (L, L), symmetric, with a true diagonal. Costs a ring for each pair that is not known.
 
     Args:
         loops: L of them.
-        ways: between their ends.
-        bound: largest squared Mahalanobis distance of a pair that agrees; see `chi2_quantile`.
+        ways: between their ends; asked for those from one loop at a time.
+        bound: largest squared Mahalanobis distance of a pair that agrees.
+        known: (K, K) what was found for the first K before; None: nothing.
     """
-    count = len(loops.older)
+    count, first = len(loops.older), 0 if known is None else len(known)
     out = np.eye(count, dtype=bool)
-    for first in range(count - 1):
-        rest = np.arange(first + 1, count)
-        out[first, rest] = out[rest, first] = ring(loops[np.full(len(rest), first)], loops[rest], ways).distance <= bound
+    if known is not None:
+        out[:first, :first] = known
+    for new in range(max(first, 1), count):
+        before = np.arange(new)
+        out[new, before] = out[before, new] = ring(loops[np.full(new, new)], loops[before], ways).distance <= bound
     return out
 
 
@@ -123,8 +135,3 @@ def largest_consistent_set(
         possible &= agree[best]
         best = None
     return members
-
-
-def chi2_quantile(probability: float) -> float:
-    """Quantile of chi2 with 3 degrees of freedom; `scipy.stats` has it too, and takes half a second to import."""
-    return float(2.0 * gammaincinv(1.5, probability))

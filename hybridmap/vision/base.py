@@ -13,7 +13,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.geometry import Array, RelativePose
+from hybridmap.geometry import Array, RelativePose, between
+from hybridmap.graph.agreement import Indices
 from hybridmap.graph.edges import Edge
 from hybridmap.streams.base import Observation
 from hybridmap.trajectory import Anchors
@@ -36,6 +37,13 @@ class Belief:
     stamps_s: Array
     travel_m: Array
     covariance_from: Callable[[int], Array]
+
+    def ways(self, first: Indices, second: Indices) -> RelativePose:
+        """The way between nodes (P,) and nodes (P,), as `agreement.Ways`. Searches the graph once for each node in `first`."""
+        covariance = np.empty((len(first), 3, 3))
+        for node in np.unique(first).tolist():
+            covariance[first == node] = self.covariance_from(node)[second[first == node]]
+        return RelativePose(between(self.poses_map_node[first], self.poses_map_node[second]), covariance)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.laser import CommitmentConfig
-from hybridmap.geometry import Array, between, compose, inverse
+from hybridmap.geometry import RelativePose
+from hybridmap.graph.agreement import Loops, agreement, largest_consistent_set
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.hypotheses import Hypothesis
-
-MEASURED_M = 0.12
-MEASURED_RAD = np.deg2rad(1.2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,13 +56,10 @@ class Cluster:
 class Commitment:
     """The queue of waiting hypotheses."""
 
-    def __init__(
-        self, config: CommitmentConfig, travel_of: Callable[[int], float], motion_of: Callable[[int, int, Array], Array]
-    ) -> None:
-        """Start empty; `motion_of` gives node b in the frame of node a, of a, b and the poses (N, 3) of all on the map."""
+    def __init__(self, config: CommitmentConfig, travel_of: Callable[[int], float]) -> None:
+        """Start empty; `travel_of` gives the travel until a node, m."""
         self._config = config
         self._travel = travel_of
-        self._motion = motion_of
         self._queue: list[Waiting] = []
         self._given_up: list[Waiting] = []
         self._consistent: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
@@ -117,7 +112,7 @@ class Commitment:
         self._queue = [self._queue[p] for p in positions]
 
     def _ripe(self, belief: Belief, span_per_efold_m: float) -> Cluster | None:
-        self._extend(belief)
+        self._consistent = agreement(self._loops(), belief.ways, known=self._consistent)
         clusters = self._clusters()
         if not clusters:
             return None
@@ -153,22 +148,15 @@ class Commitment:
         return bool(self._consistent[np.ix_(list(best.members), list(other.members))].mean() < 0.5)
 
     def _clusters(self) -> list[Cluster]:
-        """Greedy cliques from every seed, the best first; those that repeat an earlier one are left out."""
-        n = len(self._queue)
+        """Sets of hypotheses that agree, one a probe, begun with each of them in turn; those of the largest score first."""
         quality = np.array([w.hypothesis.quality for w in self._queue])
         probes = np.array([w.hypothesis.probe for w in self._queue])
-        order = sorted(range(n), key=lambda i: -quality[i])
+        together = self._consistent & (probes[:, None] != probes) | np.eye(len(probes), dtype=bool)
         found: dict[tuple[int, ...], Cluster] = {}
-        for seed in order:
-            members, open_ = [seed], self._consistent[seed] & (probes != probes[seed])
-            while open_.any():
-                support = np.where(open_, (self._consistent & open_[None]) @ quality + quality, -1.0)
-                best = int(np.argmax(support))
-                members.append(best)
-                open_ &= self._consistent[best] & (probes != probes[best])
-            key = tuple(sorted(members))
-            if key not in found:
-                found[key] = self._describe(key)
+        for first in np.argsort(-quality, kind="stable").tolist():
+            members = tuple(np.flatnonzero(largest_consistent_set(together, quality, first)).tolist())
+            if members not in found:
+                found[members] = self._describe(members)
         return sorted(found.values(), key=lambda c: (-c.score, c.members))
 
     def _describe(self, members: tuple[int, ...]) -> Cluster:
@@ -182,28 +170,9 @@ class Commitment:
             float(np.median([h.sigma_m for h in chosen])),
         )
 
-    def _extend(self, belief: Belief) -> None:
-        """Fill the consistency of hypotheses that came since the last time."""
-        n, known = len(self._queue), len(self._consistent)
-        if n == known:
-            return
-        grown = np.eye(n, dtype=bool)
-        grown[:known, :known] = self._consistent
-        for i in range(known, n):
-            for j in range(i):
-                grown[i, j] = grown[j, i] = self._agree(self._queue[i].hypothesis, self._queue[j].hypothesis, belief)
-        self._consistent = grown
-
-    def _agree(self, a: Hypothesis, b: Hypothesis, belief: Belief) -> bool:
-        """Close the ring probe a, anchor a, anchor b, probe b and hold what is left against its uncertainty."""
-        probes = self._motion(a.probe, b.probe, belief.poses_map_node)
-        old = between(belief.poses_map_node[a.anchor], belief.poses_map_node[b.anchor])
-        via = compose(compose(inverse(a.relative.delta), probes), b.relative.delta)
-        error = between(old, via)
-        new_m = abs(self._travel(a.probe) - self._travel(b.probe))
-        old_m = abs(self._travel(a.anchor) - self._travel(b.anchor))
-        rate = np.deg2rad(self._config.heading_deg_per_sqrt_m)
-        sigma_rad = np.sqrt(rate**2 * (new_m + min(old_m, 4.0 * self._config.wait_m)) + 2.0 * MEASURED_RAD**2)
-        lever = float(np.hypot(old[0], old[1]) + np.hypot(probes[0], probes[1])) / np.sqrt(3.0)
-        sigma_m = np.sqrt(2.0 * MEASURED_M**2 + (lever * sigma_rad) ** 2)
-        return bool(np.hypot(error[0], error[1]) < 2.5 * sigma_m and abs(error[2]) < 2.5 * sigma_rad)
+    def _loops(self) -> Loops:
+        waiting = [w.hypothesis for w in self._queue]
+        delta = np.array([h.relative.delta for h in waiting]).reshape(-1, 3)
+        covariance = np.array([h.relative.covariance for h in waiting]).reshape(-1, 3, 3)
+        ends = np.array([(h.probe, h.anchor) for h in waiting], dtype=np.int64).reshape(-1, 2)
+        return Loops.of(ends[:, 0], ends[:, 1], RelativePose(delta, covariance))

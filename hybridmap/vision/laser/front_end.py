@@ -46,7 +46,7 @@ class LaserFrontEnd:
         self._tracker = Tracker(self._config, self._atlas)
         self._prober = Prober(self._config, self._atlas, laser)
         self._reviser = Reviser(self._config, self._atlas, laser)
-        self._commitment = Commitment(self._config.commitment, self._atlas.travel_m.__getitem__, self._atlas.motion)
+        self._commitment = Commitment(self._config.commitment, self._atlas.travel_m.__getitem__)
         t, m = config.templates, config.matching
         self._templates = ViewTemplates(t.threshold, t.stable_frames, t.max_shift, m.mu_r, m.mu_d)
         self._profiles: list[NDArray[np.float32]] = []

@@ -143,11 +143,6 @@ class Atlas:
         """The nodes of the piece of the chain that a node, or the next one to come, belongs to."""
         return self.pieces[bisect_right(self._pieces, node) - 1]
 
-    def motion(self, a: int, b: int, poses_map_node: Array) -> Array:
-        """Pose (3,) of node b in the frame of node a: along the chain within one piece, from one to another on the map."""
-        same = b in self.piece(a)
-        return between(self.chain[a], self.chain[b]) if same else between(poses_map_node[a], poses_map_node[b])
-
     def along(self, node: int, before_m: float, after_m: float) -> NDArray[np.int64]:
         """Nodes of a node's piece that lie at most so much travel before and after it."""
         travel, piece = self.travel_m[node], self.piece(node)

@@ -13,7 +13,14 @@ N = 400
 STEP_M = 0.5
 CHAIN = np.column_stack([np.arange(N) * STEP_M, np.zeros(N), np.zeros(N)])
 TRAVEL = np.arange(N) * STEP_M
-BELIEF = Belief(CHAIN, np.arange(N, dtype=float), TRAVEL, lambda node: np.tile(np.eye(3), (N, 1, 1)))
+
+
+def covariance_from(node):
+    """Steps of 1 mm and 0.05 degrees."""
+    return np.abs(np.arange(N) - node)[:, None, None] * np.diag([1e-3, 1e-3, np.deg2rad(0.05)]) ** 2
+
+
+BELIEF = Belief(CHAIN, np.arange(N, dtype=float), TRAVEL, covariance_from)
 
 
 def hypothesis(probe, anchor, where=(2.0, 5.0, 0.3), quality=0.7, sigma_m=5.0):
@@ -23,13 +30,9 @@ def hypothesis(probe, anchor, where=(2.0, 5.0, 0.3), quality=0.7, sigma_m=5.0):
     return Hypothesis(probe, anchor, relative, quality, sigma_m, {}, "")
 
 
-def moved(a, b, poses):
-    return between(poses[a], poses[b])
-
-
 @pytest.fixture
 def commitment():
-    return Commitment(CommitmentConfig(), TRAVEL.__getitem__, moved)
+    return Commitment(CommitmentConfig(), TRAVEL.__getitem__)
 
 
 def test_waits_until_enough_probes_over_enough_travel_agree(commitment):
@@ -47,7 +50,7 @@ def test_waits_until_enough_probes_over_enough_travel_agree(commitment):
 
 def test_a_wider_gate_asks_for_more_travel():
     def travel_needed(sigma_m):
-        commitment = Commitment(CommitmentConfig(), TRAVEL.__getitem__, moved)
+        commitment = Commitment(CommitmentConfig(), TRAVEL.__getitem__)
         for key, probe in enumerate(range(200, 240, 2)):
             commitment.add(key, hypothesis(probe, 20, sigma_m=sigma_m))
             if commitment.settle(TRAVEL[probe], BELIEF):

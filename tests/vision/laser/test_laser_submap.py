@@ -39,11 +39,3 @@ def test_nothing_reaches_beyond_a_piece_until_it_is_joined_again(atlas):
     assert atlas.around(13, 2.0).nodes.tolist() == list(range(12, 18))
     atlas.join(12)
     assert atlas.along(10, 9.0, 9.0).tolist() == list(range(6, 20))
-
-
-def test_motion_is_of_the_chain_within_a_piece_and_of_the_map_between_two(atlas):
-    on_map = ALONG + [0.0, 7.0, 0.0] * (np.arange(20)[:, None] >= 12)
-    np.testing.assert_allclose(atlas.motion(10, 13, on_map), [1.5, 0.0, 0.0])
-    atlas.part(12)
-    np.testing.assert_allclose(atlas.motion(10, 13, on_map), [1.5, 7.0, 0.0])
-    np.testing.assert_allclose(atlas.motion(13, 15, on_map), [1.0, 0.0, 0.0])
