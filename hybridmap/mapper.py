@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hybridmap.backends.base import Backend
 from hybridmap.backends.ensemble import Ensemble
 from hybridmap.calibration.gains import Gains
 from hybridmap.calibration.online import OnlineCalibration
@@ -69,8 +70,13 @@ class Mapper:
     ```
     """
 
-    def __init__(self, config: Config, rig: Rig | None = None) -> None:
-        """Set up every stage; `rig` says which sensors there are (default: those that the configuration describes).
+    def __init__(self, config: Config, rig: Rig | None = None, backends: Sequence[str | Backend] | None = None) -> None:
+        """Set up every stage.
+
+        Args:
+            config: settings of all stages.
+            rig: which sensors there are; default: those that the configuration describes.
+            backends: names, or back-ends in a fresh state, in place of those that the configuration names.
 
         Raises:
             ConfigError: the configuration asks for a sensor that the rig does not have.
@@ -83,7 +89,7 @@ class Mapper:
         self.integrator = PathIntegrator(config.neural)
         self.cells = Reanchoring(self.integrator, config.neural.reanchor_weight)
         self.vision = create_front_end(config.vision, rig or rig_of(config.sensors), config.seed, self.clock)
-        self.backends = Ensemble(config.backends, self.clock)
+        self.backends = Ensemble(config.backends, self.clock, backends)
         self.calibration = OnlineCalibration(config.calibration, Gains.of(config.neural))
         self.anchors = NO_ANCHORS
         self._synchroniser = Synchroniser(latency_s=config.sensors.latency_s, odometry_delay_s=config.sensors.odometry_delay_s)
@@ -206,8 +212,7 @@ class Mapper:
             self.backends.finish(graph)
         else:
             self.backends.update(graph)
-        names = self.config.backends.names
-        self._pose_map_at_node = {name: self.backends.poses(graph, name)[self._at_node] for name in names}
+        self._pose_map_at_node = {name: self.backends.poses(graph, name)[self._at_node] for name in self.backends.names}
 
     def _verify_again(self) -> list[int]:
         """Have the loops that the primary back-end gave no weight measured again, from where they lie on its map."""

@@ -142,7 +142,7 @@ class _Recorder:
             return
         self._last_stamp_ns = update.stamp_ns
         self.store.add_track(update.stamp_ns, node, delta, update.pose_odom_robot)
-        for backend in self._mapper.config.backends.names:
+        for backend in self._mapper.backends.names:
             pose = update.poses_map_robot.get(backend, update.pose_odom_robot)
             self.store.add_online(backend, update.stamp_ns, pose)
 
@@ -175,7 +175,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
     store.put_anchors(mapper.anchors)
     track = store.track()
     folder.write_trajectory("odometry", track.odometry)
-    for name in mapper.config.backends.names:
+    for name in mapper.backends.names:
         solution = mapper.backends.solutions.get(name)
         if solution is not None:
             store.put_solution(name, solution.poses, solution.report)
@@ -186,7 +186,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
     head = {
         "graph_hash": graph_hash(mapper.map),
         "primary_backend": mapper.backends.primary,
-        "backends": list(mapper.config.backends.names),
+        "backends": list(mapper.backends.names),
         "source": stream.name,
         "failed_backends": dict(mapper.backends.failures),
         "stream": dict(stream.report.counts),

@@ -12,11 +12,11 @@ from barred import at_least, at_most
 
 from hybridmap import backends
 from hybridmap.backends.base import Backend, Solution
-from hybridmap.backends.following import prefix
 from hybridmap.backends.gtsam.batch import run
 from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph
 from hybridmap.geometry import Array, between
 from hybridmap.graph.connectivity import chain
+from hybridmap.graph.growth import prefix
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.metrics import Metric

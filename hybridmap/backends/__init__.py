@@ -1,18 +1,23 @@
 """Solvers: one frozen graph in, poses and a typed report out. They know no sensors; `create` makes one by name."""
 
-from hybridmap.backends.base import Backend, Solution, SolveReport, SolveStatus, SupportsPoseGraph
-from hybridmap.backends.registry import create, names
-from hybridmap.backends.replay import replay
+from hybridmap.backends.base import Backend, Outcome, Solution, Solver, SolveReport, SolveStatus, SupportsPoseGraph
+from hybridmap.backends.driver import Driver, Works, replay
+from hybridmap.backends.registry import create, names, register
 from hybridmap.backends.session import GraphSession
 
 __all__ = [
     "Backend",
+    "Driver",
     "GraphSession",
+    "Outcome",
     "Solution",
     "SolveReport",
     "SolveStatus",
+    "Solver",
     "SupportsPoseGraph",
+    "Works",
     "create",
     "names",
+    "register",
     "replay",
 ]

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Protocol
+from typing import Any, Protocol
 
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
+
+ODOMETRY = "odometry"
+"""Name of dead reckoning, which counts as a back-end."""
 
 
 class SolveStatus(StrEnum):
@@ -28,6 +32,33 @@ class SolveStatus(StrEnum):
     def has_map(self) -> bool:
         """Whether the poses are a result."""
         return self not in (SolveStatus.DIVERGED, SolveStatus.SINGULAR, SolveStatus.FAILED)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a solver says.
+
+    Attributes:
+        poses: (N, 3) of every node, m and rad.
+        status, message, iterations: why it stopped, and when.
+        weights: loop edge id -> final weight.
+        rejected: loops held for false.
+        values: the poses in the solver's own form, to start from again.
+        calibrated: the graph under the odometry calibration that the solver found.
+    """
+
+    poses: Array
+    status: SolveStatus
+    message: str
+    iterations: int
+    weights: dict[int, float] = field(default_factory=dict)
+    rejected: tuple[int, ...] = ()
+    values: Any = None
+    calibrated: PoseGraph | None = None
+
+
+Solver = Callable[[PoseGraph, Array], Outcome]
+"""Works on a graph from poses (N, 3) of its nodes; a RuntimeError says that it failed."""
 
 
 @dataclass(frozen=True, slots=True)

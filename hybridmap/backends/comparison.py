@@ -10,13 +10,12 @@ from itertools import product
 
 import numpy as np
 
-from hybridmap.backends.base import Backend, Solution, SolveStatus
-from hybridmap.backends.convergence import convergence
+from hybridmap.backends.base import ODOMETRY, Backend, Solution, SolveStatus
+from hybridmap.backends.driver import replay
 from hybridmap.backends.judging.certificate import Certificate, certify
 from hybridmap.backends.objective import chi2
-from hybridmap.backends.registry import create
-from hybridmap.backends.replay import replay
-from hybridmap.config.backends import BackendsConfig
+from hybridmap.backends.registry import create, is_sequential
+from hybridmap.config.backends import BackendsConfig, ConsistencyConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
@@ -79,7 +78,7 @@ class Row:
 
 def compare(
     graph: PoseGraph,
-    names: Sequence[str],
+    backends: Sequence[str | Backend],
     config: BackendsConfig | None = None,
     *,
     ways: Sequence[Way] = (Way.BATCH,),
@@ -91,8 +90,8 @@ def compare(
 
     Args:
         graph: the graph.
-        names: back-ends, in the order of the rows.
-        config: their settings.
+        backends: names, or back-ends in a fresh state, in the order of the rows.
+        config: settings of those that are named.
         ways: how each gets the graph; dead reckoning is the same in every way and gets the first alone.
         certified: try to prove each solution optimal (`backends.judging.certificate`).
         traced: find out how each solution came about, which takes batch solvers some three times the time.
@@ -102,12 +101,13 @@ def compare(
         GraphError: the graph is malformed: no back-end could take it.
         BackendError: a name that there is not, or is there twice.
     """
+    config = config or BackendsConfig()
+    names = [backend if isinstance(backend, str) else backend.name for backend in backends]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise BackendError(f"back-end {twice!r} is named twice; name each back-end once")
     graph.validate()
-    config = config or BackendsConfig()
-    plan = [(create(name, config), way) for name, way in product(names, ways) if name != "odometry" or way is ways[0]]
+    plan = [(create(one, config), way) for one, way in product(backends, ways) if one != ODOMETRY or way is ways[0]]
     steps = [graph.n_nodes if way is Way.INCREMENTAL else 1 for _, way in plan]
     rows = []
     for number, (backend, way) in enumerate(plan):
@@ -124,6 +124,36 @@ def compare(
         rows.append(row)
         step(steps[number])
     return rows
+
+
+def convergence(graph: PoseGraph, name: str, config: BackendsConfig, final: Solution) -> Array:
+    """Iterations done and chi2 (K, 2) over the edges that `final` kept, from the graph's own poses to `final`.
+
+    Each point is a solution of its own with that limit, at Fibonacci numbers of iterations or sweeps, so that it takes
+    about two and a half times as long again. Back-ends whose work is no single sequence have only the two ends.
+
+    Args:
+        graph: what was solved.
+        name, config: the back-end.
+        final: its solution.
+    """
+    kept = graph.with_edges(~np.isin(graph.edge_ids, final.report.rejected_edge_ids))
+    given = graph.with_edges(~np.isin(graph.edge_ids, final.report.inconsistent_edge_ids))
+    points = [(0.0, chi2(kept, graph.initial))]
+    limit, following = 1, 2
+    while limit < final.report.iterations and is_sequential(name):
+        solution = create(name, _limited(config, limit)).solve(given)
+        points.append((float(limit), chi2(kept, solution.poses)))
+        limit, following = following, limit + following
+    points.append((float(final.report.iterations), chi2(kept, final.poses)))
+    return np.array(points)
+
+
+def _limited(config: BackendsConfig, most: int) -> BackendsConfig:
+    """The settings with at most so many iterations, or sweeps; the pre-filter has done its work already."""
+    relaxation = config.relaxation.model_copy(update={"solve_sweeps": min(most, config.relaxation.solve_sweeps)})
+    limited = {"max_iterations": min(most, config.max_iterations), "relaxation": relaxation}
+    return config.model_copy(update={**limited, "consistency": ConsistencyConfig()})
 
 
 def _title(name: str, way: Way, ways: Sequence[Way]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 
 from hybridmap.backends.base import Backend, Solution
 from hybridmap.backends.registry import create
@@ -17,19 +18,35 @@ log = logging.getLogger(__name__)
 
 
 class Ensemble:
-    """Feeds every back-end the same graph, in the same order; one that fails is reported and keeps its last poses."""
+    """Feeds every back-end the same graph, in the same order; one that fails is reported and keeps its last poses.
 
-    def __init__(self, config: BackendsConfig, clock: StageClock) -> None:
-        """Create the back-ends of `config.names`; `clock` gets a stage `backend/<name>` for each.
+    Attributes:
+        names: of the back-ends, in order.
+        primary: name of the first.
+        solutions: latest of each, by name.
+        failures: why one failed the last time, by name.
+    """
+
+    def __init__(self, config: BackendsConfig, clock: StageClock, backends: Sequence[str | Backend] | None = None) -> None:
+        """Create the back-ends.
+
+        Args:
+            config: their settings, and their names.
+            clock: gets a stage `backend/<name>` for each.
+            backends: names, or back-ends in a fresh state, in place of those that `config` names.
 
         Raises:
-            BackendError: an unknown name.
+            BackendError: an unknown name, none at all, or one that is there twice.
         """
+        made = [create(backend, config) for backend in (config.names if backends is None else backends)]
         self.solutions: dict[str, Solution] = {}
         self.failures: dict[str, str] = {}
         self._clock = clock
-        self._backends: dict[str, Backend] = {name: create(name, config) for name in config.names}
-        self.primary = config.names[0]
+        self._backends: dict[str, Backend] = {backend.name: backend for backend in made}
+        if not made or len(self._backends) < len(made):
+            raise BackendError(f"back-ends: expected one or more, each once, found {[backend.name for backend in made]}")
+        self.names = tuple(self._backends)
+        self.primary = self.names[0]
 
     def poses(self, graph: PoseGraph, name: str | None = None) -> Array:
         """(N, 3) latest poses of a back-end (default: the primary), carried on to newer nodes by their consecutive edges."""

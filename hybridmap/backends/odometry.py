@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridmap.backends.base import SolveStatus
-from hybridmap.backends.following import Change, GraphBackend, Outcome
+from hybridmap.backends.base import Outcome, SolveStatus
+from hybridmap.backends.driver import Driver, Works
+from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
+
+
+def create(name: str, config: BackendsConfig) -> Driver:
+    """The back-end that believes odometry: what every other one is compared with."""
+    return Driver(name, config, _solve, works=Works.NEVER, place=dead_reckoning)
 
 
 def dead_reckoning(graph: PoseGraph, placed: Array) -> Array:
@@ -30,20 +36,5 @@ def dead_reckoning(graph: PoseGraph, placed: Array) -> Array:
     return poses
 
 
-class OdometryBackend(GraphBackend):
-    """Believes odometry: what every other back-end is compared with."""
-
-    def _extend(self, graph: PoseGraph, placed: Array) -> Array:
-        return dead_reckoning(graph, placed)
-
-    def _must_work(self, change: Change) -> bool:
-        del change
-        return False
-
-    def _extended(self, start: Array, waiting: int) -> Outcome:
-        del waiting  # for ever: it believes nothing else
-        return super()._extended(start, 0)
-
-    def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
-        del start
-        return Outcome(dead_reckoning(graph, graph.initial[:1]), SolveStatus.CONVERGED, "dead reckoning", 0)
+def _solve(graph: PoseGraph, start: Array) -> Outcome:
+    return Outcome(dead_reckoning(graph, start[:1]), SolveStatus.CONVERGED, "dead reckoning", 0)

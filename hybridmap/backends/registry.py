@@ -1,51 +1,90 @@
-"""The table of back-ends: name -> implementation, imported when it is made."""
+"""The back-ends by name: the one table that knows them all, and to which others may add."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
+from typing import Any
 
-from hybridmap.backends.base import Backend
+from hybridmap.backends.base import ODOMETRY, Backend
 from hybridmap.backends.judging.prefilter import ConsistentBackend
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
+from hybridmap.plugins import Table
 
-# name -> (module, class); every class is made as Class(name, config).
-_TABLE = {
-    "odometry": ("odometry", "OdometryBackend"),
-    "relaxation-paper": ("relaxation.linear", "PaperRelaxation"),
-    "relaxation-normalised": ("relaxation.linear", "NormalisedRelaxation"),
-    "relaxation-ratslam": ("relaxation.ratslam", "RatslamRelaxation"),
-    "relaxation-robust": ("relaxation.ratslam", "RobustRelaxation"),
-    "relaxation-gtsam-lm": ("relaxation.hybrid", "HybridRelaxation"),
-    "gtsam-lm": ("gtsam.batch", "BatchBackend"),
-    "gtsam-gn": ("gtsam.batch", "BatchBackend"),
-    "gtsam-dogleg": ("gtsam.batch", "BatchBackend"),
-    "gtsam-isam2": ("gtsam.incremental", "Isam2Backend"),
-    "gtsam-huber": ("gtsam.robust", "KernelBackend"),
-    "gtsam-cauchy": ("gtsam.robust", "KernelBackend"),
-    "gtsam-dcs": ("gtsam.robust", "KernelBackend"),
-    "gtsam-geman-mcclure": ("gtsam.robust", "KernelBackend"),
-    "gtsam-gnc": ("gtsam.gnc", "GncBackend"),
-    "gtsam-calibrated": ("gtsam.calibrated", "CalibratedBackend"),
-}
+Factory = Callable[[BackendsConfig], Backend]
+"""Makes a back-end, in a fresh state, from the settings of all back-ends."""
+
+LEAST_SQUARES, ROBUST, RELAXATION = "gtsam-lm", "gtsam-gnc", "relaxation-ratslam"
+"""Names of the back-ends that others stand on: plain least squares, the robust one, and relaxation."""
+
+_NOT_SEQUENTIAL = {ODOMETRY, "gtsam-isam2", "gtsam-gnc", "gtsam-calibrated"}
+
+
+def _ours(name: str, module: str, function: str = "create", **given: Any) -> tuple[str, Factory]:
+    """A row of the table, whose module is imported when the back-end is made."""
+
+    def make(config: BackendsConfig) -> Backend:
+        backend: Backend = getattr(import_module(f"hybridmap.backends.{module}"), function)(name, config, **given)
+        return backend
+
+    return name, make
+
+
+_OURS = dict(
+    (
+        _ours(ODOMETRY, "odometry"),
+        _ours("relaxation-paper", "relaxation.linear", "paper"),
+        _ours("relaxation-normalised", "relaxation.linear", "normalised"),
+        _ours("relaxation-ratslam", "relaxation.ratslam", "plain"),
+        _ours("relaxation-robust", "relaxation.ratslam", "robust"),
+        _ours("relaxation-gtsam-lm", "relaxation.ratslam", "then_least_squares"),
+        _ours("gtsam-lm", "gtsam.batch", method="lm"),
+        _ours("gtsam-gn", "gtsam.batch", method="gn"),
+        _ours("gtsam-dogleg", "gtsam.batch", method="dogleg"),
+        _ours("gtsam-isam2", "gtsam.incremental"),
+        _ours("gtsam-huber", "gtsam.robust", kernel="huber"),
+        _ours("gtsam-cauchy", "gtsam.robust", kernel="cauchy"),
+        _ours("gtsam-dcs", "gtsam.robust", kernel="dcs"),
+        _ours("gtsam-geman-mcclure", "gtsam.robust", kernel="geman-mcclure"),
+        _ours("gtsam-gnc", "gtsam.gnc"),
+        _ours("gtsam-calibrated", "gtsam.calibrated"),
+    )
+)
+_TABLE: Table[Factory] = Table("back-end", _OURS, "hybridmap.backends", BackendError)
 
 
 def names() -> tuple[str, ...]:
     """Every name that `create` takes."""
-    return tuple(_TABLE)
+    return _TABLE.names()
 
 
-def create(name: str, config: BackendsConfig | None = None) -> Backend:
-    """Make a back-end by its name, in a fresh state; with the pre-filter before it, where that is configured.
+def register(name: str, factory: Factory) -> None:
+    """Add a back-end, which every command then takes by its name; packages have entry points `hybridmap.backends`.
+
+    Raises:
+        BackendError: there is one of this name already.
+    """
+    _TABLE.register(name, factory)
+
+
+def create(backend: str | Backend, config: BackendsConfig | None = None) -> Backend:
+    """Make a back-end by its name, in a fresh state, with the pre-filter before it where that is configured.
+
+    One that is made already is given back as it is: it has its settings.
 
     Raises:
         BackendError: no such name; the message lists those there are.
     """
-    if name not in _TABLE:
-        raise BackendError(f"unknown back-end {name!r}; there are {', '.join(_TABLE)}")
-    module, class_name = _TABLE[name]
+    if not isinstance(backend, str):
+        return backend
     config = config or BackendsConfig()
-    backend: Backend = getattr(import_module(f"hybridmap.backends.{module}"), class_name)(name, config)
-    if config.consistency.enabled and name != "odometry":
-        return ConsistentBackend(backend, config)
-    return backend
+    made = _TABLE[backend](config)
+    if made.name != backend:
+        raise BackendError(f"back-end {backend!r}: calls itself {made.name!r}; expected the name that it is registered by")
+    return ConsistentBackend(made, config) if config.consistency.enabled and backend != ODOMETRY else made
+
+
+def is_sequential(name: str) -> bool:
+    """Whether a back-end's work on a whole graph is one row of iterations, or sweeps, on one objective."""
+    return name in _OURS and name not in _NOT_SEQUENTIAL

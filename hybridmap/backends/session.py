@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hybridmap.backends.base import Solution, SolveStatus
+from hybridmap.backends.base import Backend, Solution, SolveStatus
 from hybridmap.backends.gtsam.covariance import Covariances
-from hybridmap.backends.registry import create
+from hybridmap.backends.registry import LEAST_SQUARES, create
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError, GraphError
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, compose_relative, invert_relative
@@ -55,14 +56,14 @@ class GraphSession:
     session as it was, bit for bit.
     """
 
-    def __init__(self, backend: str = "gtsam-lm", config: BackendsConfig | None = None) -> None:
-        """An empty session.
+    def __init__(self, backend: str | Backend = LEAST_SQUARES, config: BackendsConfig | None = None) -> None:
+        """An empty session with a back-end by name, or one in a fresh state, of which copies are used.
 
         Raises:
             BackendError: no such back-end.
         """
-        self._name, self._config = backend, config
-        self._backend = create(backend, config)
+        self._given, self._config = backend, config
+        self._backend = self._fresh()
         self._state = Snapshot()
 
     def add_node(self, node: int, pose: ArrayLike | None = None) -> None:
@@ -145,7 +146,7 @@ class GraphSession:
         require_connected(graph)
         rows = {other: i for i, other in enumerate(other for other in state.rows if other != node)}
         self._state = replace(state, rows=rows, graph=graph, next_edge=state.next_edge + (mode == "bridge"))
-        self._backend = create(self._name, self._config)
+        self._backend = self._fresh()
 
     def fix(self, node: int) -> None:
         """Make another node the one that stays where it is.
@@ -210,7 +211,11 @@ class GraphSession:
     def restore(self, snapshot: Snapshot) -> None:
         """Return to a state: nodes, edges and poses are exactly what they were; the back-end starts from them."""
         self._state = snapshot
-        self._backend = create(self._name, self._config)
+        self._backend = self._fresh()
+
+    def _fresh(self) -> Backend:
+        """The back-end as if it had seen nothing."""
+        return create(self._given, self._config) if isinstance(self._given, str) else deepcopy(self._given)
 
     def _adopt(self, solution: Solution) -> Solution:
         """Bring the fixed node back to where it is, and keep the poses."""

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from hybridmap import backends
 from hybridmap.backends.gtsam.factors import NoiseModels, anchor, factors, poses_of
+from hybridmap.backends.registry import RELAXATION
 from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.gains import NEUTRAL, Gains
 from hybridmap.calibration.legs import Motion
@@ -142,7 +143,7 @@ class _Problem:
         deltas[self.own] = legs.predict(start)
         graph = chain(replace(self.graph, deltas=deltas))
         poses = graph.initial
-        for solution in backends.replay(backends.create("relaxation-ratslam", self.config), graph):
+        for solution in backends.replay(backends.create(RELAXATION, self.config), graph):
             poses = solution.poses
         return poses
 
@@ -231,7 +232,7 @@ class _Problem:
 
     def _factors(self) -> Any:
         loops = gtsam.noiseModel.mEstimator.Cauchy.Create(self.config.robust.cauchy_scale)
-        models = NoiseModels(lambda base: gtsam.noiseModel.Robust.Create(loops, base))
+        models = NoiseModels(loops)
         out = gtsam.NonlinearFactorGraph()
         for factor in factors(self.graph.with_edges(self._others()), models):
             out.push_back(factor)

@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from hybridmap.backends.base import ODOMETRY
 from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.gains import GAIN_KEYS, Gains, remove
 from hybridmap.calibration.legs import Legs, Motion
@@ -252,11 +253,11 @@ def _regress_on(drives: Sequence[Drive], poses: Sequence[Array], leg_m: float | 
 
 
 def _optimise(drive: Drive, estimate: Estimate) -> Array:
-    from hybridmap import backends
+    from hybridmap.backends.registry import ROBUST, create
 
     graph = corrected(drive, estimate.kept(Gains.of(drive.config.neural)), estimate.delay_s)
     name = drive.config.backends.names[0]
-    solver = backends.create("gtsam-gnc" if name == "odometry" else name, drive.config.backends)
+    solver = create(ROBUST if name == ODOMETRY else name, drive.config.backends)
     return solver.solve(graph).poses
 
 

@@ -10,12 +10,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.backends.base import Solution, SolveStatus
+from hybridmap.backends.base import ODOMETRY, Solution, SolveStatus
+from hybridmap.backends.driver import replay
 from hybridmap.backends.gtsam.initial import angular_start
 from hybridmap.backends.objective import chi2
 from hybridmap.backends.odometry import dead_reckoning
 from hybridmap.backends.registry import create
-from hybridmap.backends.replay import replay
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError, HybridMapError
 from hybridmap.geometry import Array, align, between, compose
@@ -213,7 +213,7 @@ def _fates(graph: PoseGraph, solution: Solution) -> tuple[NDArray[np.bool_], NDA
     A kernel may do neither: it weighs an edge down by more than a half long before its residual is beyond the gate.
     """
     report = solution.report
-    if report.backend == "odometry":
+    if report.backend == ODOMETRY:
         return ~graph.is_loop, graph.is_loop
     rejected = np.isin(graph.edge_ids, np.array(report.rejected_edge_ids, dtype=np.int64))
     weights = np.array([report.weights.get(edge, 1.0) for edge in graph.edge_ids.tolist()])

@@ -12,20 +12,19 @@ from typing import Any
 import numpy as np
 
 from hybridmap.backends.base import SolveStatus
-from hybridmap.backends.following import prefix
-from hybridmap.backends.registry import create
+from hybridmap.backends.registry import LEAST_SQUARES, create
 from hybridmap.config import Config
 from hybridmap.errors import HybridMapError, StudyError
 from hybridmap.geometry import Array, between, compose, exp
 from hybridmap.graph.connectivity import chain
 from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.growth import prefix
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.study import provenance
 from hybridmap.study.model import SettingConfig, SourceConfig, SyntheticConfig
 from hybridmap.trajectory import Trajectory
 
-_REFEREE = "gtsam-lm"
 _ARRAYS = tuple(field.name for field in fields(PoseGraph) if field.name != "file")
 
 
@@ -235,7 +234,7 @@ def _with_reference(frozen: Frozen) -> Frozen:
     """Where no truth is known: the optimum of the clean graph, if there is one to be found."""
     if frozen.of_truth or frozen.graph is None:
         return frozen
-    solution = create(_REFEREE).solve(frozen.graph)
+    solution = create(LEAST_SQUARES).solve(frozen.graph)
     found = solution.report.status in (SolveStatus.CONVERGED, SolveStatus.MAX_ITERATIONS)
     return replace(frozen, reference=solution.poses) if found else frozen
 

@@ -9,13 +9,13 @@ from scipy.stats import chi2 as chi2_law
 
 from hybridmap import backends
 from hybridmap.backends.base import Solution, SolveReport, SolveStatus
-from hybridmap.backends.following import prefix
 from hybridmap.backends.judging import prefilter
 from hybridmap.backends.judging.clusters import loops_of
 from hybridmap.backends.judging.consistency import Consistent, consistent_loops
 from hybridmap.config.backends import BackendsConfig, ConsistencyConfig
 from hybridmap.geometry import adjoint, align, inverse, transform_points
 from hybridmap.graph.agreement import ring
+from hybridmap.graph.growth import prefix
 from hybridmap.graph.uncertainty import chain_of
 from hybridmap.store.codec import report_from_json, report_to_json
 from hybridmap.study.false_loops import inject

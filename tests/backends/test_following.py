@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from hybridmap import backends
 from hybridmap.backends.base import SolveStatus
-from hybridmap.backends.following import difference, prefix
 from hybridmap.backends.objective import chi2
 from hybridmap.config.backends import BackendsConfig, Isam2Config
 from hybridmap.errors import BackendError, GraphError
 from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.growth import difference, prefix
 
 FOLLOWERS = ["gtsam-lm", "gtsam-cauchy", "gtsam-gnc", "gtsam-isam2", "relaxation-ratslam", "odometry"]
 

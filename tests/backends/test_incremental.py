@@ -7,13 +7,13 @@ import pytest
 from graphs_for_tests import laps
 
 from hybridmap import backends
-from hybridmap.backends.following import prefix
 from hybridmap.backends.gtsam.covariance import Covariances
 from hybridmap.backends.gtsam.factors import NoiseModels, poses_of
-from hybridmap.backends.gtsam.incremental import Isam2Backend, Smoother
+from hybridmap.backends.gtsam.incremental import Smoother, create
 from hybridmap.config.backends import BackendsConfig, Isam2Config
 from hybridmap.errors import BackendError
 from hybridmap.geometry import between, log
+from hybridmap.graph.growth import prefix
 from hybridmap.graph.io import read_graph
 from hybridmap.study.false_loops import inject
 
@@ -26,7 +26,7 @@ def modest(seed, nodes=90):
 
 def patient(patience, linearise=0.01):
     isam2 = Isam2Config(patience=patience, relinearize_rad=linearise, relinearize_m=10.0 * linearise)
-    return Isam2Backend("gtsam-isam2", BackendsConfig(isam2=isam2))
+    return create("gtsam-isam2", BackendsConfig(isam2=isam2))
 
 
 def grown(backend, graph):

@@ -9,7 +9,7 @@ from graphs_for_tests import laps
 
 from hybridmap import backends
 from hybridmap.backends.gtsam import gnc
-from hybridmap.backends.gtsam.gnc import GncBackend, Truncated
+from hybridmap.backends.gtsam.gnc import Truncated
 from hybridmap.backends.objective import gate_of
 from hybridmap.config.backends import BackendsConfig, GncConfig
 from hybridmap.errors import GraphError
@@ -81,9 +81,9 @@ def test_what_begins_at_the_map_of_the_drive_is_held_against_another_result(dist
         "drive": Truncated(bent if wrong else clean, lone, 1, bound),
         "other": Truncated(clean if wrong else bent, lone, 1, bound),
     }
-    backend = GncBackend("gtsam-gnc", BackendsConfig())
+    backend = backends.create("gtsam-gnc")
     monkeypatch.setattr(gnc, "on_probation", lambda _graph, result, _config: result)
-    monkeypatch.setattr(backend, "_attempts", lambda *_: {name: partial(starts.get, name) for name in starts})
+    monkeypatch.setattr(gnc, "attempts", lambda *_: {name: partial(starts.get, name) for name in starts})
     final = backend.finish(graph)
     assert np.array_equal(final.poses, clean)
     assert f"start: {'other' if wrong else 'drive'}" in final.report.message

@@ -84,7 +84,7 @@ def test_a_back_end_that_fails_is_a_row_that_says_so(monkeypatch, capsys, square
     def fail(*_):
         raise BackendError("odometry: had a bad day")
 
-    monkeypatch.setattr(odometry.OdometryBackend, "_optimise", fail)
+    monkeypatch.setattr(odometry, "dead_reckoning", fail)
     words = ("compare", square, "--backends", "odometry,gtsam-lm")
     code, printed, _ = run(monkeypatch, capsys, *words, "--json")
     told = json.loads(printed)

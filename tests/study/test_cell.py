@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hybridmap.backends.base import SolveStatus
+from hybridmap.backends.base import Outcome, SolveStatus
 from hybridmap.backends.gtsam import batch
 from hybridmap.errors import BackendError
 from hybridmap.geometry import between, compose
@@ -64,16 +64,17 @@ def test_a_typed_error_and_divergence_are_results_without_a_map(frozen, monkeypa
     def fail(*_):
         raise BackendError("gtsam-lm: had a\nbad day")
 
-    monkeypatch.setattr(batch.BatchBackend, "_solve_whole", fail)
+    monkeypatch.setattr(batch, "best_start", fail)
     found = figures_of(frozen, backends=["gtsam-lm"])["gtsam-lm", "random"]
     assert (found.status, found.message) == ("failed", "gtsam-lm: had a bad day")
     assert "ate_m" not in found.figures
     assert found.figures["false_loops"] == 10
 
-    def diverge(_, graph):
-        return batch.Outcome(graph.initial, SolveStatus.DIVERGED, "away", 1)
+    def diverge(_method, _factors, start, _max_iterations):
+        return Outcome(start, SolveStatus.DIVERGED, "away", 1)
 
-    monkeypatch.setattr(batch.BatchBackend, "_solve_whole", diverge)
+    monkeypatch.setattr(batch, "best_start", lambda _, start: start)
+    monkeypatch.setattr(batch, "run", diverge)
     found = figures_of(frozen, backends=["gtsam-lm"])["gtsam-lm", ""]
     assert (found.status, found.message) == ("diverged", "away")
     assert not {"ate_m", "chi2", "own_lost"} & set(found.figures)

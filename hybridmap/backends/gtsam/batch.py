@@ -9,12 +9,13 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from hybridmap.backends.base import SolveStatus
-from hybridmap.backends.following import Change, GraphBackend, Outcome, difference
+from hybridmap.backends.base import Outcome, SolveStatus
+from hybridmap.backends.driver import Driver
 from hybridmap.backends.gtsam.factors import NoiseModels, anchor, collected, factor_graph, factors, poses_of, values
 from hybridmap.backends.gtsam.initial import best_start
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
+from hybridmap.graph.growth import difference
 from hybridmap.graph.pose_graph import PoseGraph
 
 _MAKE: dict[str, tuple[Callable[[], Any], Callable[..., Any]]] = {
@@ -26,6 +27,17 @@ _MAKE: dict[str, tuple[Callable[[], Any], Callable[..., Any]]] = {
 
 _ON_THE_WAY = 1e-3  # relative tolerance while the graph grows: the next closure comes soon
 _STUCK = 1e4  # Levenberg-Marquardt's lambda where it gave up rather than arrived
+
+
+def create(name: str, config: BackendsConfig, method: str) -> Driver:
+    """A back-end of least squares: `lm` (with a start of its own and Dogleg to fall back on), `gn` or `dogleg`."""
+
+    def solve(graph: PoseGraph, initial: Array) -> Outcome:
+        start = best_start(graph, initial)
+        outcome = run(method, factor_graph(graph, NoiseModels()), start, config.max_iterations)
+        return outcome if start is initial else replace(outcome, message=f"{outcome.message} (start: rotation averaging)")
+
+    return Driver(name, config, solve, follow=WarmStart(method, NoiseModels(), config.max_iterations), most_rise=1e-9)
 
 
 def run(
@@ -91,15 +103,15 @@ def _attempt(method: str, graph: Any, start: Array, initial: Any, max_iterations
 
 
 class WarmStart:
-    """Factors and poses kept from one update to the next, so that only what is new is converted."""
+    """A solver that keeps factors and poses from one update to the next, so that only what is new is converted."""
 
-    def __init__(self, models: NoiseModels) -> None:
-        self._models = models
+    def __init__(self, method: str, models: NoiseModels, max_iterations: int) -> None:
+        self._method, self._models, self._max_iterations = method, models, max_iterations
         self._graph: PoseGraph | None = None
         self._factors: dict[int, Any] = {}
         self._values: Any = None
 
-    def __call__(self, method: str, graph: PoseGraph, start: Array, max_iterations: int) -> Outcome:
+    def __call__(self, graph: PoseGraph, start: Array) -> Outcome:
         """One optimiser run; where the graph was seen before, `start` (N, 3) must carry on from the last outcome."""
         added = difference(self._graph, graph).added
         known = self._graph.n_nodes if self._graph is not None else 0
@@ -109,29 +121,6 @@ class WarmStart:
         if self._values is not None:
             initial.insert(self._values)
         whole = collected([*(self._factors[edge] for edge in graph.edge_ids.tolist()), anchor(graph.initial[0])])
-        outcome = run(method, whole, start, max_iterations, initial=initial, tolerance=_ON_THE_WAY)
+        outcome = run(self._method, whole, start, self._max_iterations, initial=initial, tolerance=_ON_THE_WAY)
         self._graph, self._values = graph, initial if outcome.values is None else outcome.values
         return outcome
-
-
-class BatchBackend(GraphBackend):
-    """`gtsam-lm` (with a start of its own and Dogleg to fall back on), `gtsam-gn`, `gtsam-dogleg`."""
-
-    _rise = 1e-9
-
-    def __init__(self, name: str, config: BackendsConfig) -> None:
-        super().__init__(name, config)
-        self._warm = WarmStart(NoiseModels())
-
-    def _follow(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
-        del change
-        return self._warm(self._name.removeprefix("gtsam-"), graph, start, self._config.max_iterations)
-
-    def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
-        method = self._name.removeprefix("gtsam-")
-        return run(method, factor_graph(graph, NoiseModels()), start, self._config.max_iterations)
-
-    def _solve_whole(self, graph: PoseGraph) -> Outcome:
-        start = best_start(graph)
-        outcome = self._optimise(graph, start)
-        return outcome if start is graph.initial else replace(outcome, message=f"{outcome.message} (start: rotation averaging)")

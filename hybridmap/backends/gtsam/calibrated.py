@@ -1,4 +1,4 @@
-"""`gtsam-calibrated`: gain, turn gain and heading bias of the odometry are variables of the graph.
+"""Gain, turn gain and heading bias of the odometry are variables of the graph.
 
 Wheels that bend every metre by the same amount are no outlier: no kernel takes that out, and true loops that contradict
 the bent chain are thrown out instead. As a variable of the graph the bias straightens the whole chain. A wrong winding of the
@@ -13,15 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.backends.following import Outcome
+from hybridmap.backends.base import Outcome
+from hybridmap.backends.driver import Driver
+from hybridmap.backends.gtsam import gnc
 from hybridmap.backends.gtsam.batch import run
 from hybridmap.backends.gtsam.covariance import Covariances
-from hybridmap.backends.gtsam.factors import factor_graph
-from hybridmap.backends.gtsam.gnc import GncBackend
-from hybridmap.backends.gtsam.kernels import noise_models
+from hybridmap.backends.gtsam.factors import factor_graph, noise_models
 from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.judging.weak import softened, truncated_cost
 from hybridmap.backends.objective import gate_of, residuals
+from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array, adjoint, between, exp, log
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
@@ -58,51 +59,58 @@ def with_gains(deltas: Array, gains: Array) -> Array:
     return exp(np.column_stack([gains[0] * twist[:, :2], turn]))
 
 
-class CalibratedBackend(GncBackend):
-    """While driving as `gtsam-gnc`; on a whole graph with the calibration as one more variable."""
+def create(name: str, config: BackendsConfig) -> Driver:
+    """While driving as graduated non-convexity; on a whole graph with the calibration as one more variable."""
+    return gnc.create(name, config, best)
 
-    def _best(self, graph: PoseGraph, driven: Array | None) -> Outcome:
-        found: list[_Found] = []
-        for bias in BIAS_STARTS_RAD_M:
-            one = self._from(graph, np.array([1.0, 1.0, bias]), driven if bias == 0.0 else None)
-            agrees = any(np.abs(one.gains - other.gains).max() < _SAME for other in found)
-            found.append(one)
-            if agrees and not rejected_clusters(one.graph, one.outcome.poses, one.outcome.rejected, gate_of(self._config)):
-                break
-        best = min(found, key=lambda each: each.cost)
-        gain, turn_gain, bias = best.gains
-        message = f"gain {gain:.4f}, turn gain {turn_gain:.4f}, heading bias {bias:.5f} rad/m from {len(found)} starts"
-        return replace(best.outcome, message=f"{message}; {best.outcome.message}", calibrated=best.graph)
 
-    def _from(self, graph: PoseGraph, gains: Array, driven: Array | None) -> _Found:
-        """Choose loops and calibrate in turn until neither changes."""
-        own = _own_edges(graph)
+def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outcome:
+    """The solution of the lowest truncated cost from several heading biases, until two agree and leave no loops in doubt."""
+    found: list[_Found] = []
+    for bias in BIAS_STARTS_RAD_M:
+        one = _from(graph, config, np.array([1.0, 1.0, bias]), driven if bias == 0.0 else None)
+        agrees = any(np.abs(one.gains - other.gains).max() < _SAME for other in found)
+        found.append(one)
+        if agrees and not rejected_clusters(one.graph, one.outcome.poses, one.outcome.rejected, gate_of(config)):
+            break
+    chosen = min(found, key=lambda each: each.cost)
+    gain, turn_gain, bias = chosen.gains
+    message = f"gain {gain:.4f}, turn gain {turn_gain:.4f}, heading bias {bias:.5f} rad/m from {len(found)} starts"
+    return replace(chosen.outcome, message=f"{message}; {chosen.outcome.message}", calibrated=chosen.graph)
+
+
+def _from(graph: PoseGraph, config: BackendsConfig, gains: Array, driven: Array | None) -> _Found:
+    """Choose loops and calibrate in turn until neither changes."""
+    own = _own_edges(graph)
+    straight = _calibrated(graph, own, gains)
+    outcome = gnc.best(straight, config, driven)
+    for _ in range(3):
+        before = outcome.rejected
+        gains, poses = _calibrate(graph, own, gains, outcome, config)
         straight = _calibrated(graph, own, gains)
-        outcome = super()._best(straight, driven)
-        for _ in range(3):
-            before = outcome.rejected
-            gains, poses = self._calibrate(graph, own, gains, outcome)
-            straight = _calibrated(graph, own, gains)
-            outcome = super()._best(straight, poses)
-            if outcome.rejected == before:
-                break
-        cost = truncated_cost(straight, outcome.poses, gate_of(self._config), self._config.robust)
-        return _Found(straight, outcome, gains, cost)
+        outcome = gnc.best(straight, config, poses)
+        if outcome.rejected == before:
+            break
+    cost = truncated_cost(straight, outcome.poses, gate_of(config), config.robust)
+    return _Found(straight, outcome, gains, cost)
 
-    def _calibrate(self, graph: PoseGraph, own: NDArray[np.int64], gains: Array, outcome: Outcome) -> tuple[Array, Array]:
-        """Gauss-Newton on the three numbers, each time with the poses that are best for them; both."""
-        kept, models = ~np.isin(graph.edge_ids, outcome.rejected), noise_models(self._config.robust)
-        poses = outcome.poses
-        for _ in range(_ROUNDS):
-            straight = _calibrated(graph, own, gains).with_edges(kept)
-            poses = run("lm", factor_graph(straight, models), poses, self._config.max_iterations).poses
-            step = _gain_step(graph.with_edges(kept), softened(straight, poses, self._config.robust), poses, gains)
-            if not np.isfinite(step).all():
-                break
-            gains = gains + step
-            if np.abs(step).max() < _SETTLED:
-                break
-        return gains, poses
+
+def _calibrate(
+    graph: PoseGraph, own: NDArray[np.int64], gains: Array, outcome: Outcome, config: BackendsConfig
+) -> tuple[Array, Array]:
+    """Gauss-Newton on the three numbers, each time with the poses that are best for them; both."""
+    kept, models = ~np.isin(graph.edge_ids, outcome.rejected), noise_models(config.robust)
+    poses = outcome.poses
+    for _ in range(_ROUNDS):
+        straight = _calibrated(graph, own, gains).with_edges(kept)
+        poses = run("lm", factor_graph(straight, models), poses, config.max_iterations).poses
+        step = _gain_step(graph.with_edges(kept), softened(straight, poses, config.robust), poses, gains)
+        if not np.isfinite(step).all():
+            break
+        gains = gains + step
+        if np.abs(step).max() < _SETTLED:
+            break
+    return gains, poses
 
 
 def _own_edges(graph: PoseGraph) -> NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""Graphs and poses in GTSAM's terms, and back."""
+"""Graphs, robust kernels and poses in GTSAM's terms, and back."""
 
 from __future__ import annotations
 
@@ -8,18 +8,30 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from hybridmap.config.backends import RobustConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
 
 _PRIOR_SIGMA = 1e-3  # zero residual at the optimum: fixes the frame without touching chi2
 
-Wrap = Callable[[Any], Any]
+_LOOP: dict[str, Callable[[RobustConfig], Any]] = {
+    "cauchy": lambda c: gtsam.noiseModel.mEstimator.Cauchy.Create(c.cauchy_scale),
+    "huber": lambda c: gtsam.noiseModel.mEstimator.Huber.Create(c.huber_scale),
+    "dcs": lambda c: gtsam.noiseModel.mEstimator.DCS.Create(c.dcs_phi),
+    "geman-mcclure": lambda c: gtsam.noiseModel.mEstimator.GemanMcClure.Create(c.geman_mcclure_scale),
+}
+
+_MOTION: dict[str, Any] = {
+    "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
+    "huber": gtsam.noiseModel.mEstimator.Huber,
+    "geman-mcclure": gtsam.noiseModel.mEstimator.GemanMcClure,
+}
 
 
 class NoiseModels:
-    """Noise models shared between edges of equal information; `loop` and `motion` wrap kernels round those of their edges."""
+    """Noise models shared between edges of equal information, with robust kernels on loops and on edges of motion."""
 
-    def __init__(self, loop: Wrap | None = None, motion: Wrap | None = None) -> None:
+    def __init__(self, loop: Any = None, motion: Any = None) -> None:
         """With a kernel for loops and one for edges of motion (`PoseGraph.is_motion`); None: quadratic."""
         self._plain: dict[bytes, Any] = {}
         self._robust: dict[tuple[bytes, bool], Any] = {}
@@ -40,13 +52,24 @@ class NoiseModels:
         model = self._plain.get(key)
         if model is None:
             model = self._plain[key] = gtsam.noiseModel.Gaussian.Information(information)
-        wrap = self._loop if loop else self._motion if motion else None
-        if wrap is None:
+        kernel = self._loop if loop else self._motion if motion else None
+        if kernel is None:
             return model
         robust = self._robust.get((key, loop))
         if robust is None:
-            robust = self._robust[key, loop] = wrap(model)
+            robust = self._robust[key, loop] = gtsam.noiseModel.Robust.Create(kernel, model)
         return robust
+
+
+def loop_kernel(name: str, config: RobustConfig) -> Any:
+    """A kernel for loops by its name."""
+    return _LOOP[name](config)
+
+
+def noise_models(config: RobustConfig, loop: Any = None) -> NoiseModels:
+    """Noise models with a kernel on loops (None: quadratic) and the configured one on edges of motion."""
+    motion = None if config.odometry == "none" else _MOTION[config.odometry].Create(config.odometry_scale)
+    return NoiseModels(loop, motion)
 
 
 def factors(graph: PoseGraph, models: NoiseModels) -> list[Any]:

@@ -14,13 +14,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.backends.base import Solution, SolveStatus
-from hybridmap.backends.following import Change, GraphBackend, Outcome, prefix
+from hybridmap.backends.base import Outcome, SolveStatus
+from hybridmap.backends.driver import Driver
 from hybridmap.backends.gtsam.batch import run
 from hybridmap.backends.gtsam.covariance import expected_loops
-from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph, factors, poses_of, values
+from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph, factors, noise_models, poses_of, values
 from hybridmap.backends.gtsam.initial import best_start, trusted_start
-from hybridmap.backends.gtsam.kernels import noise_models
 from hybridmap.backends.gtsam.robust import WarmKernel, with_kernel
 from hybridmap.backends.judging.clusters import neighbouring_pairs, rejected_clusters
 from hybridmap.backends.judging.weak import softened, truncated_cost, weak_edges
@@ -28,6 +27,7 @@ from hybridmap.backends.objective import SLACK, gate_of, squared_norms, unit_var
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.connectivity import extend
+from hybridmap.graph.growth import prefix
 from hybridmap.graph.pose_graph import PoseGraph
 
 _STEP = 0.5  # of a quantised weight's logarithm to the base 2
@@ -35,6 +35,9 @@ _PATIENT, _NEAR_FIRST = 1e-4, 3e-2  # least weight of a loop that takes part in 
 _ROUGHLY = 10.0  # of the bound, before the first iteration
 _QUICK = (2, 12)  # iterations before each look: where loops agree few are needed, where they do not they are of no use
 _MOSTLY, _ALMOST_ALL = 0.9, 0.97  # share of loops that least squares must agree with, on the way and in the end
+
+Whole = Callable[[PoseGraph, BackendsConfig, Array | None], Outcome]
+"""Solves a whole graph; the poses (N, 3), if given, are those that a drive led to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +128,7 @@ def graduate(graph: PoseGraph, start: Array, config: BackendsConfig, negligible:
 def trusting(graph: PoseGraph, config: BackendsConfig) -> Truncated | None:
     """Least squares with all loops, then the loops within the gate; None where too many are beyond it."""
     bound = gate_of(config)
-    poses, rounds = best_start(graph), 0
+    poses, rounds = best_start(graph, graph.initial), 0
     if _share(squared_norms(graph, poses)[graph.is_loop] <= _ROUGHLY * bound) < _MOSTLY:
         return None
     whole = factor_graph(graph, NoiseModels())
@@ -182,7 +185,7 @@ def on_probation(graph: PoseGraph, result: Truncated, config: BackendsConfig) ->
 def _from_kernels(graph: PoseGraph, config: BackendsConfig) -> Truncated:
     """Settle from the map that Cauchy's kernel on loops and the configured one on odometry lead to."""
     bound = gate_of(config)
-    outcome = with_kernel("gtsam-cauchy", graph, trusted_start(graph, bound), config)
+    outcome = with_kernel("cauchy", graph, trusted_start(graph, graph.initial, bound), config)
     settled = _settle(_Problem(graph, config), outcome.poses, bound, config.max_iterations)
     return replace(settled, rounds=outcome.iterations + settled.rounds)
 
@@ -228,95 +231,85 @@ def grow(graph: PoseGraph, config: BackendsConfig, negligible: float) -> Truncat
     return replace(last, rounds=rounds + last.rounds)
 
 
-class GncBackend(GraphBackend):
-    """`gtsam-gnc`: Cauchy on the loops while driving, graduated non-convexity on the whole graph at the end."""
+def create(name: str, config: BackendsConfig, whole: Whole | None = None) -> Driver:
+    """Cauchy on the loops while driving, graduated non-convexity (or what `whole` does) on the whole graph at the end."""
+    solve = whole or best
 
-    _softens = True
+    def anew(graph: PoseGraph, initial: Array) -> Outcome:
+        del initial  # every attempt has a start of its own
+        return solve(graph, config, None)
 
-    def __init__(self, name: str, config: BackendsConfig) -> None:
-        super().__init__(name, config)
-        self._warm = WarmKernel("gtsam-cauchy", config)
+    def onward(graph: PoseGraph, driven: Array) -> Outcome:
+        return solve(graph, config, driven)
 
-    def _follow(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
-        del change
-        return self._warm(graph, start)
+    return Driver(name, config, anew, follow=WarmKernel("cauchy", config), onward=onward, softens=True)
 
-    def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
-        return with_kernel("gtsam-cauchy", graph, start, self._config)
 
-    def finish(self, graph: PoseGraph) -> Solution:
-        """See `Backend.finish`: as `solve`, with the map at the end of the drive as one more start."""
-        driven = self.update(graph).poses
-        return self._timed(graph, lambda: self._best(graph, driven))
+def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outcome:
+    """Run the configured starts until one convinces; if none does, the lowest truncated cost wins.
 
-    def _solve_whole(self, graph: PoseGraph) -> Outcome:
-        return self._best(graph, None)
+    A result convinces where no rejected loops agree with each other, or where two different ways came to the same; with a
+    kernel on odometry, which false loops may tear, only where every loop fits without strain. The map of the drive (N, 3) may
+    be bent by loops that were false: what begins there and rejects some is held against the next result that convinces.
+    """
+    results: dict[str, Truncated] = {}
+    unconfirmed: dict[str, Truncated] = {}
+    tearable = config.robust.odometry != "none"
+    for name, attempt in attempts(graph, config, driven).items():
+        found = attempt()
+        if found is None:
+            continue
+        if not found.kept.all():
+            found = on_probation(graph, found, config)
+        agreed = name == "grown" and any(np.array_equal(found.kept, other.kept) for other in results.values())
+        if tearable:
+            convincing = found.kept.all() and unit_variance(graph, squared_norms(graph, found.poses)) <= SLACK
+        else:
+            convincing = agreed or not rejected_clusters(graph, found.poses, _rejected(graph, found), found.bound)
+        if convincing and name == "drive" and not found.kept.all():
+            unconfirmed[name] = found
+        elif convincing:
+            return _cheapest(graph, {**unconfirmed, name: found}, config)
+        results[name] = found
+    return _cheapest(graph, results, config)
 
-    def _best(self, graph: PoseGraph, driven: Array | None) -> Outcome:
-        """Run the configured starts until one convinces; if none does, the lowest truncated cost wins.
 
-        A result convinces where no rejected loops agree with each other, or where two different ways came to the same; with a
-        kernel on odometry, which false loops may tear, only where every loop fits without strain. The map of the drive may be
-        bent by loops that were false: what begins there and rejects some is held against the next result that convinces.
-        """
-        results: dict[str, Truncated] = {}
-        unconfirmed: dict[str, Truncated] = {}
-        tearable = self._config.robust.odometry != "none"
-        for name, attempt in self._attempts(graph, driven).items():
-            found = attempt()
-            if found is None:
-                continue
-            if not found.kept.all():
-                found = on_probation(graph, found, self._config)
-            agreed = name == "grown" and any(np.array_equal(found.kept, other.kept) for other in results.values())
-            if tearable:
-                convincing = found.kept.all() and unit_variance(graph, squared_norms(graph, found.poses)) <= SLACK
-            else:
-                convincing = agreed or not rejected_clusters(graph, found.poses, _rejected(graph, found), found.bound)
-            if convincing and name == "drive" and not found.kept.all():
-                unconfirmed[name] = found
-            elif convincing:
-                return self._cheapest(graph, {**unconfirmed, name: found})
-            results[name] = found
-        return self._cheapest(graph, results)
+def attempts(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> dict[str, Callable[[], Truncated | None]]:
+    """The configured ways to a result, by name, in the order in which they are tried."""
 
-    def _cheapest(self, graph: PoseGraph, results: dict[str, Truncated]) -> Outcome:
-        """The result of the lowest truncated cost, at the tightest bound that any of them ended with.
+    def whole(negligible: float) -> Truncated:
+        return graduate(graph, trusted_start(graph, graph.initial, gate_of(config)), config, negligible)
 
-        Files that overstate their noise would otherwise prefer a false loop that happens to be consistent.
-        """
-        bound = min(result.bound for result in results.values())
-        costs = {name: truncated_cost(graph, result.poses, bound, self._config.robust) for name, result in results.items()}
-        best = min(costs, key=costs.__getitem__)
-        return self._verdict(graph, results[best], best)
+    ways: dict[str, Callable[[], Truncated | None]] = {}
+    if config.gnc.start == "batch":
+        return {"batch": lambda: whole(_PATIENT)}
+    if config.gnc.start == "auto":
+        ways["least squares"] = lambda: trusting(graph, config)
+    if driven is not None:
+        ways["drive"] = lambda: graduate(graph, driven, config, _PATIENT)
+    if config.gnc.start == "auto":
+        ways["batch, near loops first"] = lambda: whole(_NEAR_FIRST)
+    ways["grown"] = lambda: grow(graph, config, _PATIENT)
+    if config.gnc.start == "auto":
+        ways["grown, near loops first"] = lambda: grow(graph, config, _NEAR_FIRST)
+    if config.gnc.start == "auto" and config.robust.odometry != "none":
+        ways["kernels"] = lambda: _from_kernels(graph, config)
+        ways["grown on stiff odometry"] = lambda: _softened_last(graph, config)
+    return ways
 
-    def _attempts(self, graph: PoseGraph, driven: Array | None) -> dict[str, Callable[[], Truncated | None]]:
-        config = self._config
 
-        def whole(negligible: float) -> Truncated:
-            return graduate(graph, trusted_start(graph, gate_of(config)), config, negligible)
+def _cheapest(graph: PoseGraph, results: dict[str, Truncated], config: BackendsConfig) -> Outcome:
+    """The result of the lowest truncated cost, at the tightest bound that any of them ended with.
 
-        attempts: dict[str, Callable[[], Truncated | None]] = {}
-        if config.gnc.start == "batch":
-            return {"batch": lambda: whole(_PATIENT)}
-        if config.gnc.start == "auto":
-            attempts["least squares"] = lambda: trusting(graph, config)
-        if driven is not None:
-            attempts["drive"] = lambda: graduate(graph, driven, config, _PATIENT)
-        if config.gnc.start == "auto":
-            attempts["batch, near loops first"] = lambda: whole(_NEAR_FIRST)
-        attempts["grown"] = lambda: grow(graph, config, _PATIENT)
-        if config.gnc.start == "auto":
-            attempts["grown, near loops first"] = lambda: grow(graph, config, _NEAR_FIRST)
-        if config.gnc.start == "auto" and config.robust.odometry != "none":
-            attempts["kernels"] = lambda: _from_kernels(graph, config)
-            attempts["grown on stiff odometry"] = lambda: _softened_last(graph, config)
-        return attempts
-
-    def _verdict(self, graph: PoseGraph, result: Truncated, start: str) -> Outcome:
-        loops = graph.edge_ids[graph.is_loop].tolist()
-        weights = dict(zip(loops, result.kept.astype(np.float64).tolist(), strict=True))
-        rejected = tuple(edge for edge, weight in weights.items() if weight == 0.0)
-        variance = _variance(graph, result, self._config)
-        message = f"gnc: {len(rejected)} of {len(loops)} loops rejected (start: {start}; unit variance {variance:.3g})"
-        return Outcome(result.poses, SolveStatus.CONVERGED, message, result.rounds, weights, rejected)
+    Files that overstate their noise would otherwise prefer a false loop that happens to be consistent.
+    """
+    bound = min(result.bound for result in results.values())
+    costs = {name: truncated_cost(graph, result.poses, bound, config.robust) for name, result in results.items()}
+    start = min(costs, key=costs.__getitem__)
+    result = results[start]
+    loops = graph.edge_ids[graph.is_loop].tolist()
+    weights = dict(zip(loops, result.kept.astype(np.float64).tolist(), strict=True))
+    rejected = tuple(edge for edge, weight in weights.items() if weight == 0.0)
+    variance = _variance(graph, result, config)
+    message = f"gnc: {len(rejected)} of {len(loops)} loops rejected (start: {start}; unit variance {variance:.3g})"
+    return Outcome(result.poses, SolveStatus.CONVERGED, message, result.rounds, weights, rejected)

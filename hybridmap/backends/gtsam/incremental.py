@@ -1,19 +1,20 @@
-"""`gtsam-isam2`: incremental smoothing; edges may go again, and after a failure the state before it is restored."""
+"""Incremental smoothing by ISAM2; edges may go again, and after a failure the state before it is restored."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from hybridmap.backends.base import Solution, SolveStatus
-from hybridmap.backends.following import Change, GraphBackend, Outcome, prefix
+from hybridmap.backends.base import Outcome, SolveStatus
+from hybridmap.backends.driver import Driver
+from hybridmap.backends.gtsam.factors import loop_kernel, noise_models
 from hybridmap.backends.gtsam.initial import angular_start
-from hybridmap.backends.gtsam.kernels import loop_kernel, noise_models
 from hybridmap.backends.gtsam.robust import judged
 from hybridmap.backends.gtsam.smoother import Smoother
 from hybridmap.backends.judging.weak import truncated_cost
 from hybridmap.backends.objective import gate_of, squared_norms, total
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
+from hybridmap.graph.growth import Change, prefix
 from hybridmap.graph.pose_graph import PoseGraph
 
 _RISE = 1e-3  # relative, of chi2: what the thresholds of linearisation leave open
@@ -21,8 +22,26 @@ _RISE = 1e-3  # relative, of chi2: what the thresholds of linearisation leave op
 _SETTLED = 1e-5  # relative decrease of the cost that no longer counts: the batch optimisers' tolerance
 
 
-class Isam2Backend(GraphBackend):
-    """Follows a growing graph; `solve` grows a frozen one from loop to loop.
+def create(name: str, config: BackendsConfig) -> Driver:
+    """A back-end that follows a growing graph; `solve` grows a frozen one from loop to loop."""
+    isam2 = Isam2(config)
+    most_rise = np.inf if isam2.is_robust else _RISE
+
+    def solve(graph: PoseGraph, initial: Array) -> Outcome:
+        del initial  # the chain is grown from node 0
+        drive = create(name, config)
+        *grown, _ = _closing_nodes(graph)
+        updates = sum(drive.update(prefix(graph, nodes)).report.iterations for nodes in grown)
+        end = drive.finish(graph)
+        report, updates = end.report, updates + end.report.iterations
+        message = f"isam2: {updates} updates"
+        return Outcome(end.poses, report.status, message, updates, report.weights, report.rejected_edge_ids)
+
+    return Driver(name, config, solve, follow=isam2.follow, last=isam2.conclude, most_rise=most_rise, softens=True)
+
+
+class Isam2:
+    """A solver that is told what is new, and one that ends the drive.
 
     Closures that agree with the map wait. Measurements with residuals r, added to a least-squares map, move to first order no
     pose by more than sqrt(sum of r' information r) of its standard deviations (Cauchy-Schwarz on the Kalman gain), and
@@ -30,21 +49,20 @@ class Isam2Backend(GraphBackend):
     patience.
     """
 
-    _softens = True
-
-    def __init__(self, name: str, config: BackendsConfig) -> None:
-        super().__init__(name, config)
+    def __init__(self, config: BackendsConfig) -> None:
+        self._config = config
         self._smoother: Smoother | None = None
-        self._kernel = loop_kernel("gtsam-cauchy", config.robust) if config.isam2.loop_kernel == "cauchy" else None
-        quadratic = self._kernel is None and config.robust.odometry == "none"
-        self._rise = _RISE if quadratic else np.inf
+        self._weights: dict[int, float] = {}
+        self._rejected: tuple[int, ...] = ()
+        self._kernel = loop_kernel("cauchy", config.robust) if config.isam2.loop_kernel == "cauchy" else None
 
-    def finish(self, graph: PoseGraph) -> Solution:
-        """See `Backend.finish`: goes on from where the drive ended, with every node linearised anew."""
-        return self._advance(graph, self._conclude)
+    @property
+    def is_robust(self) -> bool:
+        """Whether any edge has a kernel."""
+        return self._kernel is not None or self._config.robust.odometry != "none"
 
-    def _follow(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
-        del change
+    def follow(self, graph: PoseGraph, start: Array) -> Outcome:
+        """An update, which may let closures wait."""
         if self._smoother is not None:
             shift = _largest_shift(graph, self._smoother.lacks(graph), start)
             if shift <= self._config.isam2.patience:
@@ -52,22 +70,9 @@ class Isam2Backend(GraphBackend):
                 return Outcome(start, SolveStatus.CONVERGED, message, 0, self._weights, self._rejected)
         return self._kept(*self._brought_up(graph, start), graph)
 
-    def _conclude(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
-        """As `_follow`, with nothing waiting and everything polished."""
-        del change
+    def conclude(self, graph: PoseGraph, start: Array) -> Outcome:
+        """The last update: nothing waits, and every node is linearised anew."""
         return self._kept(*self._polished(*self._brought_up(graph, start), graph), graph)
-
-    def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
-        return self._outcome(*self._anew(graph, start), graph)
-
-    def _solve_whole(self, graph: PoseGraph) -> Outcome:
-        drive = Isam2Backend(self._name, self._config)
-        *grown, _ = _closing_nodes(graph)
-        updates = sum(drive.update(prefix(graph, nodes)).report.iterations for nodes in grown)
-        end = drive.finish(graph)
-        report, updates = end.report, updates + end.report.iterations
-        message = f"isam2: {updates} updates"
-        return Outcome(end.poses, report.status, message, updates, report.weights, report.rejected_edge_ids)
 
     def _brought_up(self, graph: PoseGraph, start: Array) -> tuple[Smoother, int]:
         """The smoother with what is new in the graph, and the updates done.
@@ -130,15 +135,12 @@ class Isam2Backend(GraphBackend):
 
     def _kept(self, smoother: Smoother, updates: int, graph: PoseGraph) -> Outcome:
         """The outcome; the smoother goes on from it if it is finite."""
-        outcome = self._outcome(smoother, updates, graph)
+        outcome = Outcome(smoother.poses(), SolveStatus.CONVERGED, f"isam2: {updates} updates", updates)
+        if self._kernel is not None:
+            outcome = judged(outcome, self._kernel, graph, gate_of(self._config))
         if np.isfinite(outcome.poses).all():
-            self._smoother = smoother
+            self._smoother, self._weights, self._rejected = smoother, outcome.weights, outcome.rejected
         return outcome
-
-    def _outcome(self, smoother: Smoother, updates: int, graph: PoseGraph) -> Outcome:
-        poses = smoother.poses()
-        outcome = Outcome(poses, SolveStatus.CONVERGED, f"isam2: {updates} updates", updates)
-        return outcome if self._kernel is None else judged(outcome, self._kernel, graph, gate_of(self._config))
 
 
 def _largest_shift(graph: PoseGraph, lacks: Change, start: Array) -> float:

@@ -17,26 +17,26 @@ from hybridmap.graph.pose_graph import PoseGraph
 _NEAR = 100.0  # mean squared Mahalanobis residual from which another start is looked for
 
 
-def best_start(graph: PoseGraph) -> Array:
-    """The angular start or the graph's own `initial`, whichever has the lower chi2; (N, 3).
+def best_start(graph: PoseGraph, given: Array) -> Array:
+    """The angular start or the one given (N, 3), whichever has the lower chi2; (N, 3).
 
-    Where `initial` fits the edges within some standard deviations already, it is taken without a look at the other: a
+    Where the one given fits the edges within some standard deviations already, it is taken without a look at the other: a
     chain of the wrong winding does not.
     """
-    own = chi2(graph, graph.initial)
+    own = chi2(graph, given)
     if own <= _NEAR * graph.n_edges:
-        return graph.initial
+        return given
     angular = angular_start(graph)
-    return graph.initial if angular is None or own <= chi2(graph, angular) else angular
+    return given if angular is None or own <= chi2(graph, angular) else angular
 
 
-def trusted_start(graph: PoseGraph, bound: float) -> Array:
-    """The graph's `initial` or the chain of its best consecutive edges, by chi2 with loops cut off at `bound`; (N, 3).
+def trusted_start(graph: PoseGraph, given: Array, bound: float) -> Array:
+    """The start given (N, 3) or the chain of the best consecutive edges, by chi2 with loops cut off at `bound`; (N, 3).
 
     For back-ends that must not trust loops. In a map `initial` is odometry alone, and registrations know better.
     """
     chained = extend(graph, graph.initial[:1])
-    return min((graph.initial, chained), key=lambda poses: truncated_cost(graph, poses, bound))
+    return min((given, chained), key=lambda poses: truncated_cost(graph, poses, bound))
 
 
 def angular_start(graph: PoseGraph) -> Array | None:

@@ -8,10 +8,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.backends.following import Change, difference
 from hybridmap.backends.gtsam.factors import NoiseModels, anchor, collected, factors, poses_of, values
 from hybridmap.config.backends import Isam2Config
 from hybridmap.geometry import Array, compose, exp
+from hybridmap.graph.growth import Change, difference
 from hybridmap.graph.pose_graph import PoseGraph
 
 _EACH_NODE = chr(0)  # GTSAM's letter of a key that is a plain number

@@ -7,22 +7,26 @@ Divided by the degree it is stable for every theta <= 1, as no eigenvalue of D^-
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import eigsh
 
-from hybridmap.backends.base import SolveStatus
-from hybridmap.backends.following import Outcome
-from hybridmap.backends.relaxation.relaxing import RelaxationBackend
-from hybridmap.config.backends import RelaxationConfig
+from hybridmap.backends.base import Outcome, SolveStatus
+from hybridmap.backends.driver import Driver
+from hybridmap.backends.relaxation.relaxing import relaxing
+from hybridmap.config.backends import BackendsConfig, RelaxationConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
 
 _CHECK_EVERY = 50  # sweeps between two looks at the objective
+
+Rate = tuple[float | Array | None, str]
+"""The rate of each node, or None to refuse; and a word about it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,45 +96,48 @@ def relax(rule: LinearRule, positions: Array, rate: float | Array, sweeps: int, 
     return positions, sweeps
 
 
-class _WorldFrameRelaxation(RelaxationBackend):
-    """Sweeps over positions alone; a subclass says at which rate."""
+def paper(name: str, config: BackendsConfig) -> Driver:
+    """Equation 16 as printed; what happens beyond theta_max is configured."""
 
-    def _relax(self, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
-        config = self._config.relaxation
-        rule = LinearRule.of(graph)
-        rate, note = self._rate(rule, config)
-        if rate is None:
-            return Outcome(start, SolveStatus.DIVERGED, f"{note}; not run", 0)
-        positions, done = relax(rule, start[:, :2], rate, sweeps, config.tolerance_m)
-        if positions is None:
-            return Outcome(start, SolveStatus.DIVERGED, f"{note}; diverged within {done} sweeps, kept the start", done)
-        poses = np.column_stack([positions, graph.initial[:, 2]])
-        status = SolveStatus.CONVERGED if done < sweeps else SolveStatus.MAX_ITERATIONS
-        return Outcome(poses, status, f"{note}; {done} sweeps", done)
-
-    @abstractmethod
-    def _rate(self, rule: LinearRule, config: RelaxationConfig) -> tuple[float | Array | None, str]:
-        """The rate of each node, or None to refuse; and a word about it."""
-
-
-class NormalisedRelaxation(_WorldFrameRelaxation):
-    """`relaxation-normalised`: theta divided by the node's degree; never raises its objective."""
-
-    def _rate(self, rule: LinearRule, config: RelaxationConfig) -> tuple[float | Array | None, str]:
-        return _normalised(rule, config), f"theta {config.theta} / degree"
-
-
-class PaperRelaxation(_WorldFrameRelaxation):
-    """`relaxation-paper`: equation 16 as printed; what happens beyond theta_max is configured."""
-
-    def _rate(self, rule: LinearRule, config: RelaxationConfig) -> tuple[float | Array | None, str]:
+    def rate(rule: LinearRule, config: RelaxationConfig) -> Rate:
         largest = lambda_max(rule.laplacian)
         theta_max = 2.0 / largest if largest > 0.0 else np.inf
         note = f"theta {config.theta}, theta_max {theta_max:.4g} = 2/lambda_max, lambda_max {largest:.4g}"
         if config.theta < theta_max or config.on_unstable == "run":
             return config.theta, note
-        return (_normalised(rule, config), f"{note}, normalised") if config.on_unstable == "normalise" else (None, note)
+        return (_by_degree(rule, config), f"{note}, normalised") if config.on_unstable == "normalise" else (None, note)
+
+    return relaxing(name, config, partial(_relaxed, config.relaxation, rate))
 
 
-def _normalised(rule: LinearRule, config: RelaxationConfig) -> Array:
+def normalised(name: str, config: BackendsConfig) -> Driver:
+    """Theta divided by the node's degree; never raises its objective."""
+
+    def rate(rule: LinearRule, config: RelaxationConfig) -> Rate:
+        return _by_degree(rule, config), f"theta {config.theta} / degree"
+
+    return relaxing(name, config, partial(_relaxed, config.relaxation, rate))
+
+
+def _relaxed(
+    config: RelaxationConfig,
+    rate_of: Callable[[LinearRule, RelaxationConfig], Rate],
+    graph: PoseGraph,
+    start: Array,
+    sweeps: int,
+) -> Outcome:
+    """Sweeps over positions alone, each node at its rate."""
+    rule = LinearRule.of(graph)
+    rate, note = rate_of(rule, config)
+    if rate is None:
+        return Outcome(start, SolveStatus.DIVERGED, f"{note}; not run", 0)
+    positions, done = relax(rule, start[:, :2], rate, sweeps, config.tolerance_m)
+    if positions is None:
+        return Outcome(start, SolveStatus.DIVERGED, f"{note}; diverged within {done} sweeps, kept the start", done)
+    poses = np.column_stack([positions, graph.initial[:, 2]])
+    status = SolveStatus.CONVERGED if done < sweeps else SolveStatus.MAX_ITERATIONS
+    return Outcome(poses, status, f"{note}; {done} sweeps", done)
+
+
+def _by_degree(rule: LinearRule, config: RelaxationConfig) -> Array:
     return np.asarray((config.theta / np.maximum(rule.degree, 1.0))[:, None])

@@ -1,61 +1,74 @@
-"""Relaxation link by link, in place, headings too: the rule of RatSLAM's experience map, plain and robust."""
+"""Relaxation link by link, in place, headings too: the rule of RatSLAM's experience map, plain, robust, and as a start.
+
+Relaxation needs no good start and thousands of sweeps for the last per cent; least squares needs a good start and a few
+iterations. Together they are `relaxation-gtsam-lm`: while driving the map is relaxed, at the end least squares goes on from it.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from hybridmap.backends.base import Solution, SolveStatus
-from hybridmap.backends.following import Outcome
-from hybridmap.backends.objective import gate_of, truncated_cost
-from hybridmap.backends.relaxation.relaxing import RelaxationBackend
+from hybridmap.backends.base import Outcome, SolveStatus
+from hybridmap.backends.driver import Driver, Works
+from hybridmap.backends.objective import chi2, gate_of, truncated_cost
+from hybridmap.backends.relaxation.relaxing import relaxing, swept
 from hybridmap.backends.relaxation.sweeps import Relaxed, relax_links
-from hybridmap.config.backends import RelaxationConfig
+from hybridmap.config.backends import BackendsConfig, RelaxationConfig
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
 
 _REJECTED = 0.25  # weight of a loop whose residual is the scale itself
+_TOLERANCE = 1e-9  # relative decrease of the cost at which least squares is done: the start must not show in the result
 
 
-class RatslamRelaxation(RelaxationBackend):
-    """`relaxation-ratslam`: every link moves both of its ends by theta times its error."""
-
-    def _relax(self, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
-        config = self._config.relaxation
-        return _outcome(relax_links(graph, start, sweeps, config), config)
+def plain(name: str, config: BackendsConfig) -> Driver:
+    """Every link moves both of its ends by theta times its error."""
+    return relaxing(name, config, partial(_relaxed, config.relaxation))
 
 
-class RobustRelaxation(RelaxationBackend):
-    """`relaxation-robust`: a loop's correction is multiplied by a Geman-McClure weight of its error.
+def robust(name: str, config: BackendsConfig) -> Driver:
+    """A loop's correction is multiplied by a Geman-McClure weight of its error.
 
     The scale of the weight shrinks geometrically to 1 in the course of a call. When a whole graph is solved, that takes a
     quarter of the sweeps; the rest are of the plain rule on the loops that are left, with a look at all of them in between.
     The end of a drive is solved as a whole from the map that the drive led to, and the better of the two is kept.
     """
+    rules = config.relaxation
+    solve = swept(partial(_in_rounds, rules), rules.solve_sweeps)
 
-    def finish(self, graph: PoseGraph) -> Solution:
-        """See `Backend.finish`."""
-        driven = self.update(graph)
-        settled = self._timed(graph, lambda: self._optimise(graph, driven.poses))
-        bound = gate_of(self._config)
-        return min(settled, driven, key=lambda solution: truncated_cost(graph, solution.poses, bound))
+    def follow(graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
+        return _judged(graph, relax_links(graph, start, sweeps, rules, robust=True), rules)
 
-    def _relax(self, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
-        config = self._config.relaxation
-        quarter = max(sweeps // 4, 1)
-        relaxed = replace(relax_links(graph, start, min(sweeps, quarter), config, robust=True), settled=False)
-        while relaxed.sweeps < sweeps and not relaxed.settled:
-            kept = ~(graph.is_loop & (weights(graph, relaxed.poses, config) < _REJECTED))
-            part = min(quarter, sweeps - relaxed.sweeps)
-            onward = relax_links(graph.with_edges(kept), relaxed.poses, part, config)
-            relaxed = replace(onward, sweeps=relaxed.sweeps + onward.sweeps)
-        return _judged(graph, relaxed, config)
+    def onward(graph: PoseGraph, driven: Array) -> Outcome:
+        settled, bound = solve(graph, driven), gate_of(config)
+        if truncated_cost(graph, settled.poses, bound) <= truncated_cost(graph, driven, bound):
+            return settled
+        kept = _judged(graph, Relaxed(driven, settled.iterations, settled=False), rules)
+        return replace(kept, message=f"kept the map of the drive; {kept.message}")
 
-    def _relax_on(self, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
-        config = self._config.relaxation
-        return _judged(graph, relax_links(graph, start, sweeps, config, robust=True), config)
+    return Driver(name, config, solve, follow=swept(follow, rules.sweeps_per_node), onward=onward, works=Works.ON_GROWTH)
+
+
+def then_least_squares(name: str, config: BackendsConfig) -> Driver:
+    """The plain rule, then Levenberg-Marquardt over all edges."""
+    rule, rules = partial(_relaxed, config.relaxation), config.relaxation
+    relax = swept(rule, rules.solve_sweeps)
+
+    def solve(graph: PoseGraph, start: Array) -> Outcome:
+        relaxed = relax(graph, start)
+        if relaxed.status is SolveStatus.DIVERGED:
+            return relaxed
+        refined = _refined(graph, relaxed.poses, config, f"{relaxed.iterations} sweeps")
+        return replace(refined, iterations=relaxed.iterations + refined.iterations)
+
+    def onward(graph: PoseGraph, driven: Array) -> Outcome:
+        return _refined(graph, driven, config, "driven")
+
+    return Driver(name, config, solve, follow=swept(rule, rules.sweeps_per_node), onward=onward, works=Works.ON_GROWTH)
 
 
 def weights(graph: PoseGraph, poses: Array, config: RelaxationConfig) -> Array:
@@ -64,6 +77,21 @@ def weights(graph: PoseGraph, poses: Array, config: RelaxationConfig) -> Array:
     errors = between(predicted, poses[graph.targets])
     squared = np.sum(errors[:, :2] ** 2, axis=1) / config.robust_scale_m**2 + errors[:, 2] ** 2 / config.robust_scale_rad**2
     return np.asarray(1.0 / (1.0 + squared) ** 2)
+
+
+def _relaxed(config: RelaxationConfig, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
+    return _outcome(relax_links(graph, start, sweeps, config), config)
+
+
+def _in_rounds(config: RelaxationConfig, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
+    quarter = max(sweeps // 4, 1)
+    relaxed = replace(relax_links(graph, start, min(sweeps, quarter), config, robust=True), settled=False)
+    while relaxed.sweeps < sweeps and not relaxed.settled:
+        kept = ~(graph.is_loop & (weights(graph, relaxed.poses, config) < _REJECTED))
+        part = min(quarter, sweeps - relaxed.sweeps)
+        onward = relax_links(graph.with_edges(kept), relaxed.poses, part, config)
+        relaxed = replace(onward, sweeps=relaxed.sweeps + onward.sweeps)
+    return _judged(graph, relaxed, config)
 
 
 def _judged(graph: PoseGraph, relaxed: Relaxed, config: RelaxationConfig) -> Outcome:
@@ -81,3 +109,13 @@ def _outcome(relaxed: Relaxed, config: RelaxationConfig) -> Outcome:
         message = f"no node moved more than {config.tolerance_m} m"
         return Outcome(relaxed.poses, SolveStatus.CONVERGED, message, relaxed.sweeps)
     return Outcome(relaxed.poses, SolveStatus.MAX_ITERATIONS, f"{relaxed.sweeps} sweeps", relaxed.sweeps)
+
+
+def _refined(graph: PoseGraph, start: Array, config: BackendsConfig, before: str) -> Outcome:
+    from hybridmap.backends.gtsam.batch import run
+    from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph
+
+    outcome = run("lm", factor_graph(graph, NoiseModels()), start, config.max_iterations, tolerance=_TOLERANCE)
+    if chi2(graph, outcome.poses) > chi2(graph, start):
+        return Outcome(start, SolveStatus.STALLED, f"{before}; {outcome.message}; kept the relaxed map", outcome.iterations)
+    return replace(outcome, message=f"{before}; {outcome.message} after {outcome.iterations} iterations")

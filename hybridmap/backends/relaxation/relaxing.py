@@ -2,49 +2,37 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable
 
 import numpy as np
 
-from hybridmap.backends.base import Solution, SolveStatus
-from hybridmap.backends.following import Change, GraphBackend, Outcome
+from hybridmap.backends.base import Outcome, Solver, SolveStatus
+from hybridmap.backends.driver import Driver, Works
+from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
 
+Rule = Callable[[PoseGraph, Array, int], Outcome]
+"""At most so many sweeps over a graph that has edges, from poses (N, 3)."""
 
-class RelaxationBackend(GraphBackend):
-    """A rule that is swept over the graph; a subclass supplies `_relax`."""
 
-    def finish(self, graph: PoseGraph) -> Solution:
-        """See `Backend.finish`: the sweeps of one more update; the end of the drive goes on from the map."""
-        return self.update(graph)
+def swept(rule: Rule, sweeps: int) -> Solver:
+    """A solver by at most so many sweeps of a rule; poses that grow without bound are no map."""
 
-    def _must_work(self, change: Change) -> bool:
-        del change
-        return True
-
-    def _follow(self, graph: PoseGraph, start: Array, change: Change) -> Outcome:
-        del change
-        return self._guard(self._relax_on, graph, start, self._config.relaxation.sweeps_per_node)
-
-    def _optimise(self, graph: PoseGraph, start: Array) -> Outcome:
-        return self._guard(self._relax, graph, start, self._config.relaxation.solve_sweeps)
-
-    def _guard(self, relax: Callable[[PoseGraph, Array, int], Outcome], graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
+    def solve(graph: PoseGraph, start: Array) -> Outcome:
         if graph.n_edges == 0:
             return Outcome(start, SolveStatus.CONVERGED, "nothing to relax", 0)
         with np.errstate(over="ignore", invalid="ignore"):
-            outcome = relax(graph, start, sweeps)
+            outcome = rule(graph, start, sweeps)
         if np.isfinite(outcome.poses).all():
             return outcome
-        message = f"theta {self._config.relaxation.theta}: poses were not finite; kept those before"
-        return Outcome(start, SolveStatus.DIVERGED, message, outcome.iterations)
+        return Outcome(start, SolveStatus.DIVERGED, "poses were not finite; kept those before", outcome.iterations)
 
-    @abstractmethod
-    def _relax(self, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
-        """At most so many sweeps over a graph that has edges, from poses (N, 3)."""
+    return solve
 
-    def _relax_on(self, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
-        """The same while the graph grows."""
-        return self._relax(graph, start, sweeps)
+
+def relaxing(name: str, config: BackendsConfig, rule: Rule) -> Driver:
+    """A back-end that sweeps whenever the graph has grown; the end of the drive goes on from the map by one more update."""
+    follow = swept(rule, config.relaxation.sweeps_per_node)
+    solve = swept(rule, config.relaxation.solve_sweeps)
+    return Driver(name, config, solve, follow=follow, last=follow, works=Works.ON_GROWTH)

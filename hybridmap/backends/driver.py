@@ -1,0 +1,234 @@
+"""Following a growing graph: one driver for every solver, which is a function from (graph, start) to an outcome."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from enum import Enum
+
+import numpy as np
+
+from hybridmap.backends.base import Backend, Outcome, Solution, Solver, SolveReport, SolveStatus, SupportsPoseGraph
+from hybridmap.backends.judging.clusters import rejected_clusters
+from hybridmap.backends.judging.weak import hanging_nodes, weak_edges
+from hybridmap.backends.objective import chi2, gate_of, squared_norms, total, unit_variance
+from hybridmap.config.backends import BackendsConfig
+from hybridmap.errors import BackendError
+from hybridmap.geometry import Array, between, compose
+from hybridmap.graph.connectivity import extend, require_connected
+from hybridmap.graph.growth import Change, difference, prefix
+from hybridmap.graph.pose_graph import PoseGraph
+
+_ROUNDING = 1e-9  # of chi2: a chain without loops has none, and no solver finds less
+
+Extend = Callable[[PoseGraph, Array], Array]
+"""Poses (N, 3) of a graph whose first (M, 3) are given."""
+
+
+class Works(Enum):
+    """When an update asks the solver: where the graph closes (`Change.closes`), whenever it grew, or never."""
+
+    ON_CLOSURES = "on closures"
+    ON_GROWTH = "on growth"
+    NEVER = "never"
+
+
+class Driver:
+    """A back-end around a solver: follows a growing graph, solves a whole one, and reports on both.
+
+    Between two closures an update costs what is new in the graph. What raises leaves the state before the call.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        config: BackendsConfig,
+        solve: Solver,
+        *,
+        follow: Solver | None = None,
+        last: Solver | None = None,
+        onward: Solver | None = None,
+        works: Works = Works.ON_CLOSURES,
+        place: Extend = extend,
+        most_rise: float = np.inf,
+        softens: bool = False,
+    ) -> None:
+        """Put a back-end together.
+
+        Args:
+            name: the back-end's.
+            config: gives the gate of loops, and the kernel on edges of motion.
+            solve: solves a whole graph from its `initial`, knowing nothing of earlier calls.
+            follow: does an update that asks for work; its start carries on from its last outcome. Default: `solve`.
+            last: the end of the drive is one more update, by this. Default: a whole solution.
+            onward: the end of the drive is a whole solution from the poses that the drive led to, by this. Default: by
+                `solve`, from the graph's `initial`.
+            works: when an update asks for work.
+            place: where new nodes are put.
+            most_rise: relative rise of chi2 over that of the start from which a solution is none.
+            softens: it puts the configured kernel on edges of motion; weak ones are reported.
+        """
+        self._name, self._config = name, config
+        self._solve, self._follow, self._last, self._onward = solve, follow or solve, last, onward
+        self._works, self._place, self._most_rise, self._softens = works, place, most_rise, softens
+        self._graph: PoseGraph | None = None
+        self._poses: Array = np.zeros((0, 3))
+        self._squared: Array = np.zeros(0)
+        self._weights: dict[int, float] = {}
+        self._rejected: tuple[int, ...] = ()
+        self._waiting = 0  # measurements beside the chain that no solver has seen
+
+    @property
+    def name(self) -> str:
+        """The name by which `create` knows it."""
+        return self._name
+
+    def update(self, graph: PoseGraph) -> Solution:
+        """See `Backend.update`."""
+        return self._advance(graph, None)
+
+    def finish(self, graph: PoseGraph) -> Solution:
+        """See `Backend.finish`."""
+        if self._last is not None:
+            return self._advance(graph, self._last)
+        if self._onward is not None:
+            return self._whole(graph, self._onward, self.update(graph).poses)
+        return self.solve(graph)
+
+    def solve(self, graph: PoseGraph | SupportsPoseGraph) -> Solution:
+        """See `Backend.solve`."""
+        frozen = graph if isinstance(graph, PoseGraph) else graph.pose_graph()
+        return self._whole(frozen, self._solve, frozen.initial)
+
+    def _advance(self, graph: PoseGraph, always: Solver | None) -> Solution:
+        """Follow the graph: by `always` if given, else as the solver follows, where the graph asks for work."""
+        started = time.process_time()
+        change = difference(self._graph, graph)
+        new = graph.with_edges(change.added)
+        placed = self._admit(graph, new, change)
+        start = self._place(new, placed)
+        at_start = self._carried(new, change, start)
+        if always is not None or self._works is Works.ON_GROWTH or (self._works is Works.ON_CLOSURES and change.closes):
+            outcome, waiting = self._checked(graph, start, self._asked(always or self._follow, graph, start)), 0
+        else:
+            waiting = 0 if self._works is Works.NEVER else self._waiting + new.n_edges - (len(start) - len(placed))
+            outcome = self._extended(start, waiting)
+        squared = at_start if outcome.poses is start else squared_norms(graph, outcome.poses)
+        before = total(at_start)
+        if self._rose(before, total(squared)):
+            message = f"{outcome.message}; chi2 rose, the next updates go on from there"
+            outcome = replace(outcome, status=SolveStatus.STALLED, message=message)
+        self._graph, self._poses, self._squared = graph, outcome.poses, squared
+        self._weights, self._rejected, self._waiting = outcome.weights, outcome.rejected, waiting
+        return self._solution(graph, outcome, squared, before, started)
+
+    def _whole(self, graph: PoseGraph, solver: Solver, start: Array) -> Solution:
+        """Check a whole graph, run a solver on it, check what comes out."""
+        started = time.process_time()
+        graph.validate()
+        require_connected(graph)
+        outcome = self._checked(graph, graph.initial, self._asked(solver, graph, start))
+        squared = squared_norms(graph, outcome.poses)
+        before = total(squared) if outcome.poses is graph.initial else chi2(graph, graph.initial)
+        if self._rose(before, total(squared)):
+            message = f"{outcome.message}; ended worse than it began, kept the start"
+            outcome = Outcome(graph.initial, SolveStatus.DIVERGED, message, outcome.iterations)
+            squared = squared_norms(graph, graph.initial)
+        solution = self._solution(graph, outcome, squared, before, started)
+        if not outcome.rejected:
+            return solution
+        meant = graph if outcome.calibrated is None else outcome.calibrated
+        clusters = rejected_clusters(meant, outcome.poses, outcome.rejected, gate_of(self._config))
+        return replace(solution, report=replace(solution.report, rejected_clusters=clusters))
+
+    def _admit(self, graph: PoseGraph, new: PoseGraph, change: Change) -> Array:
+        """Validate what is new, i.e. the edges of `new`; the poses to extend from."""
+        new.validate()
+        old = self._graph
+        if old is None:
+            return graph.initial[:1]
+        if graph.n_nodes < old.n_nodes:
+            raise BackendError(f"{self._name}: the graph shrank from {old.n_nodes} to {graph.n_nodes} nodes between updates")
+        if len(change.removed):
+            require_connected(graph)
+        return self._poses
+
+    def _asked(self, solver: Solver, graph: PoseGraph, start: Array) -> Outcome:
+        try:
+            return solver(graph, start)
+        except RuntimeError as error:  # gtsam raises nothing more specific
+            raise BackendError(f"{self._name}: the solver gave up: {_first_line(error)}") from error
+
+    def _extended(self, start: Array, waiting: int) -> Outcome:
+        """What an update without work comes to."""
+        status, message = SolveStatus.CONVERGED, "extended by odometry"
+        if waiting:
+            status, message = SolveStatus.WAITING, f"{message}; {waiting} measurements beside the chain wait for a closure"
+        return Outcome(start, status, message, 0, self._weights, self._rejected)
+
+    def _rose(self, before: float, after: float) -> bool:
+        """Whether chi2 after is above that before by more than what an optimum leaves open."""
+        return np.isfinite(self._most_rise) and after > before * (1.0 + self._most_rise) + _ROUNDING
+
+    def _checked(self, graph: PoseGraph, start: Array, outcome: Outcome) -> Outcome:
+        """Refuse what is not finite, and bring node 0 back to where it is fixed."""
+        if not np.isfinite(outcome.poses).all():
+            message = "poses were not finite; kept those before"
+            return Outcome(start, SolveStatus.DIVERGED, message, outcome.iterations)
+        if np.array_equal(outcome.poses[0], graph.initial[0]):
+            return outcome
+        poses = compose(graph.initial[0], between(outcome.poses[0], outcome.poses))
+        poses[0] = graph.initial[0]
+        return replace(outcome, poses=poses)
+
+    def _carried(self, new: PoseGraph, change: Change, start: Array) -> Array:
+        """Squared residuals (E,) at the start of an update: those of the edges of `new`; the others are known."""
+        kept = np.delete(self._squared, change.removed) if len(change.removed) else self._squared
+        squared = np.empty(len(kept) + new.n_edges)
+        known = np.ones(len(squared), dtype=bool)
+        known[change.added] = False
+        squared[known] = kept
+        squared[change.added] = squared_norms(new, start)
+        return squared
+
+    def _solution(self, graph: PoseGraph, outcome: Outcome, squared: Array, before: float, started: float) -> Solution:
+        """The outcome with the referee's figures: squared residuals (E,) at its poses, chi2 before."""
+        meant = graph if outcome.calibrated is None else outcome.calibrated
+        strain = squared if outcome.calibrated is None else squared_norms(meant, outcome.poses)
+        weak = weak_edges(meant, strain, self._config.robust) if self._softens else {}
+        without = (*outcome.rejected, *weak)
+        hanging = hanging_nodes(graph, without) if weak else 0
+        note = f"; {len(weak)} edges of motion of little weight, {hanging} nodes hang on them alone" if weak else ""
+        report = SolveReport(
+            backend=self._name,
+            status=outcome.status,
+            message=outcome.message + note,
+            iterations=outcome.iterations,
+            chi2_initial=before,
+            chi2=total(squared),
+            cpu_s=time.process_time() - started,
+            rejected_edge_ids=outcome.rejected,
+            weights=outcome.weights,
+            chi2_odometry=total(strain[~graph.is_loop]),
+            unit_variance=unit_variance(meant, strain, without),
+            weak_edges=weak,
+            hanging_nodes=hanging,
+        )
+        return Solution(outcome.poses, report)
+
+
+def replay(backend: Backend, graph: PoseGraph) -> Iterator[Solution]:
+    """Feed a graph to `update` node by node, as the robot made it; an edge enters when both of its ends exist.
+
+    Raises:
+        GraphError: the graph is malformed, or a node hangs on later ones only.
+        BackendError: the solver failed.
+    """
+    for nodes in range(1, graph.n_nodes + 1):
+        yield backend.update(prefix(graph, nodes))
+
+
+def _first_line(error: BaseException) -> str:
+    text = str(error).strip()
+    return text.splitlines()[0] if text else type(error).__name__
