@@ -165,7 +165,7 @@ def test_no_graph_makes_the_rule_grow_beyond_all_bounds(seed, theta, robust):
     deltas = np.where(graph.is_loop[:, None], rng.uniform(-100, 100, graph.deltas.shape), graph.deltas)
     nonsense = replace(graph, sources=ends[0], targets=ends[1], deltas=deltas)  # a hub of contradicting loops
     poses = relax_links(nonsense, graph.initial, 500, RelaxationConfig(theta=theta), robust=robust).poses
-    assert np.abs(poses - poses[0]).max() < 1e4
+    assert np.abs(poses - poses[0]).max() < 1e6  # growth without bound reaches 1e300 in so many sweeps
 
 
 @given(st.integers(0, 10_000), st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-3.1, 3.1)), st.booleans())
