@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridmap.errors import StoreError
-from hybridmap.store.codec import pack, unpack
+from hybridmap.store.codec import pack, rig_from_json, unpack
 
 DTYPES = ("|b1", "|u1", "|i1", "<u2", ">u2", "<i4", "<i8", "<f4", ">f4", "<f8")
 
@@ -45,3 +45,10 @@ def test_damage_is_said(array):
     packed = pack(array)
     with pytest.raises(StoreError, match="damaged"):
         unpack(replace(packed, data=packed.data[: len(packed.data) // 2]))
+
+
+def test_a_rig_of_an_older_map_and_of_a_kind_that_is_not_known_is_read():
+    laser = {"bearings_rad": [0.0, 1.0], "range_min_m": 0.1, "range_max_m": 9.0, "pose_base_laser": [0.2, 0.0, 0.0]}
+    rig = rig_from_json({"camera": None, "laser": laser, "radar": {"power_w": 3.0}})
+    assert list(rig.sensors) == ["laser"]
+    np.testing.assert_array_equal(rig.sensors["laser"].bearings_rad, [0.0, 1.0])
