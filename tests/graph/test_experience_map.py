@@ -52,10 +52,10 @@ def test_a_frozen_graph_does_not_move_with_the_map():
     assert chain.pose_graph().n_edges == 1
 
 
-@pytest.mark.parametrize("ends", [(0, 7), (-1, 0), (1, 1)])
-def test_an_edge_needs_two_nodes(ends):
+@pytest.mark.parametrize(("source", "target"), [(0, 7), (-1, 0), (1, 1)])
+def test_an_edge_needs_two_nodes(source, target):
     with pytest.raises(GraphError, match="two different nodes"):
-        map_of(3).add_edge(Edge(*ends, EdgeKind.LOOP, Status.REJECTED, "", None))
+        map_of(3).add_edge(Edge(source, target, EdgeKind.LOOP, Status.REJECTED, "", None))
 
 
 def test_an_accepted_edge_needs_a_measurement_and_leaves_the_map_whole():

@@ -9,6 +9,7 @@ from hybridmap.graph.connectivity import chain, require_connected
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.io import held, read_graph, write_g2o
 from hybridmap.graph.pose_graph import PoseGraph
+from tests.narrowing import known
 
 G2O = """# a comment
 VERTEX_SE2 0 0 0 0
@@ -96,7 +97,7 @@ def test_what_is_written_is_read_back_to_the_bit(tmp_path):
 def test_a_file_without_vertices_is_chained_from_its_edges(tmp_path):
     lines = [line for line in G2O.splitlines() if not line.startswith("VERTEX")]
     graph = read_graph(written(tmp_path, "\n".join(lines)))
-    assert np.allclose(graph.initial, [[0, 0, 0], [1, 0, 0.5], compose([1, 0, 0.5], [1.5, 0, 0.25])])
+    assert np.allclose(graph.initial, np.array([[0, 0, 0], [1, 0, 0.5], compose([1, 0, 0.5], [1.5, 0, 0.25])]))
 
 
 def test_vertices_may_have_any_numbers(tmp_path):
@@ -131,7 +132,7 @@ def test_what_is_wrong_with_a_graph_is_told_in_the_numbers_of_its_file(tmp_path)
     with pytest.raises(GraphError, match=r"graph\.g2o:5: edge 20 -> 30 has an information matrix that is not positive"):
         graph.validate()
     with pytest.raises(GraphError, match=r"graph\.g2o:5: edge 20 -> 30 has"):
-        graph.with_edges([1]).validate()
+        graph.with_edges(np.array([1])).validate()
     with pytest.raises(GraphError, match=r"graph\.g2o: vertex 30 has a pose with"):
         read_graph(written(tmp_path, tens.replace("30 3", "30 3e99") + edges.format(9))).validate()
     with pytest.raises(GraphError, match=r"graph\.g2o: vertex 20 is not connected to an earlier node"):
@@ -155,7 +156,7 @@ def test_the_first_fixed_vertex_is_held_and_written_again(tmp_path, caplog):
     assert np.allclose(between(back[:-1], back[1:]), between(moved[:-1], moved[1:]))
     write_g2o(tmp_path / "out.g2o", graph, back)
     again = read_graph(tmp_path / "out.g2o")
-    assert (again.file.held, "FIX 2\n" in (tmp_path / "out.g2o").read_text()) == (2, True)
+    assert (known(again.file).held, "FIX 2\n" in (tmp_path / "out.g2o").read_text()) == (2, True)
     with pytest.raises(GraphError, match=r"graph\.g2o: FIX names vertex 8, which the file does not give"):
         read_graph(written(tmp_path, G2O.replace("FIX 0", "FIX 8")))
     unfixed = read_graph(written(tmp_path, G2O.replace("FIX 0\n", "")))

@@ -63,7 +63,7 @@ def test_edges_of_the_same_two_nodes_hold_each_other():
         kinds=np.full(2, EdgeKind.ODOMETRY, dtype=np.int8),
         edge_ids=np.arange(2),
     )
-    both = np.linalg.inv(np.linalg.inv(loose) + np.linalg.inv(blind))
+    both = np.linalg.inv(np.linalg.inv(loose) + np.linalg.inv(blind)).astype(np.float64)
     assert np.allclose(relative_covariances(graph, 0)[1], both)
     assert np.allclose(relative_covariances(graph, 1)[0], invert_relative(RelativePose(delta, both)).covariance)
 

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from neural_drives import arc, wander
 
 from hybridmap import geometry
 from hybridmap.config.mapping import NeuralConfig
@@ -10,6 +9,7 @@ from hybridmap.errors import StreamError
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.band import BandMotion
 from hybridmap.neural.torus import shift_sheets
+from tests.neural.neural_drives import arc, wander
 
 
 def drive(config, deltas, poses, dtype=np.float64):
@@ -121,10 +121,11 @@ def test_there_is_no_position_beside_the_network():
     assert other.pose == pytest.approx(integrator.pose, abs=1e-12)
 
 
-def test_sheets_stop_when_the_bands_do():
+def test_sheets_stop_when_the_bands_do(monkeypatch):
     integrator = PathIntegrator(NeuralConfig(band_drive=0.0))
     before = integrator.module_phases()
-    integrator.bands.step = lambda displacement: BandMotion(np.zeros((8, 3)), np.ones((8, 3), complex))
+    still = BandMotion(np.zeros((8, 3)), np.ones((8, 3), complex))
+    monkeypatch.setattr(integrator.bands, "step", lambda displacement_m: still)
     integrator.step((0.05, 0.0, 0.0), 0.1)
     assert integrator.module_phases() == pytest.approx(before, abs=1e-9)
 

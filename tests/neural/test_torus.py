@@ -55,6 +55,6 @@ def test_floor_and_residual(shift):
 
 
 def test_floor_of_a_negative_shift():
-    assert split_shift(-0.3) == (-1, pytest.approx(0.7))
-    assert split_shift(0.3) == (0, pytest.approx(0.3))
+    assert split_shift(-0.3) == pytest.approx((-1, 0.7))
+    assert split_shift(0.3) == pytest.approx((0, 0.3))
     assert split_shift(-2.0) == (-2, 0.0)

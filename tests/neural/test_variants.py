@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from neural_drives import wander
 
 from hybridmap import geometry
 from hybridmap.config.mapping import NeuralConfig
@@ -15,6 +14,7 @@ from hybridmap.neural import PathIntegrator
 from hybridmap.neural.grid import GridModules, kernel_spectrum, relu
 from hybridmap.neural.place import PlaceProjection
 from hybridmap.neural.torus import LowModes
+from tests.neural.neural_drives import wander
 
 
 def driven(seed, distance_m, rng=None, **settings):

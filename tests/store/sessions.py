@@ -69,7 +69,8 @@ def laser_ranges(pose: np.ndarray, half_m: float = 5.0) -> np.ndarray:
     with np.errstate(divide="ignore"):
         to_x = (np.sign(np.cos(yaw)) * half_m - origin[0]) / np.cos(yaw)
         to_y = (np.sign(np.sin(yaw)) * half_m - origin[1]) / np.sin(yaw)
-    return np.minimum(to_x, to_y).astype(np.float32)
+    ranges: np.ndarray = np.minimum(to_x, to_y)
+    return ranges.astype(np.float32)
 
 
 def keyframe_of(node: int, truth: np.ndarray) -> dict[str, np.ndarray]:

@@ -37,11 +37,11 @@ def test_map_comes_back_with_every_edge_and_the_same_hash(tmp_path):
         assert dict(old.scores) == dict(new.scores)
         assert old.since_node == new.since_node
         assert (old.relative is None) == (new.relative is None)
-    for old, new in zip(before.nodes, after.nodes, strict=True):
-        assert (old.stamp_ns, old.template, old.travel_m) == (new.stamp_ns, new.template, new.travel_m)
-        np.testing.assert_array_equal(old.pose_odom, new.pose_odom)
-        np.testing.assert_array_equal(old.place_code, new.place_code)
-        assert new.place_code.dtype == np.float32
+    for node, back in zip(before.nodes, after.nodes, strict=True):
+        assert (node.stamp_ns, node.template, node.travel_m) == (back.stamp_ns, back.template, back.travel_m)
+        np.testing.assert_array_equal(node.pose_odom, back.pose_odom)
+        np.testing.assert_array_equal(node.place_code, back.place_code)
+        assert back.place_code.dtype == np.float32
 
 
 def test_keyframes_snapshots_rig_and_solutions_come_back_exactly(tmp_path):

@@ -128,7 +128,8 @@ def overwritten_and_failed(folder):
 def test_a_kill_while_files_are_moved_loses_none(tmp_path, monkeypatch):
     write_session(tmp_path / "s", ring_map(0.1))
     before = contents(tmp_path / "s")
-    rename, done = Path.rename, []
+    rename = Path.rename
+    done: list[Path] = []
 
     def killed_at(last):
         def renamed(path, target):
