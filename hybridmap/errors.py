@@ -17,6 +17,10 @@ class StreamError(HybridMapError):
     """A source of sensor data that is missing, damaged, unordered or of the wrong kind."""
 
 
+class OutputError(HybridMapError):
+    """A file or folder that cannot be written: taken, of another kind, being written by another run, or out of reach."""
+
+
 class GeometryError(HybridMapError):
     """A pose, covariance or trajectory that is not one: wrong shape, NaN, not positive definite."""
 
@@ -30,7 +34,7 @@ class BackendError(HybridMapError):
 
 
 class StoreError(HybridMapError):
-    """A session folder or map file that is missing, of another version, or already in use."""
+    """A session folder or map file that is missing, damaged or of another version."""
 
 
 class ExportError(HybridMapError):
@@ -42,4 +46,4 @@ class EvaluationError(HybridMapError):
 
 
 class StudyError(HybridMapError):
-    """A study that cannot go on: its folder, its workers or its cluster."""
+    """A study that cannot go on: its sources, its workers or its cluster."""

@@ -63,7 +63,7 @@ def run(stream: Stream, config: Config, out: Path, *, overwrite: bool = False, p
 
     Raises:
         StreamError: the stream is damaged or unordered, or gave nothing to map.
-        StoreError: the folder cannot be used, or another run is writing there.
+        OutputError: the folder cannot be used, or another run is writing there.
         ConfigError, BackendError: a sensor or back-end that there is not.
     """
     mapper = Mapper(config, stream.rig)

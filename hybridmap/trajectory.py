@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -12,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridmap.errors import GeometryError, StreamError
 from hybridmap.geometry import Array, between, compose, interpolate, quaternion_from_yaw, yaw_from_quaternion
+from hybridmap.output import write_text
 
 NS_PER_S = 1_000_000_000
 
@@ -152,32 +152,10 @@ def format_motion(moved_m: float, turned_deg: float) -> str:
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write the TUM format: stamps with 9 decimals, 17 significant digits, no half-written file on failure."""
+    """Write the TUM format: stamps with 9 decimals, 17 significant digits, in one move."""
     quaternions = quaternion_from_yaw(trajectory.poses[:, 2])
     lines = [
         f"{format_stamp(int(stamp))} {pose[0]:.17g} {pose[1]:.17g} 0 0 0 {q[2]:.17g} {q[3]:.17g}\n"
         for stamp, pose, q in zip(trajectory.stamps_ns, trajectory.poses, quaternions, strict=True)
     ]
-    write_text_atomic(path, "".join(lines))
-
-
-def write_text_atomic(path: Path, text: str) -> None:
-    """Write a text file in one move, so that a reader or a crash never meets half of it.
-
-    Raises:
-        OSError: it cannot be written; names `path` itself.
-    """
-    write_bytes_atomic(path, text.encode("utf-8"))
-
-
-def write_bytes_atomic(path: Path, content: bytes) -> None:
-    """The same for any file."""
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(content)
-        partial.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
-        raise OSError(error.errno, error.strerror, str(path)) from None
+    write_text(path, "".join(lines))

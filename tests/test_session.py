@@ -16,7 +16,7 @@ import pytest
 from hybridmap import session
 from hybridmap.backends.base import SolveStatus
 from hybridmap.config import Config
-from hybridmap.errors import StoreError, StreamError
+from hybridmap.errors import OutputError, StreamError
 from hybridmap.evaluate import evaluate_session
 from hybridmap.evaluate.explain import Explainer
 from hybridmap.geometry import between
@@ -118,7 +118,7 @@ def test_a_drive_that_ends_lost_says_so(tmp_path, monkeypatch):
 def test_a_session_is_not_overwritten_by_chance_but_on_demand(tmp_path):
     config = Config.load("laser", {"vision.sensor": "none"})
     session.run(RoomDrive(laps=0.2, with_scans=False), config, tmp_path / "s")
-    with pytest.raises(StoreError, match="overwrite"):
+    with pytest.raises(OutputError, match="overwrite"):
         session.run(RoomDrive(laps=0.2, with_scans=False), config, tmp_path / "s")
     (tmp_path / "s" / "notes.txt").write_text("mine")
     session.run(RoomDrive(laps=0.4, with_scans=False), config, tmp_path / "s", overwrite=True)

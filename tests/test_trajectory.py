@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybridmap.errors import GeometryError, StreamError
-from hybridmap.trajectory import Trajectory, format_stamp, read_tum, write_text_atomic, write_tum
+from hybridmap.trajectory import Trajectory, format_stamp, read_tum, write_tum
 
 
 @pytest.fixture
@@ -60,13 +60,3 @@ def test_a_trajectory_refuses_nonsense():
         Trajectory(np.array([1, 1]), np.zeros((2, 3)))
     with pytest.raises(GeometryError, match="NaN"):
         Trajectory(np.array([1]), np.full((1, 3), np.nan))
-
-
-def test_a_file_that_cannot_be_written_is_named_and_nothing_is_left_beside_it(tmp_path):
-    (tmp_path / "a.g2o").mkdir()
-    (tmp_path / "b.g2o").write_text("")
-    for path, blamed in ((tmp_path / "a.g2o", IsADirectoryError), (tmp_path / "b.g2o" / "c.g2o", FileExistsError)):
-        with pytest.raises(blamed) as error:
-            write_text_atomic(path, "text")
-        assert error.value.filename == str(path)
-    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a.g2o", "b.g2o"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -38,19 +39,18 @@ def calibrate(
     from hybridmap.calibration.gains import Gains
     from hybridmap.calibration.sessions import common_tree, estimate_of, read_drive, require_options
     from hybridmap.cli.show import emit
-    from hybridmap.errors import EvaluationError
-    from hybridmap.trajectory import read_tum, write_text_atomic
+    from hybridmap.output import staged, write_text
+    from hybridmap.trajectory import read_tum
 
     require_options(len(folders), len(reference or []), estimator, leg)
-    if out is not None and out.exists() and (out.is_dir() or not overwrite):
-        raise EvaluationError(f"{out}: {'is a folder; name a file' if out.is_dir() else 'exists already; give --overwrite'}")
-    drives = [read_drive(folder) for folder in folders]
-    truths = [read_tum(path) for path in reference or []]
-    tree = {} if out is None else common_tree(drives)
-    estimate = estimate_of(drives, truths, estimator, leg)
-    in_use = Gains.of(drives[0].config.neural)
-    if out is not None:
-        write_text_atomic(out, calibrated(tree, estimate, in_use))
+    with nullcontext() if out is None else staged(out, overwrite=overwrite) as work:
+        drives = [read_drive(folder) for folder in folders]
+        truths = [read_tum(path) for path in reference or []]
+        tree = {} if out is None else common_tree(drives)
+        estimate = estimate_of(drives, truths, estimator, leg)
+        in_use = Gains.of(drives[0].config.neural)
+        if out is not None and work is not None:
+            write_text(work / out.name, calibrated(tree, estimate, in_use))
     how = "reference" if truths else estimator or "alternating"
     head = {
         "sessions": [str(folder) for folder in folders],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -54,26 +55,25 @@ def compare(
     from hybridmap.cli.graphs import open_graph, settings_of
     from hybridmap.cli.show import progress
     from hybridmap.errors import EvaluationError
+    from hybridmap.output import held
+    from hybridmap.report.comparison import COMPARISON, Compared, write_comparison
 
     opened = open_graph(source)
     settings = settings_of(opened, config, setting)
     names = _names(backends)
     if not opened.is_session and (reference or relations):
         raise EvaluationError(f"{source}: a graph file has no stamps; --reference and --relations are for session folders")
-    if out is not None:
-        _prepare(out, overwrite=overwrite)
     ways = _ways(opened, batch=batch, incremental=incremental)
-    with progress(f"comparing on {source}") as advance:
-        rows = comparison.compare(
-            opened.graph, names, settings, ways=ways, certified=True, traced=out is not None, progress=advance
-        )
-    judged = _judged(opened, rows, reference, relations)
-    cells = _table(rows, judged.metrics)
-    if out is not None:
-        from hybridmap.report.comparison import Compared, write_comparison
-
-        facts = (f"Back-ends on {source.name}", opened.start, opened.head, opened.graph)
-        write_comparison(out, Compared(*facts, rows, cells, settings, judged.truth, opened.carried))
+    with nullcontext() if out is None else held(out, COMPARISON, overwrite=overwrite) as place:
+        with progress(f"comparing on {source}") as advance:
+            rows = comparison.compare(
+                opened.graph, names, settings, ways=ways, certified=True, traced=out is not None, progress=advance
+            )
+        judged = _judged(opened, rows, reference, relations)
+        cells = _table(rows, judged.metrics)
+        if place is not None:
+            facts = (f"Back-ends on {source.name}", opened.start, opened.head, opened.graph)
+            write_comparison(place, Compared(*facts, rows, cells, settings, judged.truth, opened.carried))
     if as_json:
         _emit(opened, ways, rows, judged.metrics)
     else:
@@ -87,14 +87,6 @@ def _names(backends: str) -> list[str]:
     if not names:
         raise BackendError("--backends: found no name, expected back-ends separated by commas")
     return names
-
-
-def _prepare(out: Path, *, overwrite: bool) -> None:
-    """Before anything is solved, make sure that the page will lose nothing that is in its folder."""
-    from hybridmap.report.comparison import PAGE, PICTURE
-    from hybridmap.report.folder import prepare_folder
-
-    prepare_folder(out, "comparison", (PAGE, PICTURE), overwrite=overwrite)
 
 
 def _judged(opened: GraphSource, rows: Sequence[Row], reference: Path | None, relations: Path | None) -> Judged:

@@ -37,6 +37,7 @@ def evaluate(
     The page is written anew.
     """
     from hybridmap.cli.show import emit
+    from hybridmap.errors import OutputError
     from hybridmap.evaluate import evaluate_session
     from hybridmap.report import write_report
     from hybridmap.store import SessionFolder
@@ -45,7 +46,6 @@ def evaluate(
     metrics = evaluate_session(folder, reference, relations, loops=loops)
     try:
         write_report(session)
-    except OSError as error:
-        kept = "; the page stays as it was" if session.report.is_file() else ""
-        log.warning("%s: cannot be written: %s%s", session.report, error.strerror, kept)
+    except OutputError as error:
+        log.warning("%s%s", error, "; the page stays as it was" if session.report.is_file() else "")
     emit(session.read_metrics().head, metrics, as_json=as_json, title=str(folder))

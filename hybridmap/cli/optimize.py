@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -28,18 +29,17 @@ def optimize(
     from hybridmap.backends.judging.certificate import certify
     from hybridmap.cli.graphs import open_graph, settings_of
     from hybridmap.cli.show import emit
-    from hybridmap.errors import GraphError
     from hybridmap.graph.io import held, write_g2o
+    from hybridmap.output import staged
 
-    if out is not None and out.exists() and (out.is_dir() or not overwrite):
-        raise GraphError(f"{out}: {'is a folder; name a file' if out.is_dir() else 'exists already; give --overwrite'}")
     source = open_graph(graph)
     chosen = create(backend, settings_of(source, config, setting))
-    solution = chosen.solve(source.graph)
-    report = solution.report
-    solved = report.status.has_map
-    if out is not None and solved:
-        write_g2o(out, source.graph, held(source.graph, solution.poses))
+    with nullcontext() if out is None else staged(out, overwrite=overwrite) as work:
+        solution = chosen.solve(source.graph)
+        report = solution.report
+        solved = report.status.has_map
+        if out is not None and work is not None and solved:
+            write_g2o(work / out.name, source.graph, held(source.graph, solution.poses))
     proof = certify(source.graph, solution.poses, report.rejected_edge_ids)
     head = source.head | {
         "backend": backend,

@@ -22,18 +22,18 @@ def verify(
     from hybridmap.cli.choose import parse_settings
     from hybridmap.cli.show import emit, progress
     from hybridmap.config import Config
-    from hybridmap.report.folder import prepare_folder
+    from hybridmap.output import held
     from hybridmap.verification import Scale, rows_of, verify_cells
-    from hybridmap.verification.page import METRICS, PAGE, write_verification
+    from hybridmap.verification.page import VERIFICATION, write_verification
 
     config = Config.load(None, parse_settings(setting))
-    prepare_folder(out, "verification", (PAGE, METRICS), overwrite=overwrite)
-    with progress("verifying the cells") as advance:
-        result = verify_cells(seed, Scale(), config.neural.model_dump(), advance)
-    rows = rows_of(result)
-    failed = [row.name for row in rows if row.passed is False]
-    head = {"seed": seed, "passed": not failed, "failed": failed}
-    page = write_verification(out, head, rows, result)
+    with held(out, VERIFICATION, overwrite=overwrite) as place:
+        with progress("verifying the cells") as advance:
+            result = verify_cells(seed, Scale(), config.neural.model_dump(), advance)
+        rows = rows_of(result)
+        failed = [row.name for row in rows if row.passed is False]
+        head = {"seed": seed, "passed": not failed, "failed": failed}
+        page = write_verification(place, head, rows, result)
     emit(head, rows, as_json=as_json, title=f"The spatial cells, seed {seed}")
     if not as_json:
         judged = sum(row.passed is not None for row in rows)

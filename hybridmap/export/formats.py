@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -12,6 +10,7 @@ from pathlib import Path
 from hybridmap.errors import ExportError
 from hybridmap.export.view import ExportOptions, SessionView, open_view
 from hybridmap.metrics import Metric
+from hybridmap.output import staged
 
 Writer = Callable[[SessionView, Path], list[Metric]]
 
@@ -22,7 +21,7 @@ class Format:
 
     Attributes:
         writer: `module:function` below this package; it writes one file and returns figures about it.
-        suffix: what its file is called while it is written; some writers go by it.
+        suffix: what its file is usually called.
         description: one line for people.
         companion: suffix of a second file that lies beside the first, if there is one.
         by_suffix: Open3D reads the file back only under its suffix.
@@ -77,7 +76,8 @@ def export_session(
 
     Raises:
         StoreError: no session there.
-        ExportError: unknown format or back-end, a file in the way, or nothing of the kind in the session.
+        ExportError: unknown format or back-end, or nothing of the kind in the session.
+        OutputError: a file in the way, or one that cannot be written.
     """
     if format_name not in FORMATS:
         raise ExportError(f"unknown format {format_name!r}; expected one of: {', '.join(FORMATS)}")
@@ -86,17 +86,14 @@ def export_session(
     for target in targets:
         if chosen.by_suffix and target.suffix != chosen.suffix:
             raise ExportError(f"{target}: Open3D reads a {format_name} by its suffix; name a file that ends in {chosen.suffix}")
-        if target.is_dir():
-            raise ExportError(f"{target}: is a folder; name a file")
-        if target.exists() and not overwrite:
-            raise ExportError(f"{target}: exists already; choose another name or give --overwrite")
     module, function = chosen.writer.split(":")
     writer: Writer = getattr(import_module(f"hybridmap.export.{module}"), function)
-    view = open_view(folder, backend, options or ExportOptions())
-    try:
-        metrics = _write_whole(writer, view, targets, chosen)
-    finally:
-        view.store.close()
+    with staged(*targets, overwrite=overwrite) as work:
+        view = open_view(folder, backend, options or ExportOptions())
+        try:
+            metrics = writer(view, work / targets[0].name)
+        finally:
+            view.store.close()
     return Exported(targets, view.backend, metrics)
 
 
@@ -105,22 +102,3 @@ def _targets(out: Path, chosen: Format) -> tuple[Path, ...]:
         return (out,)
     main = out.with_suffix(chosen.suffix) if out.suffix in (chosen.suffix, chosen.companion) else Path(f"{out}{chosen.suffix}")
     return (main, main.with_suffix(chosen.companion))
-
-
-def _write_whole(writer: Writer, view: SessionView, targets: tuple[Path, ...], chosen: Format) -> list[Metric]:
-    """Let the writer work in a folder beside the target, then move what it wrote: nothing half-written is ever seen."""
-    beside = next(parent for parent in targets[0].absolute().parents if parent.is_dir())
-    try:
-        work = Path(tempfile.mkdtemp(prefix=".hybridmap-", dir=beside))
-        try:
-            partial = work / f"{targets[0].stem}{chosen.suffix}"
-            metrics = writer(view, partial)
-            targets[0].parent.mkdir(parents=True, exist_ok=True)
-            for target in targets:
-                written = partial if target == targets[0] else partial.with_suffix(target.suffix)
-                written.replace(target)
-        finally:
-            shutil.rmtree(work, ignore_errors=True)
-    except OSError as error:
-        raise ExportError(f"{targets[0]}: cannot be written: {error.strerror}") from None
-    return metrics

@@ -17,9 +17,9 @@ from hybridmap.errors import ExportError
 from hybridmap.export.view import ExportOptions, SessionView
 from hybridmap.geometry import Array, compose, transform_points
 from hybridmap.metrics import Metric
+from hybridmap.output import write_text
 from hybridmap.streams.base import Seen
 from hybridmap.streams.sensors import see
-from hybridmap.trajectory import write_text_atomic
 
 _HIT, _MISS, _LIMIT = 0.9, -0.4, 4.0
 """Log-odds that a return adds to its cell, that a beam passing adds, and where they saturate."""
@@ -71,7 +71,7 @@ def write_grid(view: SessionView, path: Path) -> list[Metric]:
     height, width = grid.log_odds.shape
     image = path.with_suffix(".pgm")
     image.write_bytes(f"P5\n{width} {height}\n255\n".encode() + picture[::-1].tobytes())
-    write_text_atomic(
+    write_text(
         path,
         f"image: {image.name}\n"
         f"mode: trinary\n"

@@ -8,7 +8,8 @@ import numpy as np
 
 from hybridmap.export.view import SessionView
 from hybridmap.metrics import Metric
-from hybridmap.trajectory import write_text_atomic, write_tum
+from hybridmap.output import write_text
+from hybridmap.trajectory import write_tum
 
 
 def write_tum_trajectory(view: SessionView, path: Path) -> list[Metric]:
@@ -22,5 +23,5 @@ def write_kitti_trajectory(view: SessionView, path: Path) -> list[Metric]:
     poses = view.trajectory.poses
     cos, sin, zero, one = np.cos(poses[:, 2]), np.sin(poses[:, 2]), np.zeros(len(poses)), np.ones(len(poses))
     rows = np.stack([cos, -sin, zero, poses[:, 0], sin, cos, zero, poses[:, 1], zero, zero, one, zero], axis=1)
-    write_text_atomic(path, "".join(" ".join(f"{value + 0.0:.17g}" for value in row) + "\n" for row in rows))
+    write_text(path, "".join(" ".join(f"{value + 0.0:.17g}" for value in row) + "\n" for row in rows))
     return [Metric("poses/kitti", len(poses), "1", "poses written")]

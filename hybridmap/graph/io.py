@@ -13,7 +13,7 @@ from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.connectivity import chain
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import GraphFile, PoseGraph
-from hybridmap.trajectory import write_text_atomic
+from hybridmap.output import write_text
 
 log = logging.getLogger(__name__)
 
@@ -161,7 +161,7 @@ def write_g2o(path: Path, graph: PoseGraph, poses: Array) -> None:
     upper = graph.information[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     ends = zip(names[graph.sources], names[graph.targets], graph.deltas, upper, strict=True)
     rows += [f"EDGE_SE2 {s} {t} {_row(delta)} {_row(info)}\n" for s, t, delta, info in ends]
-    write_text_atomic(path, "".join(rows))
+    write_text(path, "".join(rows))
 
 
 def _row(numbers: Array) -> str:

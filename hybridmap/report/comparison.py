@@ -19,12 +19,13 @@ from hybridmap.geometry import Array
 from hybridmap.graph.carries import Carry
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.output import Held, Kind, write_bytes, write_text
 from hybridmap.report import comparison_figures as figures
 from hybridmap.report import tables
-from hybridmap.report.template import rendered
-from hybridmap.trajectory import write_bytes_atomic, write_text_atomic
+from hybridmap.report.template import is_page, rendered
 
 PICTURE, PAGE = "maps.png", "comparison.html"
+COMPARISON = Kind("comparison", (PAGE, PICTURE), lambda folder: is_page(folder / PAGE))
 _TEMPLATE = "comparison.html.j2"
 _WORST = 6  # edges a row
 
@@ -56,8 +57,12 @@ class Compared:
     carried: Sequence[Carry] = ()
 
 
-def write_comparison(folder: Path, compared: Compared) -> Path:
-    """Write `maps.png` and `comparison.html` into a folder, which is made; returns the page."""
+def write_comparison(place: Held, compared: Compared) -> Path:
+    """Write `maps.png` and `comparison.html` into a folder that is held as `COMPARISON`; returns the page.
+
+    Raises:
+        OutputError: it cannot be written to.
+    """
     graph, rows = compared.graph, compared.rows
     picture = figures.panels(graph, rows, compared.start, compared.carried)
     page = rendered(
@@ -83,9 +88,10 @@ def write_comparison(folder: Path, compared: Compared) -> Path:
         settings=yaml.safe_dump(compared.settings.model_dump(mode="json", exclude={"names"}), sort_keys=False),
         version=version("hybridmap"),
     )
-    write_bytes_atomic(folder / PICTURE, picture)
-    write_text_atomic(folder / PAGE, page)
-    return folder / PAGE
+    with place.replaced():
+        write_bytes(place.path / PICTURE, picture)
+        write_text(place.path / PAGE, page)
+    return place.path / PAGE
 
 
 def worst_edges(graph: PoseGraph, row: Row) -> list[str]:

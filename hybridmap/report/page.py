@@ -9,6 +9,7 @@ from typing import Any
 
 from hybridmap.graph.carries import carries
 from hybridmap.metrics import Metric
+from hybridmap.output import write_text
 from hybridmap.report import tables
 from hybridmap.report.closures import examples
 from hybridmap.report.correction_figure import correction_figure
@@ -18,7 +19,7 @@ from hybridmap.report.outline import outlines, raster
 from hybridmap.report.scene import ODOMETRY, Scene, load_scene
 from hybridmap.report.template import rendered
 from hybridmap.store import MapStore, SessionFolder
-from hybridmap.trajectory import NS_PER_S, write_text_atomic
+from hybridmap.trajectory import NS_PER_S
 
 _TEMPLATE = "report.html.j2"
 
@@ -43,7 +44,7 @@ def write_report(folder: SessionFolder) -> Path:
     with MapStore.open(folder.path) as store:
         scene = load_scene(folder, store)
         text = rendered(_TEMPLATE, **_content(scene, store))
-    write_text_atomic(folder.report, text)
+    write_text(folder.report, text)
     return folder.report
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from hybridmap.errors import StudyError
+from hybridmap.output import write_text
 from hybridmap.report import study_figures, tables
 from hybridmap.report.study_figures import FLOOR_M, MOST_PANELS
 from hybridmap.report.template import rendered
@@ -19,7 +19,6 @@ from hybridmap.study.grid import Cell
 from hybridmap.study.model import quoted
 from hybridmap.study.statistics import LEAST, Interval, Summary
 from hybridmap.study.study import Study
-from hybridmap.trajectory import write_text_atomic
 
 _TEMPLATE = "study.html.j2"
 _SOLVED = ("converged", "waiting", "max-iterations")
@@ -73,13 +72,10 @@ def write_study_page(study: Study) -> Path:
     """Write `report.html` of a study: one page that needs nothing beside it; the same results give the same page.
 
     Raises:
-        StudyError: it cannot be written.
+        OutputError: it cannot be written.
     """
     page = study.folder.path / PAGE
-    try:
-        write_text_atomic(page, _render(study))
-    except OSError as error:
-        raise StudyError(f"{page}: cannot be written: {error.strerror}") from None
+    write_text(page, _render(study))
     return page
 
 

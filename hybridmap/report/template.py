@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
+
+_MARK = '<meta name="generator" content="hybridmap '  # in the head of the pages that have a folder of their own
+
+
+def is_page(path: Path) -> bool:
+    """Whether a file is a page that was made here, and that no session or study folder holds."""
+    return path.is_file() and _MARK in path.read_text(encoding="utf-8", errors="replace")
 
 
 def rendered(template: str, **content: Any) -> str:

@@ -100,8 +100,13 @@ def open_read_only(path: Path) -> sqlite3.Connection:
 
 
 def finish(connection: sqlite3.Connection) -> None:
-    """Commit, fold the write-ahead log into the file and close: one file is left."""
+    """Commit, fold the write-ahead log into the file and close: one file is left, unless somebody reads it just now."""
     with closing(connection):
         connection.commit()
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        connection.execute("PRAGMA journal_mode = DELETE")
+        try:
+            connection.execute("PRAGMA journal_mode = DELETE")
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
+                raise
+            # somebody has the log open: with it the file is whole, and the session must not fail for a reader

@@ -1,27 +1,26 @@
-"""The session folder: which files it holds, how it is prepared and how results get into it."""
+"""The session folder: which files it holds and how results get into it."""
 
 from __future__ import annotations
 
 import json
 import logging
 import math
-import shutil
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hybridmap.errors import StoreError
+from hybridmap.errors import OutputError, StoreError
 from hybridmap.metrics import Metric, to_json
-from hybridmap.store.lock import hold, is_being_written
+from hybridmap.output import PREVIOUS, Kind, held, holds_only, is_held, write_text
 from hybridmap.store.map_store import MapStore
 from hybridmap.store.schema import MAP_NAME
-from hybridmap.trajectory import Trajectory, read_tum, write_text_atomic, write_tum
+from hybridmap.trajectory import Trajectory, read_tum, write_tum
 
 log = logging.getLogger(__name__)
 
-_OURS = (
+_FILES = (
     MAP_NAME,
     f"{MAP_NAME}-wal",
     f"{MAP_NAME}-shm",
@@ -31,8 +30,13 @@ _OURS = (
     "reference",
     "report.html",
 )
-_PREVIOUS = ".previous"
-_MOVING = ".previous.partial"  # a kill may leave part of a session here, and so never in `_PREVIOUS`
+
+
+def _is_session(folder: Path) -> bool:
+    return (folder / MAP_NAME).is_file() or holds_only(folder, _FILES)  # a run that was killed early had no map yet
+
+
+SESSION = Kind("session", _FILES, _is_session, useful_unfinished=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,105 +89,16 @@ class SessionFolder:
 
     @contextmanager
     def writing(self, *, overwrite: bool = False) -> Iterator[None]:
-        """Write a new session in the block, and nobody else meanwhile; an error takes it back, see `discard`.
+        """Write a new session in the block, and nobody else meanwhile; an error takes it back.
 
         So does Ctrl-C where a session was there before; where there was none, what is written so far stays.
 
         Raises:
-            StoreError: as `prepare`, or another run is writing here.
+            OutputError: it holds a session and `overwrite` is not given, holds something else, another run is writing here,
+                or it cannot be written to.
         """
-        with self._hold():
-            self.prepare(overwrite=overwrite)
-            try:
-                yield
-            except KeyboardInterrupt:
-                self.restore_previous()
-                raise
-            except BaseException:
-                self.discard()
-                raise
-            self.keep()
-
-    def _hold(self) -> ExitStack:
-        try:
-            if self.path.exists() and not self.path.is_dir():
-                raise StoreError(f"{self.path}: is a file; expected a folder that is empty or does not exist")
-            self.path.mkdir(parents=True, exist_ok=True)
-            return hold(self.path)
-        except OSError as error:
-            raise StoreError(f"{self.path}: cannot be used as output folder: {error.strerror}") from None
-
-    def prepare(self, *, overwrite: bool = False) -> None:
-        """Make the folder ready for a new session; what an old one left is set aside until `keep` or `discard`.
-
-        Raises:
-            StoreError: it holds a session and `overwrite` is not given, holds something else, or cannot be made.
-        """
-        try:
-            self._prepare(overwrite)
-        except OSError as error:
-            raise StoreError(f"{self.path}: cannot be used as output folder: {error.strerror}") from None
-
-    def _prepare(self, overwrite: bool) -> None:
-        if self.path.exists() and not self.path.is_dir():
-            raise StoreError(f"{self.path}: is a file; expected a folder that is empty or does not exist")
-        self._put_back()  # what a run that was killed while it moved files had not done
-        if overwrite and not _ended(self.path):
-            self.restore_previous()  # a run that was killed while it overwrote: the session set aside is the whole one
-        found = sorted(entry.name for entry in self.path.iterdir()) if self.path.exists() else []
-        session = MAP_NAME in found or (bool(found) and set(found) <= {*_OURS, _PREVIOUS})
-        if session and not overwrite:
-            raise StoreError(f"{self.path}: holds a session already; choose another folder or give --overwrite")
-        if found and not session:
-            raise StoreError(f"{self.path}: not empty and no session (it holds {found[0]!r}); choose another folder")
-        self.path.mkdir(parents=True, exist_ok=True)
-        ours = [self.path / name for name in _OURS if name in found]
-        if ours:
-            self._set_aside(ours)
-
-    def _set_aside(self, ours: Sequence[Path]) -> None:
-        moving, previous = self.path / _MOVING, self.path / _PREVIOUS
-        try:
-            moving.mkdir()
-            for entry in ours:
-                entry.rename(moving / entry.name)
-            shutil.rmtree(previous, ignore_errors=True)
-            moving.rename(previous)
-        except BaseException:
-            self._put_back()
-            raise
-
-    def _put_back(self) -> None:
-        """Move the files back that are between a session and the folder it is set aside in."""
-        moving = self.path / _MOVING
-        if moving.is_dir():
-            for entry in sorted(moving.iterdir()):
-                entry.rename(self.path / entry.name)
-            moving.rmdir()
-
-    def keep(self) -> None:
-        """The new session stands: drop the one set aside by `prepare`."""
-        shutil.rmtree(self.path / _PREVIOUS, ignore_errors=True)
-
-    def restore_previous(self) -> None:
-        """The new session was broken off: an overwritten one comes back; where there was none, what is mapped so far stays."""
-        if (self.path / _PREVIOUS).is_dir():
-            self.discard()
-
-    def discard(self) -> None:
-        """The new session failed: remove what it wrote, bring back the one set aside, and leave no empty folder."""
-        for name in _OURS:
-            entry = self.path / name
-            if entry.is_dir():
-                shutil.rmtree(entry)
-            else:
-                entry.unlink(missing_ok=True)
-        previous = self.path / _PREVIOUS
-        if previous.is_dir():
-            previous.rename(self.path / _MOVING)
-            self._put_back()
-        if self.path.is_dir() and not any(self.path.iterdir()):
-            self.path.rmdir()
+        with held(self.path, SESSION, overwrite=overwrite) as place, place.replaced():
+            yield
 
     def require(self) -> None:
         """Check that there is a session, and warn where its run did not end.
@@ -206,21 +121,21 @@ class SessionFolder:
             raise StoreError(f"{self.path}: {what}; expected what `hybridmap map SOURCE --out DIR` writes")
 
     def _why_unended(self) -> str:
-        if is_being_written(self.path):
+        if is_held(self.path):
             return "is still being written: this is the map so far"
         broken_off = "its run was broken off: this is the map up to there"
-        previous = self.path / _PREVIOUS
+        previous = self.path / PREVIOUS
         if not _ended(previous):
             return broken_off
         return f"{broken_off}; the finished session that it was to replace is {previous}: move it elsewhere to have it back"
 
     def write_config(self, config_yaml: str) -> None:
         """Write the resolved configuration."""
-        write_text_atomic(self.config_yaml, config_yaml)
+        write_text(self.config_yaml, config_yaml)
 
     def write_metrics(self, head: dict[str, Any], metrics: Iterable[Metric]) -> None:
         """Write `metrics.json`, replacing what was there, in one move."""
-        write_text_atomic(self.metrics_json, to_json(head, metrics) + "\n")
+        write_text(self.metrics_json, to_json(head, metrics) + "\n")
 
     def read_metrics(self) -> MetricsFile:
         """The figures so far; empty if there are none.
@@ -250,8 +165,8 @@ class SessionFolder:
         rows |= {metric.name: metric for metric in metrics}
         try:
             self.write_metrics(before.head, rows.values())
-        except OSError as error:
-            log.warning("%s: cannot be written: %s; the figures are not kept", self.metrics_json, error.strerror)
+        except OutputError as error:
+            log.warning("%s; the figures are not kept", error)
 
     def write_trajectory(self, name: str, trajectory: Trajectory) -> None:
         """Write an estimate: `odometry`, `<backend>` or `<backend>_online`."""

@@ -37,7 +37,7 @@ class Outcomes:
 
 
 def run(grid: Grid, folder: StudyFolder, pool: Pool, progress: Progress | None = None) -> Outcomes:
-    """Compute what the folder does not know yet; call it within `folder.in_use()`.
+    """Compute what the folder does not know yet; the folder is held as `STUDY_FOLDER`.
 
     Killed at any time, it goes on from there the next time; the results are the same bit for bit.
 
@@ -48,7 +48,8 @@ def run(grid: Grid, folder: StudyFolder, pool: Pool, progress: Progress | None =
         progress: called with cells done and their total, after each cell.
 
     Raises:
-        StudyError: the folder cannot be written to, or the workers have other code or libraries than this process.
+        OutputError: the folder cannot be written to.
+        StudyError: the workers have other code or libraries than this process.
     """
     unique = {cell.key: cell for cell in grid.cells}
     results = {key: result for key in unique if (result := folder.result(key)) is not None}

@@ -7,17 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hybridmap.errors import StudyError
 from hybridmap.metrics import Metric, to_json
+from hybridmap.output import held, write_text
 from hybridmap.study import provenance, tables
 from hybridmap.study.cell import CellResult
-from hybridmap.study.folder import CELLS_CSV, METRICS, STUDY, SUMMARY_CSV, TIMINGS_CSV, StudyFolder
+from hybridmap.study.folder import CELLS_CSV, METRICS, STUDY, STUDY_FOLDER, SUMMARY_CSV, TIMINGS_CSV, StudyFolder
 from hybridmap.study.grid import Cell, Grid, lay_out
 from hybridmap.study.model import StudyConfig, quoted
 from hybridmap.study.pools import Pool
 from hybridmap.study.runner import Progress, run
 from hybridmap.study.statistics import Summary, summarise
-from hybridmap.trajectory import write_text_atomic
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +53,13 @@ def run_study(study: StudyConfig, out: Path, pool: Pool, progress: Progress | No
     The folder gets `study.yaml`, `cells.csv`, `timings.csv`, `summary.csv` and `metrics.json`.
 
     Raises:
-        StudyError: the folder cannot be used, or the workers cannot be.
+        OutputError: the folder cannot be used, or another run is writing there.
+        StudyError: the workers cannot be used.
         GraphError, StoreError, StreamError, ConfigError: a source cannot be used; nothing has been written then.
     """
     folder = StudyFolder(out)
-    folder.check()
-    grid = lay_out(study)
-    with folder.in_use():
+    with held(out, STUDY_FOLDER):
+        grid = lay_out(study)
         outcomes = run(grid, folder, pool, progress)
         summaries = summarise(grid, outcomes.results)
         head = _head(grid, outcomes.results)
@@ -72,11 +71,8 @@ def run_study(study: StudyConfig, out: Path, pool: Pool, progress: Progress | No
             SUMMARY_CSV: tables.summary_csv(summaries),
             METRICS: to_json(head, metrics) + "\n",
         }
-        try:
-            for name, text in texts.items():
-                write_text_atomic(out / name, text)
-        except OSError as error:
-            raise StudyError(f"{out}: cannot be written to: {error.strerror}") from None
+        for name, text in texts.items():
+            write_text(out / name, text)
     return Study(folder, grid, outcomes.results, summaries, outcomes.computed, head, metrics)
 
 

@@ -7,31 +7,29 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from hybridmap.errors import StoreError
 from hybridmap.metrics import Metric, to_json
+from hybridmap.output import Held, Kind, write_text
 from hybridmap.report import tables
-from hybridmap.report.template import rendered
-from hybridmap.trajectory import write_text_atomic
+from hybridmap.report.template import is_page, rendered
 from hybridmap.verification import Verification, figures, maps_figure
 from hybridmap.verification.rows import recurrence_verdict
 
 PAGE, METRICS = "verify.html", "metrics.json"
+VERIFICATION = Kind("verification", (PAGE, METRICS), lambda folder: is_page(folder / PAGE))
 _TEMPLATE = "verify.html.j2"
 
 
-def write_verification(folder: Path, head: dict[str, Any], rows: Sequence[Metric], result: Verification) -> Path:
-    """Write `metrics.json` and `verify.html`; returns the page.
+def write_verification(place: Held, head: dict[str, Any], rows: Sequence[Metric], result: Verification) -> Path:
+    """Write `metrics.json` and `verify.html` into a folder that is held as `VERIFICATION`; returns the page.
 
     Raises:
-        StoreError: the folder cannot be written to.
+        OutputError: it cannot be written to.
     """
     text = _render(head, rows, result)
-    try:
-        write_text_atomic(folder / METRICS, to_json(head, rows) + "\n")
-        write_text_atomic(folder / PAGE, text)
-    except OSError as error:
-        raise StoreError(f"{folder}: cannot be written to: {error.strerror}") from None
-    return folder / PAGE
+    with place.replaced():
+        write_text(place.path / METRICS, to_json(head, rows) + "\n")
+        write_text(place.path / PAGE, text)
+    return place.path / PAGE
 
 
 def _scale_of(result: Verification) -> dict[str, str]:

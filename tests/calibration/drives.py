@@ -123,21 +123,20 @@ def write_session(folder, one, rng, registered=True, gains=None, changes=(), pos
         f"sensors: {sensors}\n"
     )
     session = SessionFolder(folder)
-    session.prepare()
-    session.write_config(config)
-    with MapStore.create(folder, config, rig or Rig(), "drive") as store:
-        for number, node in enumerate(experiences.nodes):
-            store.add_node(number, node, experiences.initial[number], {}, {})
-        for number, edge in enumerate(experiences.edges):
-            store.put_edge(number, edge)
-        nodes = np.searchsorted(chosen, np.arange(len(odometry)), side="right") - 1
-        for stamp, node, pose in zip(one.motion.stamps_ns, nodes, odometry, strict=True):
-            store.add_track(int(stamp), int(node), np.zeros(3), pose)
-        report = SolveReport("gtsam-cauchy", SolveStatus.CONVERGED, "done", 5, 10.0, 1.0, 0.1)
-        store.put_info("graph_hash", "0")
-        store.put_solution("gtsam-cauchy", one.truth[chosen] if poses is None else poses, report)
-        if changes:
-            store.put_info("gain_changes", [list(change) for change in changes])
-    session.write_metrics({"primary_backend": "gtsam-cauchy"}, [])
-    session.keep()
+    with session.writing():
+        session.write_config(config)
+        with MapStore.create(folder, config, rig or Rig(), "drive") as store:
+            for number, node in enumerate(experiences.nodes):
+                store.add_node(number, node, experiences.initial[number], {}, {})
+            for number, edge in enumerate(experiences.edges):
+                store.put_edge(number, edge)
+            nodes = np.searchsorted(chosen, np.arange(len(odometry)), side="right") - 1
+            for stamp, node, pose in zip(one.motion.stamps_ns, nodes, odometry, strict=True):
+                store.add_track(int(stamp), int(node), np.zeros(3), pose)
+            report = SolveReport("gtsam-cauchy", SolveStatus.CONVERGED, "done", 5, 10.0, 1.0, 0.1)
+            store.put_info("graph_hash", "0")
+            store.put_solution("gtsam-cauchy", one.truth[chosen] if poses is None else poses, report)
+            if changes:
+                store.put_info("gain_changes", [list(change) for change in changes])
+        session.write_metrics({"primary_backend": "gtsam-cauchy"}, [])
     return folder

@@ -85,7 +85,7 @@ def test_a_file_that_is_there_is_replaced_only_when_asked(monkeypatch, capsys, s
     out.write_text("mine")
     code, printed, errors = run(monkeypatch, capsys, "calibrate", session, "--out", out)
     assert (code, printed, out.read_text()) == (2, "", "mine")
-    assert "exists already; give --overwrite" in errors
+    assert "exists already; choose another name or give --overwrite" in errors
     assert run(monkeypatch, capsys, "calibrate", session, "--out", out, "--overwrite")[0] == 0
     assert Config.load(out).neural.gain != 1.0
     code, _, errors = run(monkeypatch, capsys, "calibrate", session, "--out", tmp_path, "--overwrite")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from hybridmap.errors import ExportError, StoreError
+from hybridmap.errors import ExportError, OutputError, StoreError
 from hybridmap.export import FORMATS, ExportOptions, export_session
 from hybridmap.geometry import between, compose, log
 from hybridmap.graph.io import read_graph
@@ -199,12 +199,12 @@ def test_grid_has_walls_free_room_and_the_right_origin(folder, depth_folder, tmp
 
 def test_files_in_the_way_stay_unless_overwritten(folder, tmp_path):
     (tmp_path / "map.pgm").write_text("mine")
-    with pytest.raises(ExportError, match=r"map\.pgm: exists already"):
+    with pytest.raises(OutputError, match=r"map\.pgm: exists already"):
         export_session(folder, "grid", tmp_path / "map.yaml", options=OPTIONS)
     assert [path.name for path in tmp_path.iterdir()] == ["map.pgm"]
     export_session(folder, "grid", tmp_path / "map.yaml", options=OPTIONS, overwrite=True)
     assert (tmp_path / "map.pgm").read_bytes().startswith(b"P5")
-    with pytest.raises(ExportError, match="is a folder"):
+    with pytest.raises(OutputError, match="is a folder"):
         export_session(folder, "tum", tmp_path)
 
 

@@ -8,8 +8,9 @@ import pytest
 from hybridmap.backends import comparison
 from hybridmap.backends.base import SolveStatus
 from hybridmap.config.backends import BackendsConfig
+from hybridmap.output import held
 from hybridmap.report import comparison_figures
-from hybridmap.report.comparison import Compared, write_comparison
+from hybridmap.report.comparison import COMPARISON, Compared, write_comparison
 from tests.backends.graphs_for_tests import laps
 
 NAMES = ("gtsam-lm", "odometry", "relaxation-ratslam")
@@ -33,7 +34,9 @@ def ended(row, status):
 def page_of(folder, graph, rows):
     cells = [("back-end",), *((row.title,) for row in rows)]
     head = {"nodes": 30, "edges": graph.n_edges, "loops": 18}
-    return write_comparison(folder, Compared("laps", "the start", head, graph, rows, cells, BackendsConfig())).read_text()
+    with held(folder, COMPARISON, overwrite=True) as place:
+        compared = Compared("laps", "the start", head, graph, rows, cells, BackendsConfig())
+        return write_comparison(place, compared).read_text()
 
 
 @pytest.mark.parametrize("status", list(SolveStatus))

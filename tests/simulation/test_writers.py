@@ -9,7 +9,7 @@ import pytest
 
 from hybridmap.config import Config
 from hybridmap.config.inputs import CameraConfig, SimulationConfig
-from hybridmap.errors import StreamError
+from hybridmap.errors import OutputError, StreamError
 from hybridmap.geometry import quaternion_from_yaw, rotation_from_quaternion, yaw_from_quaternion
 from hybridmap.simulation import SimulatedStream
 from hybridmap.simulation.writers import write_rosbag1, write_rosbag2, write_tum
@@ -106,7 +106,7 @@ def test_what_is_there_is_kept_unless_told_otherwise(name, stream, tmp_path):
     path = tmp_path / name
     WRITERS[name](stream, path)
     before = {file: file.stat().st_mtime_ns for file in [path, *path.rglob("*")]}
-    with pytest.raises(StreamError, match=r"exists already.*--overwrite"):
+    with pytest.raises(OutputError, match=r"already.*--overwrite"):
         WRITERS[name](stream, path)
     assert {file: file.stat().st_mtime_ns for file in before} == before
     WRITERS[name](stream, path, overwrite=True)
@@ -116,7 +116,7 @@ def test_what_is_there_is_kept_unless_told_otherwise(name, stream, tmp_path):
 def test_a_folder_that_is_no_recording_is_never_replaced(stream, tmp_path):
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious" / "thesis.txt").write_text("years of work")
-    with pytest.raises(StreamError, match="no recording"):
+    with pytest.raises(OutputError, match="no recording"):
         write_tum(stream, tmp_path / "precious", overwrite=True)
     assert (tmp_path / "precious" / "thesis.txt").read_text() == "years of work"
 

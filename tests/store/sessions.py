@@ -92,36 +92,35 @@ def write_session(
 ) -> SessionFolder:
     """A whole session folder around a map; the `solver` of its one back-end knows the truth."""
     session = SessionFolder(folder)
-    session.prepare()
-    session.write_config("backends:\n  names: [gtsam-lm]\n")
-    node_stamps = np.array([node.stamp_ns for node in experiences.nodes])
-    truth = truth_at(node_stamps)
-    with MapStore.create(folder, "backends:\n  names: [gtsam-lm]\n", rig, "circle") as store:
-        initial = experiences.pose_graph().initial
-        for number, node in enumerate(experiences.nodes):
-            frame = keyframe_of(number, truth) if keyframes else {}
-            store.add_node(number, node, initial[number], frame, {"phases": np.arange(4.0)})
-            store.commit()
-        for number, edge in enumerate(experiences.edges):
-            store.put_edge(number, edge)
-        stamps = np.arange(0, node_stamps[-1] + SECOND // 2, SECOND // 10)
-        odometry = odometry_of(truth_at(stamps))
-        nodes = np.minimum(stamps // SECOND, len(experiences) - 1)
-        for stamp, node, pose in zip(stamps, nodes, odometry, strict=True):
-            delta = between(odometry[int(node) * 10], pose)
-            store.add_track(int(stamp), int(node), delta, pose)
-            store.add_online("gtsam-lm", int(stamp), pose)
-        if solve:
-            report = SolveReport("gtsam-lm", SolveStatus.CONVERGED, "done", 5, 10.0, 1.0, 0.1)
-            store.put_solution("gtsam-lm", truth, report)
-        if ended:
-            store.put_info("graph_hash", "0")
-        track = store.track()
-        session.write_trajectory("odometry", track.odometry)
-        session.write_trajectory("gtsam-lm_online", store.online("gtsam-lm"))
-        if solve:
-            session.write_trajectory("gtsam-lm", trajectory_of(track, truth))
-    session.write_groundtruth(Trajectory(stamps, truth_at(stamps)))
-    session.write_metrics({"graph_hash": "0", "primary_backend": "gtsam-lm", "backends": ["gtsam-lm"]}, [])
-    session.keep()
+    with session.writing():
+        session.write_config("backends:\n  names: [gtsam-lm]\n")
+        node_stamps = np.array([node.stamp_ns for node in experiences.nodes])
+        truth = truth_at(node_stamps)
+        with MapStore.create(folder, "backends:\n  names: [gtsam-lm]\n", rig, "circle") as store:
+            initial = experiences.pose_graph().initial
+            for number, node in enumerate(experiences.nodes):
+                frame = keyframe_of(number, truth) if keyframes else {}
+                store.add_node(number, node, initial[number], frame, {"phases": np.arange(4.0)})
+                store.commit()
+            for number, edge in enumerate(experiences.edges):
+                store.put_edge(number, edge)
+            stamps = np.arange(0, node_stamps[-1] + SECOND // 2, SECOND // 10)
+            odometry = odometry_of(truth_at(stamps))
+            nodes = np.minimum(stamps // SECOND, len(experiences) - 1)
+            for stamp, node, pose in zip(stamps, nodes, odometry, strict=True):
+                delta = between(odometry[int(node) * 10], pose)
+                store.add_track(int(stamp), int(node), delta, pose)
+                store.add_online("gtsam-lm", int(stamp), pose)
+            if solve:
+                report = SolveReport("gtsam-lm", SolveStatus.CONVERGED, "done", 5, 10.0, 1.0, 0.1)
+                store.put_solution("gtsam-lm", truth, report)
+            if ended:
+                store.put_info("graph_hash", "0")
+            track = store.track()
+            session.write_trajectory("odometry", track.odometry)
+            session.write_trajectory("gtsam-lm_online", store.online("gtsam-lm"))
+            if solve:
+                session.write_trajectory("gtsam-lm", trajectory_of(track, truth))
+        session.write_groundtruth(Trajectory(stamps, truth_at(stamps)))
+        session.write_metrics({"graph_hash": "0", "primary_backend": "gtsam-lm", "backends": ["gtsam-lm"]}, [])
     return session

@@ -1,89 +1,25 @@
 from __future__ import annotations
 
-import fcntl
 import json
 import math
-import os
-import shutil
-import threading
-from pathlib import Path
 
 import pytest
 
-from hybridmap.errors import StoreError
+from hybridmap.errors import OutputError, StoreError
 from hybridmap.metrics import Metric
 from hybridmap.store import MapStore, SessionFolder
-from hybridmap.store.lock import is_being_written
 from hybridmap.streams.base import Rig
 from tests.store.sessions import ring_map, write_session
-
-
-def test_a_session_is_refused_unless_overwritten_and_strangers_stay(tmp_path):
-    session = write_session(tmp_path / "s", ring_map())
-    (tmp_path / "s" / "notes.txt").write_text("mine")
-    with pytest.raises(StoreError, match="holds a session already"):
-        session.prepare()
-    session.prepare(overwrite=True)
-    assert not session.map_db.exists()
-    MapStore.create(session.path, "{}", Rig(), "new").close()
-    session.keep()
-    assert sorted(path.name for path in (tmp_path / "s").iterdir()) == ["map.db", "notes.txt"]
-
-
-def test_a_failed_overwrite_brings_the_old_session_back(tmp_path):
-    session = write_session(tmp_path / "s", ring_map())
-    before = session.map_db.read_bytes()
-    session.prepare(overwrite=True)
-    MapStore.create(session.path, "{}", Rig(), "new").close()
-    session.discard()
-    assert session.map_db.read_bytes() == before
-    assert session.groundtruth.is_file()
-    assert not (session.path / ".previous").exists()
-
-
-def write_and_fail(session, error):
-    session.write_config("{}")
-    MapStore.create(session.path, "{}", Rig(), "new").close()
-    raise error
-
-
-@pytest.mark.parametrize("error", [MemoryError, ZeroDivisionError, StoreError])
-def test_a_failed_run_leaves_nothing_and_loses_nothing(tmp_path, error):
-    old, new = write_session(tmp_path / "old", ring_map()), SessionFolder(tmp_path / "new")
-    before = old.map_db.read_bytes()
-    for session in (old, new):
-        with pytest.raises(error), session.writing(overwrite=True):
-            write_and_fail(session, error)
-    assert old.map_db.read_bytes() == before
-    assert not (tmp_path / "new").exists()
-
-
-def test_two_runs_do_not_write_one_folder(tmp_path):
-    session = SessionFolder(tmp_path / "s")
-    with session.writing():
-        for overwrite in (False, True):
-            with pytest.raises(StoreError, match="is being written by another run"), session.writing(overwrite=overwrite):
-                pass
-        session.write_config("{}")
-    with session.writing(overwrite=True):
-        assert list(session.path.iterdir()) == [session.path / ".previous"]
-
-
-def test_a_look_at_a_folder_does_not_keep_a_run_from_starting(tmp_path):
-    looking = os.open(tmp_path, os.O_RDONLY)
-    fcntl.flock(looking, fcntl.LOCK_SH)  # as one that asks whether it is being written
-    look = threading.Timer(0.05, os.close, [looking])
-    look.start()
-    with SessionFolder(tmp_path).writing():
-        assert is_being_written(tmp_path)
-    look.join()
 
 
 def killed_while_it_overwrote(folder):
     """What such a run leaves, and the map of the session that was there before."""
     session = write_session(folder, ring_map())
     before = session.map_db.read_bytes()
-    session.prepare(overwrite=True)
+    (folder / ".previous").mkdir()
+    for entry in sorted(folder.iterdir()):
+        if entry.name != ".previous":
+            entry.rename(folder / ".previous" / entry.name)
     MapStore.create(session.path, "{}", Rig(), "new").close()
     return session, before
 
@@ -116,74 +52,38 @@ def test_the_next_run_puts_a_finished_session_back_first(tmp_path):
     assert session.map_db.read_bytes() == before
 
 
-class Killed(BaseException):
-    """Nothing that the run still tries comes to pass."""
-
-
-def overwritten_and_failed(folder):
-    with pytest.raises((MemoryError, Killed)), SessionFolder(folder).writing(overwrite=True):
-        write_and_fail(SessionFolder(folder), MemoryError)
-
-
-def test_a_kill_while_files_are_moved_loses_none(tmp_path, monkeypatch):
-    write_session(tmp_path / "s", ring_map(0.1))
-    before = contents(tmp_path / "s")
-    rename = Path.rename
-    done: list[Path] = []
-
-    def killed_at(last):
-        def renamed(path, target):
-            if len(done) == last:
-                raise Killed
-            done.append(target)
-            return rename(path, target)
-
-        return renamed
-
-    for last in range(14):  # six moves set it aside, six bring it back
-        shutil.copytree(tmp_path / "s", tmp_path / str(last))
-        done.clear()
-        with monkeypatch.context() as patch:
-            patch.setattr(Path, "rename", killed_at(last))
-            overwritten_and_failed(tmp_path / str(last))
-        overwritten_and_failed(tmp_path / str(last))
-        assert contents(tmp_path / str(last)) == before
-    assert len(done) < last  # the last of them was not killed at all
-
-
-def contents(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def test_what_a_finished_session_replaced_does_not_come_back(tmp_path):
-    """Killed between the end of its run and the removal of the session set aside."""
-    session = write_session(tmp_path / "s", ring_map())
-    before = session.map_db.read_bytes()
-    (tmp_path / "s" / ".previous").mkdir()
-    (tmp_path / "s" / ".previous" / "config.yaml").write_text("{}")
-    with pytest.raises(MemoryError), session.writing(overwrite=True):
-        raise MemoryError
-    assert session.map_db.read_bytes() == before
-
-
-def test_a_folder_of_something_else_is_refused_even_with_overwrite(tmp_path):
-    (tmp_path / "thesis.tex").write_text("x")
-    for overwrite in (False, True):
-        with pytest.raises(StoreError, match=r"no session.*thesis\.tex"):
-            SessionFolder(tmp_path).prepare(overwrite=overwrite)
-    assert (tmp_path / "thesis.tex").read_text() == "x"
-    with pytest.raises(StoreError, match="is a file"):
-        SessionFolder(tmp_path / "thesis.tex").prepare()
+def test_a_run_that_is_refused_leaves_what_a_killed_one_mapped(tmp_path):
+    session, _ = killed_while_it_overwrote(tmp_path / "s")
+    so_far = session.map_db.read_bytes()
+    with pytest.raises(OutputError, match="holds a session already"), session.writing():
+        pass
+    assert session.map_db.read_bytes() == so_far
 
 
 def test_remains_of_a_run_that_died_early_can_be_overwritten(tmp_path):
-    session = SessionFolder(tmp_path)
+    session = SessionFolder(tmp_path / "s")
     session.write_config("{}")
-    with pytest.raises(StoreError, match="holds a session already"):
-        session.prepare()
-    session.prepare(overwrite=True)
-    session.keep()
-    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(OutputError, match="holds a session already"), session.writing():
+        pass
+    with session.writing(overwrite=True):
+        assert not session.config_yaml.exists()
+        session.write_config("new")
+    assert session.config_yaml.read_text() == "new"
+
+
+def test_a_reader_does_not_keep_a_run_from_its_end(tmp_path):
+    session = SessionFolder(tmp_path / "s")
+    with session.writing():
+        store = MapStore.create(session.path, "{}", Rig(), "new")
+        reader = MapStore.open(session.path)
+        assert not reader.ended
+        store.put_info("graph_hash", "0")
+        store.close()
+    assert reader.ended
+    reader.close()
+    session.require()
+    with MapStore.open(session.path) as store:
+        assert store.ended
 
 
 def test_metrics_are_merged_by_name_and_keep_the_head(tmp_path):

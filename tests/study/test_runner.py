@@ -5,11 +5,12 @@ import multiprocessing
 
 import pytest
 
-from hybridmap.errors import StudyError
+from hybridmap.errors import OutputError, StudyError
+from hybridmap.output import held
 from hybridmap.report.study_page import write_study_page
 from hybridmap.study import cell as cells
 from hybridmap.study import provenance, runner
-from hybridmap.study.folder import StudyFolder
+from hybridmap.study.folder import STUDY_FOLDER
 from hybridmap.study.pools import LocalProcesses, ThisProcess
 from hybridmap.study.study import run_study
 from tests.study.studies import small
@@ -140,7 +141,7 @@ def test_a_source_that_fails_is_a_status_of_its_cells_and_the_others_go_on(tmp_p
 
 
 def hold(path, ready, done):
-    with StudyFolder(path).in_use():
+    with held(path, STUDY_FOLDER):
         ready.set()
         done.wait(30)
 
@@ -151,15 +152,15 @@ def test_a_folder_is_used_by_one_run_at_a_time_and_by_nothing_else(tmp_path):
     other = context.Process(target=hold, args=(tmp_path / "study", ready, done))
     other.start()
     assert ready.wait(30)
-    with pytest.raises(StudyError, match="another run"):
+    with pytest.raises(OutputError, match="another run"):
         run_study(small(), tmp_path / "study", ThisProcess())
     other.kill()  # a killed run holds nothing
     other.join()
     assert run_study(small(), tmp_path / "study", ThisProcess()).computed == 18
     (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(StudyError, match=r"it holds 'mine.txt'"):
+    with pytest.raises(OutputError, match=r"it holds 'mine.txt'"):
         run_study(small(), tmp_path, ThisProcess())
-    with pytest.raises(StudyError, match="is a file"):
+    with pytest.raises(OutputError, match="is a file"):
         run_study(small(), tmp_path / "mine.txt", ThisProcess())
 
 

@@ -7,8 +7,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hybridmap.errors import StreamError
-from hybridmap.simulation.writers.messages import TF_TYPE, WORLD_FRAME, MessageFactory, twist_between
-from hybridmap.simulation.writers.staging import Progress, silent, staged
+from hybridmap.output import staged
+from hybridmap.simulation.writers.messages import (
+    RECORDING,
+    TF_TYPE,
+    WORLD_FRAME,
+    MessageFactory,
+    Progress,
+    silent,
+    twist_between,
+)
 from hybridmap.streams.base import SelfMotion, Stream
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
@@ -42,14 +50,15 @@ def write_rosbag1(stream: Stream, path: Path, *, overwrite: bool = False, progre
         Number of messages a topic.
 
     Raises:
-        StreamError: the place is taken or cannot be written to, or the stream holds what a bag cannot.
+        OutputError: the place is taken or cannot be written to.
+        StreamError: the stream holds what a bag cannot.
     """
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC)
     store.register(get_types_from_msg(_TF_DEFINITION, TF_TYPE))
-    with staged(path, overwrite=overwrite) as partial, Writer(partial) as writer:
+    with staged(path, kind=RECORDING, overwrite=overwrite) as work, Writer(work / path.name) as writer:
 
         def connect(topic: str) -> Any:
             return writer.add_connection(topic, _TYPES[topic], typestore=store, latching=int(topic == TF_STATIC))
@@ -79,17 +88,18 @@ def write_rosbag2(
         Number of messages a topic.
 
     Raises:
-        StreamError: the place is taken or cannot be written to, or the stream holds what a bag cannot.
+        OutputError: the place is taken or cannot be written to.
+        StreamError: the stream holds what a bag cannot.
     """
     suffix = _SUFFIXES[storage]
     bare = path.suffix.lower() in _SUFFIXES.values()
     if bare and path.suffix.lower() != suffix:
         raise StreamError(f"{path}: a {storage} bag ends in {suffix}")
-    with staged(path, overwrite=overwrite) as partial:
-        folder = partial.with_suffix("") if bare else partial
+    with staged(path, kind=RECORDING, overwrite=overwrite) as work:
+        folder = work / (path.stem if bare else path.name)
         counts = _write_folder(stream, folder, storage, progress)
         if bare:
-            next(folder.glob(f"*{suffix}")).rename(partial)
+            next(folder.glob(f"*{suffix}")).rename(work / path.name)
     return counts
 
 

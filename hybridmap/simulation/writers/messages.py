@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.geometry import Array, between, log
+from hybridmap.output import Kind
 from hybridmap.simulation.writers.mounting import quaternion_of_rotation
 from hybridmap.simulation.writers.quaternions import quaternion_of
 from hybridmap.streams.base import SelfMotion
@@ -20,6 +23,21 @@ BASE_FRAME, ODOM_FRAME, WORLD_FRAME = "base_link", "odom", "world"
 CAMERA_FRAME, LASER_FRAME = "camera_color_optical_frame", "laser"
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 _MM_PER_M = 1000.0
+
+Progress = Callable[[int, int | None], None]
+"""Called with the observations written so far and their number."""
+
+
+def silent(done: int, total: int | None) -> None:
+    """The progress of somebody who does not watch."""
+
+
+def _is_recording(folder: Path) -> bool:
+    return any((folder / sign).is_file() for sign in ("metadata.yaml", "associations.txt"))
+
+
+RECORDING = Kind("recording", (), _is_recording)
+"""A ROS 2 bag or a TUM folder; `--overwrite` replaces it whole."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array
-from hybridmap.simulation.writers.messages import millimetres
+from hybridmap.output import staged
+from hybridmap.simulation.writers.messages import RECORDING, Progress, millimetres, silent
 from hybridmap.simulation.writers.mounting import quaternion_of_rotation
 from hybridmap.simulation.writers.quaternions import quaternion_of
-from hybridmap.simulation.writers.staging import Progress, silent, staged
 from hybridmap.streams.base import SelfMotion, Stream
 from hybridmap.streams.rgbd import Camera, RgbdFrame
 from hybridmap.trajectory import format_stamp
@@ -37,13 +37,15 @@ def write_tum(stream: Stream, folder: Path, *, overwrite: bool = False, progress
         Number of poses, of frames, and of scans that such a folder cannot hold and that were left out.
 
     Raises:
-        StreamError: the stream has no camera, the place is taken or cannot be written to, depth beyond 13.1 m.
+        OutputError: the place is taken or cannot be written to.
+        StreamError: the stream has no camera, or depth beyond 13.1 m.
     """
     camera = stream.rig.sensors.get("camera")
     if camera is None:
         raise StreamError(f"{folder}: a TUM folder holds colour and depth, and {stream.name} has no camera; write a bag")
     left_out = 0
-    with staged(folder, overwrite=overwrite) as partial:
+    with staged(folder, kind=RECORDING, overwrite=overwrite) as work:
+        partial = work / folder.name
         for name in ("rgb", "depth"):
             (partial / name).mkdir(parents=True)
         odometry: list[str] = []

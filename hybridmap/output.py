@@ -1,0 +1,321 @@
+"""What commands write: held against other runs, replaced whole or not at all, and whole again after a kill.
+
+A folder that is written in place, such as a session, is `held`. What is written in one go, such as a recording or an export,
+is `staged` beside its place. What differs between them is a `Kind`.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from hybridmap.errors import OutputError
+
+PREVIOUS = ".previous"
+"""The output that is being replaced lies whole in this folder of the held one."""
+
+_MOVING = ".previous.partial"  # on the way to `PREVIOUS` or back: a kill may leave part of an output here
+_DROPPED = ".dropped.partial"  # replaced for good: a kill may leave part of it here
+_TAKEN = (errno.EWOULDBLOCK, errno.EACCES)
+_TRIES, _PAUSE_S = 10, 0.02  # `is_held` takes a lock too, for an instant
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of output folder.
+
+    Attributes:
+        name: what messages call it.
+        files: names of its files and folders; nothing else in the folder is ever touched.
+        is_ours: whether a folder holds an output of this kind.
+        continued: the next run goes on with what is there, and need not be told to overwrite it.
+        useful_unfinished: what a run wrote before Ctrl-C is worth keeping.
+    """
+
+    name: str
+    files: tuple[str, ...]
+    is_ours: Callable[[Path], bool]
+    continued: bool = False
+    useful_unfinished: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """A folder that is held, as `held` gives it."""
+
+    path: Path
+    kind: Kind
+
+    @contextmanager
+    def replaced(self) -> Iterator[None]:
+        """Set the old output aside while the block writes the new one; an error brings it back, the end drops it."""
+        with _named(self.path):
+            self._set_aside()
+        try:
+            yield
+        except BaseException as error:
+            new = not (self.path / PREVIOUS).is_dir()
+            if not (new and self.kind.useful_unfinished and isinstance(error, KeyboardInterrupt)):
+                self._restore()
+            raise
+        if (self.path / PREVIOUS).is_dir():
+            (self.path / PREVIOUS).rename(self.path / _DROPPED)  # from here on a kill does not bring it back
+            shutil.rmtree(self.path / _DROPPED, ignore_errors=True)
+
+    def _admit(self, *, overwrite: bool) -> None:
+        """Repair what a killed run left, and refuse what must not be written to."""
+        previous = self.path / PREVIOUS
+        _refuse_strangers(self.path, self.kind, previous, self.path / _MOVING)
+        self._move_back()
+        shutil.rmtree(self.path / _DROPPED, ignore_errors=True)
+        if not self.kind.continued:
+            _refuse_own(self.path, self.kind, overwrite=overwrite)
+        if overwrite and self.kind.is_ours(previous):
+            self._restore()  # of the two, the one set aside is known to be whole
+        for entry in map(self.path.joinpath, self.kind.files):
+            for partial in (_partial(entry), *entry.rglob(".*.partial")):
+                if partial.is_file():
+                    partial.unlink()
+        if not os.access(self.path, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    def _set_aside(self) -> None:
+        ours = [entry for entry in map(self.path.joinpath, self.kind.files) if entry.exists()]
+        moving = self.path / _MOVING
+        try:
+            if ours:
+                moving.mkdir()
+                for entry in ours:
+                    entry.rename(moving / entry.name)
+                moving.rename(self.path / PREVIOUS)
+        except BaseException:
+            self._move_back()
+            raise
+
+    def _move_back(self) -> None:
+        moving = self.path / _MOVING
+        if moving.is_dir():
+            for entry in sorted(moving.iterdir()):
+                entry.rename(self.path / entry.name)
+            moving.rmdir()
+
+    def _restore(self) -> None:
+        """Remove the new output and bring back the one that was set aside, if there is one."""
+        for name in self.kind.files:
+            _remove(self.path / name)
+        if (self.path / PREVIOUS).is_dir():
+            (self.path / PREVIOUS).rename(self.path / _MOVING)
+            self._move_back()
+
+
+@contextmanager
+def held(folder: Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Held]:
+    """Make a folder for an output of a kind and hold it against other runs in the block.
+
+    If the block leaves the folder empty it goes again, with the parents that were made for it.
+
+    Raises:
+        OutputError: it is a file, holds something else, holds one of the kind and `overwrite` is not given, another run
+            is writing there, or it cannot be written to.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file; expected a folder that is empty or does not exist")
+    place = Held(folder, kind)
+    with ExitStack() as stack:
+        with _named(folder):
+            stack.enter_context(_locked(folder, folder))
+            place._admit(overwrite=overwrite)
+        yield place
+
+
+@contextmanager
+def staged(*targets: Path, kind: Kind | None = None, overwrite: bool = False) -> Iterator[Path]:
+    """Yield a folder beside the targets; what the block writes there under their names takes their places at its end.
+
+    An error leaves everything as it was.
+
+    Args:
+        targets: files side by side; with a `kind`, a file or a folder of that kind, which is replaced whole.
+        kind: of the folder.
+        overwrite: replace what is there.
+
+    Raises:
+        OutputError: a target is there and may not be replaced, another run is writing it, or it cannot be written.
+    """
+    work = targets[0].absolute()
+    work = work.with_name(f".{work.name}.new")
+    with _named(targets[0]), ExitStack() as stack:
+        _refuse(targets, kind, overwrite=overwrite)
+        stack.enter_context(_locked(work, targets[0]))
+        _clear(work, targets[0])
+        stack.callback(_put_away, work, targets[0])
+        _refuse(targets, kind, overwrite=overwrite)
+        yield work
+        for target in reversed(targets):
+            _take_place(work / target.name, target)
+
+
+def is_held(folder: Path) -> bool:
+    """Whether a run writes in a folder now."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        return not _take(handle, fcntl.LOCK_SH)
+    finally:
+        os.close(handle)
+
+
+def holds_only(folder: Path, names: tuple[str, ...]) -> bool:
+    """Whether there is something in a folder, and nothing but these names and what this module hides there."""
+    found = _entries(folder) - {PREVIOUS, _MOVING, _DROPPED}
+    return bool(found) and found <= set(names)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in one move, so that a reader or a crash never meets half of it; makes the folder.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """The same for any file."""
+    partial = _partial(path)
+    with _named(path):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with partial.open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(path)
+        except OSError:
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
+            raise
+
+
+def _partial(path: Path) -> Path:
+    return path.with_name(f".{path.name}.partial")
+
+
+def _entries(folder: Path) -> set[str]:
+    """What is in a folder, half-written files apart; empty where there is no folder."""
+    entries = folder.iterdir() if folder.is_dir() else ()
+    return {entry.name for entry in entries if entry.is_dir() or not (entry.name[0] == "." and entry.suffix == ".partial")}
+
+
+def _refuse(targets: tuple[Path, ...], kind: Kind | None, *, overwrite: bool) -> None:
+    for target in targets:
+        if target.is_dir() and kind is None:
+            raise OutputError(f"{target}: is a folder; name a file")
+        if target.is_dir() and kind is not None:
+            _refuse_strangers(target, kind)
+            _refuse_own(target, kind, overwrite=overwrite)
+        elif target.exists() and not overwrite:
+            raise OutputError(f"{target}: exists already; choose another name or give --overwrite")
+
+
+def _refuse_strangers(folder: Path, kind: Kind, *hidden: Path) -> None:
+    found = sorted(_entries(folder))
+    if found and not any(map(kind.is_ours, (folder, *hidden))):
+        other = next((name for name in found if name not in kind.files), found[0])
+        raise OutputError(f"{folder}: not empty and no {kind.name} (it holds {other!r}); choose another folder")
+
+
+def _refuse_own(folder: Path, kind: Kind, *, overwrite: bool) -> None:
+    if not overwrite and _entries(folder):
+        raise OutputError(f"{folder}: holds a {kind.name} already; choose another folder or give --overwrite")
+
+
+def _clear(work: Path, target: Path) -> None:
+    """Empty the folder of a staged output; the old one is put back if it lies there still, between two moves."""
+    if (work / PREVIOUS).exists() and not target.exists():
+        (work / PREVIOUS).rename(target)
+    for rest in work.iterdir():
+        _remove(rest)
+
+
+def _put_away(work: Path, target: Path) -> None:
+    _clear(work, target)
+    work.rmdir()
+
+
+def _take_place(new: Path, target: Path) -> None:
+    if not new.exists():
+        return
+    if not (target.is_dir() or (new.is_dir() and target.exists())):
+        new.replace(target)
+        return
+    old = new.with_name(PREVIOUS)
+    target.rename(old)
+    try:
+        new.rename(target)
+    except BaseException:
+        old.rename(target)
+        raise
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+@contextmanager
+def _locked(folder: Path, what: Path) -> Iterator[None]:
+    """Make a folder and hold a lock on it: the kernel forgets the lock when the process dies, and nothing is left in it.
+
+    A file system without locks holds nobody off.
+    """
+    made: list[Path] = []
+    handle = _lock(folder, what, made)
+    try:
+        yield
+    finally:
+        for place in made:
+            with suppress(OSError):
+                place.rmdir()
+        os.close(handle)
+
+
+def _lock(folder: Path, what: Path, made: list[Path]) -> int:
+    for _ in range(_TRIES):
+        made += [place for place in (folder, *folder.absolute().parents) if not place.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):  # the run before has just taken it away
+            handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+            if _take(handle, fcntl.LOCK_EX) and _is_at(handle, folder):
+                return handle
+            os.close(handle)
+        time.sleep(_PAUSE_S)
+    raise OutputError(f"{what}: is being written by another run; wait for it or choose another place")
+
+
+def _is_at(handle: int, folder: Path) -> bool:
+    return folder.exists() and os.path.samestat(os.fstat(handle), folder.stat())
+
+
+def _take(handle: int, how: int) -> bool:
+    try:
+        fcntl.flock(handle, how | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno not in _TAKEN
+    return True
