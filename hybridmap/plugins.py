@@ -73,6 +73,13 @@ class Table(Generic[T]):
         return factory
 
 
+def packages() -> dict[str, str]:
+    """Name and version of each installed package that adds to a table of ours."""
+    points = entry_points()
+    ours = (point for group in points.groups if group.startswith("hybridmap.") for point in points.select(group=group))
+    return {point.dist.name: point.dist.version for point in ours if point.dist is not None}
+
+
 def loaded(path: str) -> Any:
     """What `module:name` names, imported now: heavy modules wait until they are needed."""
     return EntryPoint(path, path, "").load()

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import import_module
 from typing import Any
 
 from hybridmap.backends.base import ODOMETRY, Backend
 from hybridmap.backends.judging.prefilter import ConsistentBackend
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
-from hybridmap.plugins import Table
+from hybridmap.plugins import Table, loaded
 
 Factory = Callable[[BackendsConfig], Backend]
 """Makes a back-end, in a fresh state, from the settings of all back-ends."""
@@ -21,11 +20,11 @@ LEAST_SQUARES, ROBUST, RELAXATION = "gtsam-lm", "gtsam-gnc", "relaxation-ratslam
 _NOT_SEQUENTIAL = {ODOMETRY, "gtsam-isam2", "gtsam-gnc", "gtsam-calibrated"}
 
 
-def _ours(name: str, module: str, function: str = "create", **given: Any) -> tuple[str, Factory]:
+def _ours(name: str, path: str, **given: Any) -> tuple[str, Factory]:
     """A row of the table, whose module is imported when the back-end is made."""
 
     def make(config: BackendsConfig) -> Backend:
-        backend: Backend = getattr(import_module(f"hybridmap.backends.{module}"), function)(name, config, **given)
+        backend: Backend = loaded(f"hybridmap.backends.{path}")(name, config, **given)
         return backend
 
     return name, make
@@ -33,22 +32,22 @@ def _ours(name: str, module: str, function: str = "create", **given: Any) -> tup
 
 _OURS = dict(
     (
-        _ours(ODOMETRY, "odometry"),
-        _ours("relaxation-paper", "relaxation.linear", "paper"),
-        _ours("relaxation-normalised", "relaxation.linear", "normalised"),
-        _ours("relaxation-ratslam", "relaxation.ratslam", "plain"),
-        _ours("relaxation-robust", "relaxation.ratslam", "robust"),
-        _ours("relaxation-gtsam-lm", "relaxation.ratslam", "then_least_squares"),
-        _ours("gtsam-lm", "gtsam.batch", method="lm"),
-        _ours("gtsam-gn", "gtsam.batch", method="gn"),
-        _ours("gtsam-dogleg", "gtsam.batch", method="dogleg"),
-        _ours("gtsam-isam2", "gtsam.incremental"),
-        _ours("gtsam-huber", "gtsam.robust", kernel="huber"),
-        _ours("gtsam-cauchy", "gtsam.robust", kernel="cauchy"),
-        _ours("gtsam-dcs", "gtsam.robust", kernel="dcs"),
-        _ours("gtsam-geman-mcclure", "gtsam.robust", kernel="geman-mcclure"),
-        _ours("gtsam-gnc", "gtsam.gnc"),
-        _ours("gtsam-calibrated", "gtsam.calibrated"),
+        _ours(ODOMETRY, "odometry:create"),
+        _ours("relaxation-paper", "relaxation.linear:paper"),
+        _ours("relaxation-normalised", "relaxation.linear:normalised"),
+        _ours("relaxation-ratslam", "relaxation.ratslam:plain"),
+        _ours("relaxation-robust", "relaxation.ratslam:robust"),
+        _ours("relaxation-gtsam-lm", "relaxation.ratslam:then_least_squares"),
+        _ours("gtsam-lm", "gtsam.batch:create", method="lm"),
+        _ours("gtsam-gn", "gtsam.batch:create", method="gn"),
+        _ours("gtsam-dogleg", "gtsam.batch:create", method="dogleg"),
+        _ours("gtsam-isam2", "gtsam.incremental:create"),
+        _ours("gtsam-huber", "gtsam.robust:create", kernel="huber"),
+        _ours("gtsam-cauchy", "gtsam.robust:create", kernel="cauchy"),
+        _ours("gtsam-dcs", "gtsam.robust:create", kernel="dcs"),
+        _ours("gtsam-geman-mcclure", "gtsam.robust:create", kernel="geman-mcclure"),
+        _ours("gtsam-gnc", "gtsam.gnc:create"),
+        _ours("gtsam-calibrated", "gtsam.calibrated:create"),
     )
 )
 _TABLE: Table[Factory] = Table("back-end", _OURS, "hybridmap.backends", BackendError)

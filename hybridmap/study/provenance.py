@@ -12,6 +12,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from hybridmap.plugins import packages
+
 SCHEMA = 1
 """Raised when the meaning of a figure changes."""
 
@@ -53,6 +55,7 @@ def _surroundings() -> dict[str, Any]:
         "hybridmap": version("hybridmap"),
         "machine": platform.machine(),
         "libraries": {name: _version(name) for name in _LIBRARIES},
+        "plugins": packages(),
     }
 
 
