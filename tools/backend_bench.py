@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from hybridmap import backends
 from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph, values
+from hybridmap.backends.relaxation import sweeps
 from hybridmap.backends.relaxation.sweeps import relax_links
 from hybridmap.config.backends import RelaxationConfig
 from hybridmap.geometry import Array, between, compose, exp, wrap_angle
@@ -142,10 +143,11 @@ def sweep_study(data: Path | None) -> Iterator[Metric]:
     """A sweep of the per-link rule against plain Python, all in the same order of links."""
     del data
     graph, theta = drive(1000, 1500, np.random.default_rng(0)), 0.5
-    config = RelaxationConfig(theta=theta, tolerance_m=0.0)
+    sweeps.TOLERANCE_M = 0.0  # no run ends early
+    config = RelaxationConfig(theta=theta)
 
-    def ours(sweeps: int, robust: bool = False) -> Array:
-        return relax_links(graph, graph.initial, sweeps, config, robust=robust).poses
+    def ours(count: int, robust: bool = False) -> Array:
+        return relax_links(graph, graph.initial, count, config, robust=robust).poses
 
     for plain in (loop_over_arrays, loop_over_floats):
         off = ours(20) - plain(graph, theta, 20)
@@ -159,8 +161,8 @@ def sweep_study(data: Path | None) -> Iterator[Metric]:
     }
     spent = dict.fromkeys(studied, math.inf)
     for _ in range(_ROUNDS):
-        for name, (sweeps, work) in studied.items():
-            spent[name] = min(spent[name], cpu_s(work, 1) / sweeps)
+        for name, (count, work) in studied.items():
+            spent[name] = min(spent[name], cpu_s(work, 1) / count)
     for name, cost_s in spent.items():
         yield Metric(f"sweep/{name}", 1e6 * cost_s, "us", f"a sweep of {graph.n_nodes} nodes, {graph.n_edges} edges")
     for name in ("relaxation-ratslam", "relaxation-ratslam-by-20"):

@@ -22,6 +22,13 @@ neural.place neural/path_integrator.py theta_hz
 neural.place neural/attractor.py attractor_width_cells
 neural.place neural/place.py grid_inputs_side recruit_threshold inhibition
 calibration calibration/online.py first_m every_m
+backends.relaxation backends/relaxation/relaxing.py tolerance_m
+backends.relaxation backends/relaxation/sweeps.py robust_scale_m robust_scale_rad robust_start
+backends.robust backends/gtsam/factors.py huber_scale dcs_phi geman_mcclure_scale
+backends.robust backends/judging/weak.py odometry_scale
+backends.gnc backends/gtsam/gnc.py chunk_nodes mu_factor max_rounds
+backends.consistency backends/judging/consistency.py quantile neighbours
+backends.isam2 backends/gtsam/smoother.py relinearize_m relinearize_rad settle_updates
 """
 
 RENAMED: dict[str, str] = {}

@@ -9,7 +9,7 @@ from scipy.stats import chi2 as chi2_law
 
 from hybridmap import backends
 from hybridmap.backends.base import Solution, SolveReport, SolveStatus
-from hybridmap.backends.judging import prefilter
+from hybridmap.backends.judging import consistency, prefilter
 from hybridmap.backends.judging.clusters import loops_of
 from hybridmap.backends.judging.consistency import Consistent, consistent_loops
 from hybridmap.config.backends import BackendsConfig, ConsistencyConfig
@@ -20,7 +20,6 @@ from hybridmap.graph.uncertainty import chain_of
 from hybridmap.store.codec import report_from_json, report_to_json
 from hybridmap.study.false_loops import inject
 
-CONFIG = ConsistencyConfig()
 FILTERED = BackendsConfig(consistency=ConsistencyConfig(enabled=True))
 
 
@@ -60,8 +59,8 @@ def test_true_loops_are_as_far_apart_as_the_stated_noise_has_it():
 
 def test_it_does_not_matter_from_which_end_loops_are_told(drive):
     graph = inject(drive[0], 0.3, "random", np.random.default_rng(1))
-    told = consistent_loops(turned(graph, np.flatnonzero(graph.is_loop)[::2]), CONFIG)
-    assert np.array_equal(told.loops, consistent_loops(graph, CONFIG).loops)
+    told = consistent_loops(turned(graph, np.flatnonzero(graph.is_loop)[::2]))
+    assert np.array_equal(told.loops, consistent_loops(graph).loops)
 
 
 @pytest.mark.parametrize("mode", ["random", "aliased"])
@@ -69,7 +68,7 @@ def test_it_does_not_matter_from_which_end_loops_are_told(drive):
 def test_hardly_a_false_loop_passes_and_most_true_ones_do(drive, mode, share):
     graph, _ = drive
     false = inject(graph, share, mode, np.random.default_rng(1))
-    passed = false.edge_ids[consistent_loops(false, CONFIG).loops]
+    passed = false.edge_ids[consistent_loops(false).loops]
     assert np.count_nonzero(passed > graph.edge_ids[-1]) <= 0.02 * (false.n_edges - graph.n_edges)
     assert np.count_nonzero(passed <= graph.edge_ids[-1]) >= 0.9 * graph.is_loop.sum()
 
@@ -77,17 +76,18 @@ def test_hardly_a_false_loop_passes_and_most_true_ones_do(drive, mode, share):
 def test_noise_that_is_overstated_lets_no_more_false_loops_through(drive):
     graph, _ = drive
     false = inject(graph, 0.3, "random", np.random.default_rng(1))
-    honest, humble = (consistent_loops(g, CONFIG) for g in (false, replace(false, information=false.information / 50.0)))
+    honest, humble = (consistent_loops(g) for g in (false, replace(false, information=false.information / 50.0)))
     assert humble.variance == pytest.approx(honest.variance / 50.0, rel=0.3)
     assert np.count_nonzero(false.edge_ids[humble.loops] > graph.edge_ids[-1]) <= 0.05 * (false.n_edges - graph.n_edges)
 
 
-def test_each_loop_needs_as_many_neighbours_as_configured(drive):
+def test_each_loop_needs_a_neighbour(drive, monkeypatch):
     graph, _ = drive
     alone = np.flatnonzero(graph.is_loop)[::25]  # far from each other
     sparse = graph.with_edges(np.sort(np.concatenate([np.flatnonzero(~graph.is_loop), alone])))
-    assert len(consistent_loops(sparse, CONFIG).loops) == 0
-    assert len(consistent_loops(sparse, ConsistencyConfig(neighbours=0)).loops) == len(alone)
+    assert len(consistent_loops(sparse).loops) == 0
+    monkeypatch.setattr(consistency, "NEIGHBOURS", 0)
+    assert len(consistent_loops(sparse).loops) == len(alone)
 
 
 @pytest.mark.parametrize("name", ["gtsam-lm", "relaxation-ratslam", "gtsam-isam2", "gtsam-gnc"])

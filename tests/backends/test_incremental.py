@@ -7,6 +7,7 @@ import pytest
 from graphs_for_tests import laps
 
 from hybridmap import backends
+from hybridmap.backends.gtsam import smoother
 from hybridmap.backends.gtsam.covariance import Covariances
 from hybridmap.backends.gtsam.factors import NoiseModels, poses_of
 from hybridmap.backends.gtsam.incremental import Smoother, create
@@ -24,9 +25,8 @@ def modest(seed, nodes=90):
     return graph
 
 
-def patient(patience, linearise=0.01):
-    isam2 = Isam2Config(patience=patience, relinearize_rad=linearise, relinearize_m=10.0 * linearise)
-    return create("gtsam-isam2", BackendsConfig(isam2=isam2))
+def patient(patience):
+    return create("gtsam-isam2", BackendsConfig(isam2=Isam2Config(patience=patience)))
 
 
 def grown(backend, graph):
@@ -34,10 +34,12 @@ def grown(backend, graph):
 
 
 @pytest.mark.parametrize("patience", [0.3, 1.0])
-def test_closures_wait_only_while_no_pose_would_move_by_more_than_the_patience(patience):
-    graph, always = modest(0), 1e-5  # linearised anew nearly always, so that only the waiting makes a difference
+def test_closures_wait_only_while_no_pose_would_move_by_more_than_the_patience(patience, monkeypatch):
+    monkeypatch.setattr(smoother, "RELINEARIZE_RAD", 1e-5)  # nearly always, so that only the waiting makes a difference
+    monkeypatch.setattr(smoother, "RELINEARIZE_M", 1e-4)
+    graph = modest(0)
     waited = 0
-    lazy, eager = grown(patient(patience, always), graph), grown(patient(0.0, always), graph)
+    lazy, eager = grown(patient(patience), graph), grown(patient(0.0), graph)
     for nodes, mine, best in zip(range(1, 91), lazy, eager, strict=True):
         if "closures wait" not in mine.report.message:
             continue
@@ -70,13 +72,13 @@ def test_the_end_of_the_drive_leaves_nothing_waiting():
 
 def test_poses_read_piece_by_piece_are_the_estimate_of_gtsam():
     graph, _ = laps(np.random.default_rng(3), nodes=120)
-    smoother = Smoother(Isam2Config(), NoiseModels(), orthogonal=False)
+    following = Smoother(NoiseModels(), orthogonal=False)
     parts = [prefix(graph, nodes) for nodes in range(1, 121)]
     parts.append(graph.with_edges(graph.edge_ids != 70))
     for part in parts:
-        smoother.follow(part, graph.initial, smoother.lacks(part))
-        theirs = poses_of(smoother._isam.calculateEstimate())
-        assert np.abs(log(between(theirs, smoother.poses()))).max() < 1e-9
+        following.follow(part, graph.initial, following.lacks(part))
+        theirs = poses_of(following._isam.calculateEstimate())
+        assert np.abs(log(between(theirs, following.poses()))).max() < 1e-9
 
 
 @pytest.mark.parametrize("mode", ["random", "aliased"])

@@ -44,9 +44,10 @@ def test_a_fifth_of_false_loops_ruins_least_squares_but_not_robust_back_ends(dis
 
 
 @pytest.mark.parametrize("start", ["auto", "batch", "grow"])
-def test_every_start_of_gnc_finds_the_false_loops_of_a_mild_drive(disturbed, start):
+def test_every_start_of_gnc_finds_the_false_loops_of_a_mild_drive(disturbed, start, monkeypatch):
+    monkeypatch.setattr(gnc, "CHUNK_NODES", 40)
     _, false, clean = disturbed
-    config = BackendsConfig(gnc=GncConfig(start=start, chunk_nodes=40))
+    config = BackendsConfig(gnc=GncConfig(start=start))
     solution = backends.create("gtsam-gnc", config).solve(false)
     assert ate(solution.poses, clean) < 0.05
     assert set(solution.report.weights) == set(false.edge_ids[false.is_loop].tolist())

@@ -37,18 +37,18 @@ def one_by_one(graph, start, count, config, robust=False):
     order = sorted(range(graph.n_edges), key=lambda e: (graph.sources[e], graph.edge_ids[e]))
     for sweep in range(1, count + 1):
         before = poses.copy()
-        scale = config.robust_start ** max(0, 1 - 2 * sweep / count) if robust else 1.0
+        scale = sweeps.ROBUST_START ** max(0, 1 - 2 * sweep / count) if robust else 1.0
         for e in order:
             s, t = graph.sources[e], graph.targets[e]
             error = poses[t] - compose(poses[s], graph.deltas[e])
             error[2] = wrap_angle(error[2])
             rate = config.theta * config.theta_decay ** (sweep - 1)
             if robust and graph.is_loop[e]:
-                in_scales = error / (scale * np.array([config.robust_scale_m, config.robust_scale_m, config.robust_scale_rad]))
+                in_scales = error / (scale * np.array([0.3, 0.3, 0.1]))
                 rate *= (1 + in_scales @ in_scales) ** -2
             poses[s] += rate * error
             poses[t] -= rate * error
-        if scale == 1.0 and np.abs(poses - before).max() <= config.tolerance_m:
+        if scale == 1.0 and np.abs(poses - before).max() <= sweeps.TOLERANCE_M:
             break
     return poses, sweep
 
@@ -76,9 +76,10 @@ GRAPHS = {
 @pytest.mark.parametrize("name", GRAPHS)
 @pytest.mark.parametrize("robust", [False, True])
 @pytest.mark.parametrize(("theta", "theta_decay"), [(0.5, 1.0), (1.0, 0.9), (0.2, 0.5)])
-def test_sweeps_are_the_loop_over_links(name, robust, theta, theta_decay):
+def test_sweeps_are_the_loop_over_links(name, robust, theta, theta_decay, monkeypatch):
+    monkeypatch.setattr(sweeps, "ROBUST_START", 5.0)
     graph = GRAPHS[name]()
-    config = RelaxationConfig(theta=theta, theta_decay=theta_decay, robust_start=5.0)
+    config = RelaxationConfig(theta=theta, theta_decay=theta_decay)
     expected, swept = one_by_one(graph, graph.initial, 23, config, robust)
     found = relax_links(graph, graph.initial, 23, config, robust=robust)
     assert found.sweeps == swept
@@ -101,9 +102,10 @@ def test_links_are_visited_by_source_and_of_one_source_by_age():
 
 
 @pytest.mark.parametrize("robust", [False, True])
-def test_the_tolerance_ends_a_run(robust):
+def test_the_tolerance_ends_a_run(robust, monkeypatch):
+    monkeypatch.setattr(sweeps, "TOLERANCE_M", 1e-3)
     graph, _ = laps(np.random.default_rng(0), noise=3.0)
-    config = RelaxationConfig(tolerance_m=1e-3, theta_decay=0.9)
+    config = RelaxationConfig(theta_decay=0.9)
     expected, swept = one_by_one(graph, graph.initial, 100, config, robust)
     found = relax_links(graph, graph.initial, 100, config, robust=robust)
     assert found.settled
@@ -118,7 +120,7 @@ def test_the_tolerance_ends_a_run(robust):
 @pytest.mark.parametrize("robust", [False, True])
 def test_a_consistent_graph_stays_where_it_is(robust):
     graph, truth = laps(np.random.default_rng(0), noise=0.0)
-    found = relax_links(graph, truth, 50, RelaxationConfig(tolerance_m=1e-9), robust=robust)
+    found = relax_links(graph, truth, 50, RelaxationConfig(), robust=robust)
     assert (found.sweeps, found.settled) == (25 if robust else 1, True)
     assert apart(found.poses, truth) < 1e-9
 
@@ -177,9 +179,10 @@ def test_a_moved_map_relaxes_to_the_moved_result(seed, motion, robust):
     assert apart(there, compose(motion, here)) < 1e-8
 
 
-def test_a_loop_s_weight_falls_with_its_error_and_an_odometry_edge_has_none():
+def test_a_loop_s_weight_falls_with_its_error_and_an_odometry_edge_has_none(monkeypatch):
+    monkeypatch.setattr(sweeps, "ROBUST_START", 1.0)
     graph, _ = laps(np.random.default_rng(0), nodes=22, noise=0.0)
-    config = RelaxationConfig(theta=0.5, robust_scale_m=0.3, robust_scale_rad=0.1, robust_start=1.0)
+    config = RelaxationConfig(theta=0.5)
     loop = graph.with_edges(graph.is_loop)
     loop = loop.with_edges(np.array([0]))
     off = graph.initial.copy()

@@ -8,17 +8,25 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from hybridmap.backends.judging.weak import ODOMETRY_SCALE
 from hybridmap.config.backends import RobustConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
 
 _PRIOR_SIGMA = 1e-3  # zero residual at the optimum: fixes the frame without touching chi2
 
+HUBER_SCALE = 1.345
+"""Whitened residual from which a Huber cost is linear: 95 % efficient where all noise is Gaussian (Holland and Welsch 1977)."""
+DCS_PHI = 1.0
+"""Dynamic covariance scaling: squared whitened residual from which a loop is scaled down (Agarwal et al. 2013)."""
+GEMAN_MCCLURE_SCALE = 2.0
+"""Whitened residual at which the Geman-McClure weight of a loop is a quarter; one of honest noise keeps a third."""
+
 _LOOP: dict[str, Callable[[RobustConfig], Any]] = {
     "cauchy": lambda c: gtsam.noiseModel.mEstimator.Cauchy.Create(c.cauchy_scale),
-    "huber": lambda c: gtsam.noiseModel.mEstimator.Huber.Create(c.huber_scale),
-    "dcs": lambda c: gtsam.noiseModel.mEstimator.DCS.Create(c.dcs_phi),
-    "geman-mcclure": lambda c: gtsam.noiseModel.mEstimator.GemanMcClure.Create(c.geman_mcclure_scale),
+    "huber": lambda _: gtsam.noiseModel.mEstimator.Huber.Create(HUBER_SCALE),
+    "dcs": lambda _: gtsam.noiseModel.mEstimator.DCS.Create(DCS_PHI),
+    "geman-mcclure": lambda _: gtsam.noiseModel.mEstimator.GemanMcClure.Create(GEMAN_MCCLURE_SCALE),
 }
 
 _MOTION: dict[str, Any] = {
@@ -68,7 +76,7 @@ def loop_kernel(name: str, config: RobustConfig) -> Any:
 
 def noise_models(config: RobustConfig, loop: Any = None) -> NoiseModels:
     """Noise models with a kernel on loops (None: quadratic) and the configured one on edges of motion."""
-    motion = None if config.odometry == "none" else _MOTION[config.odometry].Create(config.odometry_scale)
+    motion = None if config.odometry == "none" else _MOTION[config.odometry].Create(ODOMETRY_SCALE)
     return NoiseModels(loop, motion)
 
 

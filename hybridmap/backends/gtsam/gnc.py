@@ -30,6 +30,12 @@ from hybridmap.graph.connectivity import extend
 from hybridmap.graph.growth import prefix
 from hybridmap.graph.pose_graph import PoseGraph
 
+CHUNK_NODES = 500
+"""`grow`: nodes a chunk. Odometry drifts little over so many, and a large graph takes few chunks."""
+MU_FACTOR = 4.0
+"""Growth of the control parameter mu from round to round; Yang et al. have 1.4, and here each round is one step only."""
+MAX_ROUNDS = 60
+"""Most rounds: mu then has grown by more than any residual needs."""
 _STEP = 0.5  # of a quantised weight's logarithm to the base 2
 _PATIENT, _NEAR_FIRST = 1e-4, 3e-2  # least weight of a loop that takes part in a round
 _ROUGHLY = 10.0  # of the bound, before the first iteration
@@ -110,14 +116,14 @@ def graduate(graph: PoseGraph, start: Array, config: BackendsConfig, negligible:
     largest = float(squared.max(initial=0.0))
     mu = bound / (2.0 * largest - bound) if largest > bound else np.inf
     rounds, current = 0, values(start)
-    while np.isfinite(mu) and rounds < config.gnc.max_rounds:
+    while np.isfinite(mu) and rounds < MAX_ROUNDS:
         weights = truncated_weights(squared, mu, bound)
         poses, current = _step(problem.weighted(weights, negligible), poses, current)
         squared = problem.squared(poses)
         rounds += 1
         if mu > 1.0 and np.all((weights < negligible) | (weights > 0.9)):
             break
-        mu *= config.gnc.mu_factor
+        mu *= MU_FACTOR
     settled = _settle(problem, poses, bound, config.max_iterations)
     honest = min(1.0, SLACK * _variance(graph, settled, config)) * bound
     if honest < bound:
@@ -223,7 +229,7 @@ def _step(factor_graph: Any, poses: Array, current: Any) -> tuple[Array, Any]:
 def grow(graph: PoseGraph, config: BackendsConfig, negligible: float) -> Truncated:
     """Solve the graph chunk by chunk, extending by odometry; loops rejected before compete again in every chunk."""
     poses, rounds = graph.initial[:1], 0
-    for end in range(config.gnc.chunk_nodes, graph.n_nodes, config.gnc.chunk_nodes):
+    for end in range(CHUNK_NODES, graph.n_nodes, CHUNK_NODES):
         part = prefix(graph, end)
         result = graduate(part, extend(part, poses), config, negligible)
         poses, rounds = result.poses, rounds + result.rounds

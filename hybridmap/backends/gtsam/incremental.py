@@ -96,7 +96,7 @@ class Isam2:
         smoother.follow(graph, start, lacks)
         if not new and len(lacks.removed) == 0:
             return smoother, 1
-        updates = 1 + smoother.settle(self._config.isam2.settle_updates)
+        updates = 1 + smoother.settle()
         if new:
             return smoother, updates
         straight = angular_start(graph)
@@ -126,7 +126,7 @@ class Isam2:
             return self._told(self._empty(orthogonal=True), graph, start)
 
     def _empty(self, *, orthogonal: bool = False) -> Smoother:
-        return Smoother(self._config.isam2, noise_models(self._config.robust, self._kernel), orthogonal=orthogonal)
+        return Smoother(noise_models(self._config.robust, self._kernel), orthogonal=orthogonal)
 
     def _cost(self, graph: PoseGraph, poses: Array) -> float:
         """What it is out to lower, as the referee sees it."""

@@ -9,11 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.gtsam.factors import NoiseModels, anchor, collected, factors, poses_of, values
-from hybridmap.config.backends import Isam2Config
 from hybridmap.geometry import Array, compose, exp
 from hybridmap.graph.growth import Change, difference
 from hybridmap.graph.pose_graph import PoseGraph
 
+RELINEARIZE_M, RELINEARIZE_RAD = 0.1, 0.01
+"""Largest steps of a variable before it is linearised anew: edges bend with headings, not with positions."""
+SETTLE_UPDATES = 10
+"""Most empty updates after the first one and after an edge was removed; they end when nothing is linearised anew."""
 _EACH_NODE = chr(0)  # GTSAM's letter of a key that is a plain number
 _MANY = 4  # share of the nodes, as its inverse, from which reading all of them is the quicker way
 
@@ -21,16 +24,15 @@ _MANY = 4  # share of the nodes, as its inverse, from which reading all of them 
 class Smoother:
     """An ISAM2 that follows a graph. What raises may leave it half changed: throw it away then."""
 
-    def __init__(self, config: Isam2Config, models: NoiseModels, *, orthogonal: bool) -> None:
+    def __init__(self, models: NoiseModels, *, orthogonal: bool) -> None:
         """An empty one.
 
         Args:
-            config: thresholds.
             models: makes the noise models of its factors.
             orthogonal: QR factors, slower than Cholesky's, which square the condition of the graph.
         """
         thresholds = gtsam.ISAM2ThresholdMap()
-        limits = np.array([config.relinearize_m, config.relinearize_m, config.relinearize_rad])
+        limits = np.array([RELINEARIZE_M, RELINEARIZE_M, RELINEARIZE_RAD])
         thresholds.insert((_EACH_NODE, limits))
         params = gtsam.ISAM2Params()
         params.setRelinearizeThreshold(thresholds)
@@ -71,12 +73,12 @@ class Smoother:
         self._point = np.concatenate([self._point, start[known:]])
         self._graph = graph
 
-    def settle(self, most: int) -> int:
-        """Empty updates until nothing is linearised anew; returns how many."""
-        for done in range(1, most + 1):
+    def settle(self) -> int:
+        """Empty updates until nothing is linearised anew, at most `SETTLE_UPDATES`; returns how many."""
+        for done in range(1, SETTLE_UPDATES + 1):
             if self._update().getVariablesRelinearized() == 0:
                 return done
-        return most
+        return SETTLE_UPDATES
 
     def poses(self) -> Array:
         """Current estimate (N, 3)."""

@@ -72,7 +72,7 @@ class ConsistentBackend:
         started = time.process_time()
         graph.validate()
         try:
-            consistent = consistent_loops(graph, self._config.consistency)
+            consistent = consistent_loops(graph)
         except GraphError as broken:
             solution = solve(graph)
             message = f"consistency of loops not judged, as {broken}; {solution.report.message}"

@@ -14,6 +14,9 @@ from hybridmap.config.backends import RobustConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
 
+ODOMETRY_SCALE = 1.0
+"""Whitened residual at which the weight of the kernel on edges of motion is a half (Cauchy) or a quarter (Geman-McClure), or
+from which its cost is linear (Huber): one standard deviation of the edge."""
 WEAK = 0.1
 """Weight below which an edge holds next to nothing: Cauchy's at three times its scale."""
 
@@ -36,13 +39,13 @@ _COSTS: dict[str, _Kernel] = {
 
 def motion_weights(graph: PoseGraph, squared: Array, config: RobustConfig) -> Array:
     """Weight (E,) of each edge at its squared residual (E,): of the configured kernel for edges of motion, else one."""
-    return np.where(graph.is_motion, _WEIGHTS[config.odometry](squared, config.odometry_scale), 1.0)
+    return np.where(graph.is_motion, _WEIGHTS[config.odometry](squared, ODOMETRY_SCALE), 1.0)
 
 
 def truncated_cost(graph: PoseGraph, poses: Array, bound: float, config: RobustConfig) -> float:
     """As `objective.truncated_cost`, with the configured kernel's cost for edges of motion."""
     every = squared_norms(graph, poses)
-    motion = _COSTS[config.odometry](every, config.odometry_scale)
+    motion = _COSTS[config.odometry](every, ODOMETRY_SCALE)
     return float(np.where(graph.is_loop, np.minimum(every, bound), np.where(graph.is_motion, motion, every)).sum())
 
 

@@ -18,7 +18,7 @@ from scipy.sparse.linalg import eigsh
 
 from hybridmap.backends.base import Outcome, SolveStatus
 from hybridmap.backends.driver import Driver
-from hybridmap.backends.relaxation.relaxing import relaxing
+from hybridmap.backends.relaxation.relaxing import TOLERANCE_M, relaxing
 from hybridmap.config.backends import BackendsConfig, RelaxationConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
@@ -131,7 +131,7 @@ def _relaxed(
     rate, note = rate_of(rule, config)
     if rate is None:
         return Outcome(start, SolveStatus.DIVERGED, f"{note}; not run", 0)
-    positions, done = relax(rule, start[:, :2], rate, sweeps, config.tolerance_m)
+    positions, done = relax(rule, start[:, :2], rate, sweeps, TOLERANCE_M)
     if positions is None:
         return Outcome(start, SolveStatus.DIVERGED, f"{note}; diverged within {done} sweeps, kept the start", done)
     poses = np.column_stack([positions, graph.initial[:, 2]])

@@ -14,8 +14,8 @@ import numpy as np
 from hybridmap.backends.base import Outcome, SolveStatus
 from hybridmap.backends.driver import Driver, Works
 from hybridmap.backends.objective import chi2, gate_of, truncated_cost
-from hybridmap.backends.relaxation.relaxing import relaxing, swept
-from hybridmap.backends.relaxation.sweeps import Relaxed, relax_links
+from hybridmap.backends.relaxation.relaxing import TOLERANCE_M, relaxing, swept
+from hybridmap.backends.relaxation.sweeps import ROBUST_SCALE_M, ROBUST_SCALE_RAD, Relaxed, relax_links
 from hybridmap.config.backends import BackendsConfig, RelaxationConfig
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.edges import EdgeKind
@@ -41,13 +41,13 @@ def robust(name: str, config: BackendsConfig) -> Driver:
     solve = swept(partial(_in_rounds, rules), rules.solve_sweeps)
 
     def follow(graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
-        return _judged(graph, relax_links(graph, start, sweeps, rules, robust=True), rules)
+        return _judged(graph, relax_links(graph, start, sweeps, rules, robust=True))
 
     def onward(graph: PoseGraph, driven: Array) -> Outcome:
         settled, bound = solve(graph, driven), gate_of(config)
         if truncated_cost(graph, settled.poses, bound) <= truncated_cost(graph, driven, bound):
             return settled
-        kept = _judged(graph, Relaxed(driven, settled.iterations, settled=False), rules)
+        kept = _judged(graph, Relaxed(driven, settled.iterations, settled=False))
         return replace(kept, message=f"kept the map of the drive; {kept.message}")
 
     return Driver(name, config, solve, follow=swept(follow, rules.sweeps_per_node), onward=onward, works=Works.ON_GROWTH)
@@ -71,42 +71,42 @@ def then_least_squares(name: str, config: BackendsConfig) -> Driver:
     return Driver(name, config, solve, follow=swept(rule, rules.sweeps_per_node), onward=onward, works=Works.ON_GROWTH)
 
 
-def weights(graph: PoseGraph, poses: Array, config: RelaxationConfig) -> Array:
+def weights(graph: PoseGraph, poses: Array) -> Array:
     """The Geman-McClure weight (E,) that each edge of the graph would have as a loop, at the robust scales themselves."""
     predicted = compose(poses[graph.sources], graph.deltas)
     errors = between(predicted, poses[graph.targets])
-    squared = np.sum(errors[:, :2] ** 2, axis=1) / config.robust_scale_m**2 + errors[:, 2] ** 2 / config.robust_scale_rad**2
+    squared = np.sum(errors[:, :2] ** 2, axis=1) / ROBUST_SCALE_M**2 + errors[:, 2] ** 2 / ROBUST_SCALE_RAD**2
     return np.asarray(1.0 / (1.0 + squared) ** 2)
 
 
 def _relaxed(config: RelaxationConfig, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
-    return _outcome(relax_links(graph, start, sweeps, config), config)
+    return _outcome(relax_links(graph, start, sweeps, config))
 
 
 def _in_rounds(config: RelaxationConfig, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
     quarter = max(sweeps // 4, 1)
     relaxed = replace(relax_links(graph, start, min(sweeps, quarter), config, robust=True), settled=False)
     while relaxed.sweeps < sweeps and not relaxed.settled:
-        kept = ~(graph.is_loop & (weights(graph, relaxed.poses, config) < _REJECTED))
+        kept = ~(graph.is_loop & (weights(graph, relaxed.poses) < _REJECTED))
         part = min(quarter, sweeps - relaxed.sweeps)
         onward = relax_links(graph.with_edges(kept), relaxed.poses, part, config)
         relaxed = replace(onward, sweeps=relaxed.sweeps + onward.sweeps)
-    return _judged(graph, relaxed, config)
+    return _judged(graph, relaxed)
 
 
-def _judged(graph: PoseGraph, relaxed: Relaxed, config: RelaxationConfig) -> Outcome:
+def _judged(graph: PoseGraph, relaxed: Relaxed) -> Outcome:
     """The outcome with every loop's weight, those of less than `_REJECTED` as rejected."""
     loops = graph.only(EdgeKind.LOOP)
-    by_id = dict(zip(loops.edge_ids.tolist(), weights(loops, relaxed.poses, config).tolist(), strict=True))
+    by_id = dict(zip(loops.edge_ids.tolist(), weights(loops, relaxed.poses).tolist(), strict=True))
     rejected = tuple(edge for edge, weight in by_id.items() if weight < _REJECTED)
-    outcome = _outcome(relaxed, config)
+    outcome = _outcome(relaxed)
     message = f"{outcome.message}; {len(rejected)} of {len(by_id)} loops rejected"
     return replace(outcome, message=message, weights=by_id, rejected=rejected)
 
 
-def _outcome(relaxed: Relaxed, config: RelaxationConfig) -> Outcome:
+def _outcome(relaxed: Relaxed) -> Outcome:
     if relaxed.settled:
-        message = f"no node moved more than {config.tolerance_m} m"
+        message = f"no node moved more than {TOLERANCE_M} m"
         return Outcome(relaxed.poses, SolveStatus.CONVERGED, message, relaxed.sweeps)
     return Outcome(relaxed.poses, SolveStatus.MAX_ITERATIONS, f"{relaxed.sweeps} sweeps", relaxed.sweeps)
 

@@ -12,6 +12,9 @@ from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
 
+TOLERANCE_M = 1e-6
+"""A sweep that moves no node by more (m; 1 rad counts as 1 m) ends the relaxation: far below the noise of any edge."""
+
 Rule = Callable[[PoseGraph, Array, int], Outcome]
 """At most so many sweeps over a graph that has edges, from poses (N, 3)."""
 

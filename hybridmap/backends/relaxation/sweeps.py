@@ -11,10 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.backends.relaxation.relaxing import TOLERANCE_M
 from hybridmap.compiled import compiled
 from hybridmap.config.backends import RelaxationConfig
 from hybridmap.geometry import Array, wrap_angle
 from hybridmap.graph.pose_graph import PoseGraph
+
+ROBUST_SCALE_M, ROBUST_SCALE_RAD = 0.3, 0.1
+"""`relaxation-robust`: errors of position and heading at which a loop's correction is a quarter of the plain one. A
+false loop that is off by a metre then pulls with less than a hundredth."""
+ROBUST_START = 8.0
+"""Factor on both scales at the first sweep of a call, from which they shrink to themselves: loops of 2 m still pull."""
 
 _LINKS = "int64[::1], int64[::1], float64[:, ::1], boolean[::1]"
 _RULE = "float64, float64, int64, float64, float64, float64, float64"
@@ -47,10 +54,10 @@ def relax_links(graph: PoseGraph, start: Array, sweeps: int, config: RelaxationC
     Args:
         graph: its edges are the links; their information is not used.
         start: (N, 3) poses before, m and rad.
-        sweeps: most sweeps; they end after one that moves no coordinate by more than `tolerance_m`, or one beyond all bounds.
-        config: theta, its decay from sweep to sweep, the tolerance and the robust scales.
+        sweeps: most sweeps; they end after one that moves no coordinate by more than `TOLERANCE_M`, or one beyond all bounds.
+        config: theta and its decay from sweep to sweep.
         robust: multiply theta by the Geman-McClure weight 1 / (1 + r^2)^2 of a loop's error at its visit, r^2 being the sum of
-            the squares in units of the scales. These shrink geometrically from `robust_start` times themselves to themselves,
+            the squares in units of the scales. These shrink geometrically from `ROBUST_START` times themselves to themselves,
             which they are in the second half of the sweeps; before that the tolerance ends nothing.
     """
     order = np.argsort(graph.sources, kind="stable")
@@ -65,10 +72,10 @@ def relax_links(graph: PoseGraph, start: Array, sweeps: int, config: RelaxationC
         config.theta,
         config.theta_decay,
         sweeps,
-        config.tolerance_m,
-        config.robust_scale_m,
-        config.robust_scale_rad,
-        config.robust_start if robust else 1.0,
+        TOLERANCE_M,
+        ROBUST_SCALE_M,
+        ROBUST_SCALE_RAD,
+        ROBUST_START if robust else 1.0,
     )
     poses[:, 2] = wrap_angle(poses[:, 2])
     return Relaxed(poses, done, settled)
