@@ -42,7 +42,7 @@ class GncConfig(Section):
     """`batch` anneals the whole graph from its initial poses, `grow` adds the nodes by chunks, `auto` grows in two ways (and
     starts from the map at the end of a drive, where there is one) and takes the lowest truncated cost.
 
-    Watch: `auto` costs about three times as much, and survives worse starts."""
+    Watch: `auto` takes the most time, and survives worse starts."""
     quantile: float = Field(default=0.99, gt=0.5, lt=1)
     """A loop is an inlier while its squared Mahalanobis residual is below this quantile of chi2 with 3 degrees of freedom.
 
