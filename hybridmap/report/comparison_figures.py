@@ -72,7 +72,7 @@ def panels(graph: PoseGraph, rows: Sequence[Row], start: str, carried: Sequence[
     with style.figure(style.PAGE_WIDTH_IN, 0.4 + 3.1 * lines) as picture:
         places = picture.subplots(lines, columns, squeeze=False).ravel()
         for axes, (title, poses) in zip(places, maps.items(), strict=False):
-            _draw_map(axes, driven, poses, rejected.get(title, ()))
+            draw_map(axes, driven, poses, rejected.get(title, ()))
             axes.set_title(title)
         for axes in places[len(maps) :]:
             axes.set_axis_off()
@@ -175,7 +175,8 @@ def _box(maps: Sequence[Array]) -> tuple[Array, Array]:
     return low - margin, high + margin
 
 
-def _draw_map(axes: Any, graph: PoseGraph, poses: Array, rejected: tuple[int, ...]) -> None:
+def draw_map(axes: Any, graph: PoseGraph, poses: Array, rejected: tuple[int, ...]) -> None:
+    """Draw the edges of one map: the rejected ones, by edge id, lie under the loops, and these under the chain."""
     lost, loops = np.isin(graph.edge_ids, np.array(rejected, dtype=np.int64)), graph.is_loop
     _draw_edges(axes, graph, poses, lost, color=_REJECTED, linewidths=0.4, alpha=0.6, zorder=1.1)
     _draw_edges(axes, graph, poses, loops & ~lost, color=_LOOP, linewidths=0.6, zorder=1.2)

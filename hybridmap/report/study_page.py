@@ -85,7 +85,7 @@ def _render(study: Study) -> str:
     of_error = study_figures.having(plan, _error)
     kept = [_kept(result) for _, result in study.rows]
     pairs = study_figures.paired_groups(study.summaries)
-    groups = _groups(study.summaries)
+    groups = groups_of(study.summaries)
     shown = [group for group in groups if group.lines]
     return rendered(
         _TEMPLATE,
@@ -158,7 +158,7 @@ def _share(result: CellResult, part: str, whole: str) -> float | None:
     return None if some is None or not every else 100.0 * some / every
 
 
-def _groups(summaries: Sequence[Summary]) -> list[Group]:
+def groups_of(summaries: Sequence[Summary]) -> list[Group]:
     """Every group; a line a back-end that has a map there."""
     found: dict[str, dict[str, dict[str, Summary]]] = {}
     for one in summaries:

@@ -9,6 +9,7 @@ import yaml
 
 from hybridmap.cli import main
 from hybridmap.report import study_page
+from hybridmap.study.folder import PAGE
 from tests.study.studies import TREE
 
 
@@ -40,7 +41,7 @@ def test_a_study_is_run_and_gone_on_with(run, tmp_path, monkeypatch):
     names = {"study.yaml", "cells.csv", "timings.csv", "summary.csv", "metrics.json", "report.html", "cells", "sources"}
     assert found == names
     before = (out / "cells.csv").read_bytes()
-    monkeypatch.setattr(study_page, "_render", lambda _: "")  # one page is enough
+    monkeypatch.setattr(study_page, "write_study_page", lambda study: study.folder.path / PAGE)  # one page is enough
     code, printed, _ = run(*words)
     assert code == 0
     assert "18 known before" in printed
@@ -54,7 +55,7 @@ def test_a_study_is_run_and_gone_on_with(run, tmp_path, monkeypatch):
 
 
 def test_why_cells_failed_stands_under_the_table(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(study_page, "_render", lambda _: "")
+    monkeypatch.setattr(study_page, "write_study_page", lambda study: study.folder.path / PAGE)
     tree = TREE | {
         "backends": ["gtsam-lm"],
         "seeds": 1,

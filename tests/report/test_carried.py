@@ -47,7 +47,7 @@ def scene(session: SessionFolder) -> Scene:
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Every picture that a figure is made of."""
     pictures: list[Any] = []
-    monkeypatch.setattr(style, "svg_uri", lambda picture: pictures.append(picture) or "")
+    monkeypatch.setattr(style, "svg_uri", pictures.append)
     return pictures
 
 
@@ -90,7 +90,7 @@ def test_no_map_of_a_comparison_has_a_line_through_the_air(
     assert len(first.get_xdata()) + len(second.get_xdata()) < len(source.graph.initial) * 10 - 9
     assert [is_broken(line) for line in maps] == [True, True]
     graphs = []
-    monkeypatch.setattr(comparison_figures, "_draw_map", lambda axes, graph, *_: graphs.append(graph))
+    monkeypatch.setattr(comparison_figures, "draw_map", lambda axes, graph, *_: graphs.append(graph))
     comparison_figures.panels(source.graph, rows, source.start, source.carried)
     assert {graph.n_edges for graph in graphs} == {source.graph.n_edges - 1}
     assert all(PICKED_UP + 1 not in graph.targets[graph.is_motion] for graph in graphs)

@@ -1,15 +1,17 @@
 """The page of a comparison: a row that diverged has no map, and what lines that coincide hide is said."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 
 from hybridmap.backends import comparison
 from hybridmap.backends.base import SolveStatus
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.output import held
-from hybridmap.report import comparison_figures
+from hybridmap.report import comparison_figures, style
 from hybridmap.report.comparison import COMPARISON, Compared, write_comparison
 from tests.backends.graphs_for_tests import laps
 
@@ -71,17 +73,20 @@ def test_the_page_says_what_its_pictures_hide_and_show(graph, rows, tmp_path):
     assert "<h2>What the edges cost</h2> <p>The share of all edges" in page
 
 
-def test_later_lines_are_thinner_and_on_top(rows):
-    looks = comparison_figures._looks([rows[0], rows[2], replace(rows[0], backend="gtsam-gnc", title="gtsam-gnc")])
-    widths = [look["linewidth"] for look in looks.values()]
+def test_later_lines_are_thinner_and_on_top(rows, monkeypatch):
+    drawn: list[Any] = []
+    monkeypatch.setattr(style, "svg_uri", drawn.append)
+    comparison_figures.overlay([rows[0], rows[2], replace(rows[0], backend="gtsam-gnc", title="gtsam-gnc")], [], [])
+    lines = drawn[0].axes[0].get_lines()
+    widths = [line.get_linewidth() for line in lines]
     assert widths == sorted(widths, reverse=True)
     assert len(set(widths)) == 3
-    assert len({look["zorder"] for look in looks.values()}) == 1  # equal: drawn in their order
+    assert len({line.get_zorder() for line in lines}) == 1  # equal: drawn in their order
 
 
-def test_rejected_loops_lie_under_the_others(graph, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(comparison_figures, "_draw_edges", lambda *_, **looks: drawn.append((looks["zorder"], looks["color"])))
-    monkeypatch.setattr(comparison_figures.style, "metric_axes", lambda _: None)
-    comparison_figures._draw_map(None, graph, graph.initial, (int(graph.edge_ids[graph.is_loop][0]),))
-    assert min(drawn)[1] == comparison_figures.style.REJECTED
+def test_rejected_loops_lie_under_the_others(graph):
+    with style.figure(4.0, 3.0) as picture:
+        axes = picture.add_subplot()
+        comparison_figures.draw_map(axes, graph, graph.initial, (int(graph.edge_ids[graph.is_loop][0]),))
+        lowest = min(axes.collections, key=lambda lines: lines.get_zorder())
+    assert to_hex(lowest.get_color()[0]) == style.REJECTED

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -133,21 +134,26 @@ def test_titles_of_overlays_are_as_wide_as_their_axes(scene: Scene, measured: bo
     assert TextPath((0, 0), title, prop=bold).get_extents().width < 72 * 0.8 * closures.WIDTH_IN
 
 
-def test_accepted_loops_lie_over_the_rejected_ones_and_the_legend_can_be_read(scene: Scene) -> None:
-    order = [looks["zorder"] for looks in map_figure._FATES.values()]
-    assert order == sorted(order, reverse=True)
-    thin, thick = map_figure._FATES["loops rejected"], map_figure._FATES["loops accepted"]
-    assert thin["linewidth"] < 0.5 * thick["linewidth"]
-    with style.figure(4.0, 3.0) as picture:
-        picture.add_subplot().plot([0, 1], [0, 1], label="rejected", alpha=0.3, linewidth=thin["linewidth"])
-        map_figure._draw_legend(picture)
-        (line,) = picture.legends[0].get_lines()
-        assert (line.get_linewidth() >= 1.5, line.get_alpha()) == (True, 1.0)
+def test_accepted_loops_lie_over_the_rejected_ones_and_the_legend_can_be_read(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr(style, "svg_uri", drawn.append)
+    map_figure.graph_figure(scene, None)
+    loops = {lines.get_label(): lines for lines in drawn[0].axes[0].collections}
+    accepted, rejected = loops["loops accepted (20)"], loops["loops rejected (20)"]
+    assert accepted.get_zorder() > rejected.get_zorder()
+    assert rejected.get_linewidth()[0] < 0.5 * accepted.get_linewidth()[0]
+    (legend,) = drawn[0].legends
+    shown = {text.get_text(): line for text, line in zip(legend.get_texts(), legend.get_lines(), strict=True)}
+    line = shown["loops rejected (20)"]
+    assert (line.get_linewidth() >= 1.5, line.get_alpha()) == (True, 1.0)
 
 
 def test_spread_takes_the_middles() -> None:
-    assert spread(list(range(9)), 3) == [1, 4, 7]  # type: ignore[arg-type]
-    assert spread([1, 2], 3) == [1, 2]  # type: ignore[list-item]
+    edges = ring_map(0.25).edges
+    assert spread(edges, 3) == [edges[1], edges[4], edges[7]]
+    assert spread(edges[:2], 3) == list(edges[:2])
 
 
 def test_outline_of_a_scan_is_the_room() -> None:
@@ -219,5 +225,5 @@ def test_times_are_said_as_people_say_them(value: float, said: tuple[str, str]) 
     ],
 )
 def test_an_interval_has_the_decimals_that_it_bears_out(figures, text):
-    count = 0 if math.isnan(figures[0]) else 7
-    assert tables.interval(Interval(*figures, count, 0.95)) == text
+    value, low, high = figures
+    assert tables.interval(Interval(value, low, high, 0 if math.isnan(value) else 7, 0.95)) == text

@@ -1,15 +1,17 @@
 """The page of a study: no verdict on few seeds, and what failed said once instead of shown empty."""
 
 import re
+from typing import Any
 
 import pytest
 
-from hybridmap.report import study_figures, study_page
+from hybridmap.report import study_figures, style
+from hybridmap.report.study_page import groups_of, write_study_page
 from hybridmap.study.cell import CellResult
 from hybridmap.study.folder import StudyFolder
 from hybridmap.study.grid import Cell, lay_out
-from hybridmap.study.statistics import summarise
-from hybridmap.study.study import Study, _head, _metrics
+from hybridmap.study.pools import ThisProcess
+from hybridmap.study.study import Study, run_study
 from tests.study.studies import TREE, small
 
 NO_LOOPS = "graph: found no loops"
@@ -18,7 +20,7 @@ NO_LOOPS = "graph: found no loops"
 @pytest.fixture(autouse=True)
 def _unpainted(monkeypatch):
     """Figures are laid out and not written: their text is not looked at."""
-    monkeypatch.setattr(study_figures.style, "svg_uri", lambda _: "data:,")
+    monkeypatch.setattr(style, "svg_uri", lambda _: "data:,")
 
 
 @pytest.fixture
@@ -26,10 +28,11 @@ def made(tmp_path):
     """Make a study whose cells come out as a function of theirs says: ATE (m), or a message."""
 
     def make(outcome, **changes) -> Study:
-        grid = lay_out(small(**changes))
-        results = {cell.key: _result(cell, outcome(cell)) for cell in grid.cells}
-        summaries = summarise(grid, results)
-        return Study(StudyFolder(tmp_path), grid, results, summaries, 0, _head(grid, results), _metrics(summaries))
+        config, folder = small(**changes), StudyFolder(tmp_path)
+        with folder.in_use():
+            for cell in lay_out(config).cells:
+                folder.keep_result(_result(cell, outcome(cell)))
+        return run_study(config, tmp_path, ThisProcess())
 
     return make
 
@@ -37,7 +40,7 @@ def made(tmp_path):
 def _result(cell: Cell, outcome: float | str) -> CellResult:
     if isinstance(outcome, str):
         return CellResult(cell.key, "failed", outcome, {}, 0.0, "")
-    figures = {
+    figures: dict[str, float | None] = {
         "ate_m": outcome,
         "chi2": 1.0,
         "false_kept": 2.0,
@@ -48,9 +51,13 @@ def _result(cell: Cell, outcome: float | str) -> CellResult:
     return CellResult(cell.key, "converged", "", figures, 0.0, "")
 
 
+def error_of(result: CellResult) -> float | None:
+    return result.figures.get("ate_m")
+
+
 def text_of(study: Study) -> str:
     """The page without its pictures and tags."""
-    page = study_page._render(study)
+    page = write_study_page(study).read_text()
     return " ".join(re.sub(r"<style>.*?</style>|<[^>]+>", " ", page, flags=re.DOTALL).split())
 
 
@@ -61,7 +68,7 @@ def better_by_the_seed(cell: Cell) -> float:
 @pytest.mark.parametrize(("method", "seeds", "judged"), [("bootstrap", 2, 0), ("bootstrap", 5, 2), ("t", 2, 0), ("t", 3, 2)])
 def test_few_seeds_have_no_verdict_and_the_page_says_so(made, method, seeds, judged):
     study = made(better_by_the_seed, seeds=seeds, statistics={"method": method}, false_loops={})
-    page = study_page._render(study)
+    page = write_study_page(study).read_text()
     assert page.count('class="n lower"') == judged
     assert (f"({seeds} values: no interval)" in page) == (judged == 0)
     told = next(metric.description for metric in study.metrics if metric.name.startswith("ate_difference/"))
@@ -79,28 +86,26 @@ def test_what_failed_is_said_once_and_not_shown_empty(made):
     assert text.count(NO_LOOPS) == 1
     assert f"every one 24 {NO_LOOPS}" in text
     assert "4 groups have no map by any back-end" in text
-    assert [group.label for group in study_page._groups(study.summaries) if group.lines] == ["laps/default", "again/default"]
+    assert [group.label for group in groups_of(study.summaries) if group.lines] == ["laps/default", "again/default"]
 
 
-def test_back_ends_without_a_map_have_no_line_of_dashes_and_are_not_in_the_legend(made):
+def test_back_ends_without_a_map_have_no_line_of_dashes_and_are_not_in_the_legend(made, monkeypatch):
     study = made(lambda cell: "diverged" if cell.backend == "relaxed" else 1.0, seeds=3)
-    (first, *_) = study_page._groups(study.summaries)
+    (first, *_) = groups_of(study.summaries)
     assert [line.backend for line in first.lines] == ["gtsam-lm", "odometry"]
     assert first.without == ("relaxed",)
     assert "Without a map: relaxed." in text_of(study)
-    drawn = []
-    for panel in study_figures.layout(study).panels:
-        with study_figures._axes(1, 2.0) as (_, (axes,)):
-            looks = study_figures.style.line_styles(["gtsam-lm", "odometry", "relaxed"])
-            study_figures._draw_lines(axes, panel, study_page._error, looks)
-            drawn += axes.get_legend_handles_labels()[1]
-    assert set(drawn) == {"gtsam-lm", "odometry"}
+    drawn: list[Any] = []
+    monkeypatch.setattr(style, "svg_uri", drawn.append)
+    study_figures.merit_figure(study, study_figures.layout(study), "ATE (m)", error_of, logarithmic=True)
+    (legend,) = drawn[0].legends
+    assert {text.get_text() for text in legend.get_texts()} == {"gtsam-lm", "odometry"}
 
 
 def test_panels_without_any_figure_are_left_out_and_counted(made):
     sources = [{"name": name, "synthetic": {"nodes": 40 + 4 * k}} for k, name in enumerate("ab")]
     study = made(lambda cell: NO_LOOPS if cell.source == "a" else 1.0, sources=sources)
-    plan = study_figures.having(study_figures.layout(study), study_page._error)
+    plan = study_figures.having(study_figures.layout(study), error_of)
     assert [panel.title for panel in plan.panels] == ["b, random false loops", "b, aliased false loops"]
     assert "2 panels are left out because no cell has a map there" in text_of(study)
     assert "Every back-end kept all of the false loops" in text_of(study)
