@@ -5,10 +5,11 @@ from typing import Any
 
 import pytest
 
+from hybridmap.output import held
 from hybridmap.report import study_figures, style
 from hybridmap.report.study_page import groups_of, write_study_page
 from hybridmap.study.cell import CellResult
-from hybridmap.study.folder import StudyFolder
+from hybridmap.study.folder import STUDY_FOLDER, StudyFolder
 from hybridmap.study.grid import Cell, lay_out
 from hybridmap.study.pools import ThisProcess
 from hybridmap.study.study import Study, run_study
@@ -29,7 +30,7 @@ def made(tmp_path):
 
     def make(outcome, **changes) -> Study:
         config, folder = small(**changes), StudyFolder(tmp_path)
-        with folder.in_use():
+        with held(tmp_path, STUDY_FOLDER):
             for cell in lay_out(config).cells:
                 folder.keep_result(_result(cell, outcome(cell)))
         return run_study(config, tmp_path, ThisProcess())
