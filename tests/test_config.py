@@ -47,7 +47,7 @@ def test_extending_in_a_circle_is_refused(tmp_path):
         ("backends: {names: x}\n", r"backends.names: expected a list, found 'x'"),
         ("backends: {names: [a, b, a]}\n", r"backends.names: expected each back-end once, found 'a' again"),
         ("- 1\n", r"expected a mapping"),
-        ("a: [\n", r"not a YAML file"),
+        ("a: [\n", r"not YAML: line 2: "),
     ],
 )
 def test_refusals_name_the_key(tmp_path, text, expected):

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from hybridmap.backends.base import ODOMETRY
@@ -76,7 +75,7 @@ def read_drive(folder: Path) -> Drive:
     SessionFolder(folder).require()
     with MapStore.open(folder) as store:
         track, experiences, solutions = store.track(), store.map(), store.solutions()
-        tree = yaml.safe_load(store.config_yaml) or {}
+        tree = store.config_tree
         config = _understood(tree, f"{store.path}: configuration")
         changes, primary = store.info(GAIN_CHANGES) or [], store.primary
         sensors = " and ".join(words(store.rig)) or "no sensor but odometry"

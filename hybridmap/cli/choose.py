@@ -6,10 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import yaml
-
 from hybridmap.config import Config
 from hybridmap.config.root import named_configs
+from hybridmap.config.section import value_of
 from hybridmap.errors import ConfigError
 from hybridmap.streams import open_stream
 from hybridmap.streams.base import Rig, Stream
@@ -36,10 +35,7 @@ def parse_settings(settings: list[str] | None) -> dict[str, Any]:
         key, equals, value = setting.partition("=")
         if not equals or not key.strip():
             raise ConfigError(f"--set {setting}: expected KEY=VALUE, e.g. nodes.distance_m=0.3")
-        try:
-            parsed[key.strip()] = yaml.safe_load(value)
-        except yaml.YAMLError:
-            raise ConfigError(f"--set {setting}: the value is not YAML") from None
+        parsed[key.strip()] = value_of(value, f"--set {setting}")
     return parsed
 
 

@@ -6,12 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from hybridmap.cli.choose import parse_settings
 from hybridmap.config import Config
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.config.gone import without_gone
+from hybridmap.config.section import read_mapping
 from hybridmap.errors import GraphError
 from hybridmap.graph.carries import Carry, carries
 from hybridmap.graph.hashing import graph_hash
@@ -70,8 +69,7 @@ def settings_of(source: GraphSource, config: str | None, setting: list[str] | No
     own = SessionFolder(source.path).config_yaml
     if config is not None or not source.is_session or not own.is_file():
         return Config.load(config, parse_settings(setting)).backends
-    saved = yaml.safe_load(own.read_text(encoding="utf-8")) or {}
-    backends = without_gone({"backends": saved.get("backends", {})})
+    backends = without_gone({"backends": read_mapping(own).get("backends", {})})
     return Config.load(None, {**backends, **parse_settings(setting)}).backends
 
 

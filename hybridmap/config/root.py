@@ -15,7 +15,7 @@ from hybridmap.config.backends import BackendsConfig
 from hybridmap.config.gone import without_gone
 from hybridmap.config.inputs import SensorsConfig, SimulationConfig
 from hybridmap.config.mapping import CalibrationConfig, EdgesConfig, NeuralConfig, NodesConfig
-from hybridmap.config.section import Section, said
+from hybridmap.config.section import Section, mapping_of, read_mapping, said
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import ConfigError
 
@@ -85,7 +85,7 @@ class Config(Section):
         Raises:
             ConfigError: as `load`.
         """
-        return cls.from_tree(without_gone(yaml.safe_load(text) or {}), origin)
+        return cls.from_tree(without_gone(mapping_of(text, origin)), origin)
 
     def to_yaml(self) -> str:
         """The resolved configuration as YAML that `load` reads back to an equal one."""
@@ -114,14 +114,7 @@ def _read_tree(source: str | Path, seen: tuple[Path, ...], beside: Path | None =
     path = _find(source, beside)
     if path in seen:
         raise ConfigError(f"{path}: `extends` leads back to itself")
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not a YAML file: {' '.join(str(error).split())}") from None
-    if tree is None:
-        tree = {}
-    if not isinstance(tree, dict):
-        raise ConfigError(f"{path}: expected a mapping of sections, found {type(tree).__name__}")
+    tree = read_mapping(path)
     parent = tree.pop("extends", None)
     if parent is None:
         return tree

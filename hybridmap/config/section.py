@@ -1,10 +1,15 @@
-"""The base of every configuration section."""
+"""The base of every configuration section, and the one reader of YAML."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
+import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hybridmap.config.gone import what_became_of
+from hybridmap.errors import ConfigError, HybridMapError
 
 _WORDS = {"tuple_type": "a list", "list_type": "a list", "dict_type": "keys with values", "model_type": "keys with values"}
 
@@ -47,3 +52,36 @@ def said(error: ValidationError, section: str = "") -> str:
         expected = message.removeprefix("Input should be ")
         message = f"expected {'a number ' if expected.startswith(('greater', 'less')) else ''}{expected}"
     return f"{where}: {message}, found {repr(first.get('input'))[:80]}"
+
+
+def read_mapping(path: Path, error: type[HybridMapError] = ConfigError) -> dict[str, Any]:
+    """The mapping that a YAML file holds; an empty file holds an empty one.
+
+    Raises:
+        HybridMapError: of the type `error`: the file is no YAML, named with the line, or no mapping.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as mistake:
+        raise error(f"{path}: not YAML: {mistake}") from None
+    return mapping_of(text, str(path), error)
+
+
+def mapping_of(text: str, origin: str, error: type[HybridMapError] = ConfigError) -> dict[str, Any]:
+    """The same for a text; `origin` names it in errors."""
+    tree = value_of(text, origin, error)
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise error(f"{origin}: expected a mapping of keys to values, found {type(tree).__name__}")
+    return tree
+
+
+def value_of(text: str, origin: str, error: type[HybridMapError] = ConfigError) -> Any:
+    """Any value that is written as YAML."""
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as mistake:
+        mark = getattr(mistake, "problem_mark", None)
+        line = f"line {mark.line + 1}: " if mark is not None else ""
+        raise error(f"{origin}: not YAML: {line}{getattr(mistake, 'problem', None) or mistake}") from None

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from hybridmap.errors import EvaluationError
@@ -198,7 +197,7 @@ class Explainer:
         if len(self._map) == 0:
             self._store.close()
             raise EvaluationError(f"{folder}: its map holds no node: there is nothing to explain")
-        self._settings: dict[str, Any] = yaml.safe_load(self._store.config_yaml) or {}
+        self._settings: dict[str, Any] = self._store.config_tree
         self._held_at: dict[int, bool] = {}
 
     def __enter__(self) -> Explainer:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from hybridmap.config.gone import without_gone
 from hybridmap.config.vision import MatchingConfig, ProfileConfig
@@ -151,7 +150,7 @@ def truth_of(folder: Path, reference: Path | None) -> Trajectory:
 
 def view_settings(store: MapStore) -> ViewSettings:
     """The settings that a session's profiles were made with; what an older session did not know has its default."""
-    tree: dict[str, Any] = without_gone(yaml.safe_load(store.config_yaml) or {}).get("vision") or {}
+    tree: dict[str, Any] = without_gone(store.config_tree).get("vision") or {}
     rgbd = tree.get("rgbd") or {}
     return ViewSettings(
         ProfileConfig.model_validate(tree.get("profile") or {}),

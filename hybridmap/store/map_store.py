@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from hybridmap.backends.base import Solution, SolveReport
+from hybridmap.config.section import mapping_of
 from hybridmap.errors import StoreError
 from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.edges import Edge, EdgeKind, Status
@@ -181,6 +181,15 @@ class MapStore:
         return str(self.info("config_yaml"))
 
     @property
+    def config_tree(self) -> dict[str, Any]:
+        """The same as a nested mapping.
+
+        Raises:
+            StoreError: it is damaged.
+        """
+        return mapping_of(self.config_yaml, f"{self._path}: configuration", StoreError)
+
+    @property
     def rig(self) -> Rig:
         """The sensors of the run."""
         return codec.rig_from_json(self.info("rig"))
@@ -196,7 +205,7 @@ class MapStore:
         recorded = self.info("primary_backend")
         if recorded is not None:
             return str(recorded)
-        names = ((yaml.safe_load(self.config_yaml) or {}).get("backends") or {}).get("names") or list(self.solutions())
+        names = (self.config_tree.get("backends") or {}).get("names") or list(self.solutions())
         return str(names[0]) if names else "odometry"
 
     @property

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from hybridmap.config.inputs import CameraIntrinsics, CameraMounting, SensorsConfig
 from hybridmap.config.root import Config
+from hybridmap.config.section import read_mapping
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array
 from hybridmap.streams.base import Rig, Sample, SelfMotion, StreamReport
@@ -218,7 +218,7 @@ def _read_poses(path: Path) -> tuple[NDArray[np.int64], Array]:
 def _read_calibration(folder: Path, sensors: SensorsConfig) -> tuple[Calibration, Array, float]:
     """Intrinsics, (4, 4) pose of the optical frame in the base, and depth units per metre."""
     path = folder / "camera.yaml"
-    tree = _read_camera_yaml(path) if path.is_file() else {}
+    tree = read_mapping(path, StreamError) if path.is_file() else {}
     camera, mounting = tree.get("camera") or {}, tree.get("base_to_camera") or {}
     if sensors.camera_intrinsics is None and not camera:
         raise StreamError(
@@ -240,16 +240,6 @@ def _read_calibration(folder: Path, sensors: SensorsConfig) -> tuple[Calibration
     if not units_per_m > 0:
         raise StreamError(f"{path}: camera.depth_scale: found {units_per_m}, expected units per metre > 0")
     return calibration, mounted(given), units_per_m
-
-
-def _read_camera_yaml(path: Path) -> dict[str, Any]:
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise StreamError(f"{path}: not a YAML file: {' '.join(str(error).split())}") from None
-    if not isinstance(tree, dict):
-        raise StreamError(f"{path}: expected sections `camera` and `base_to_camera`, found {type(tree).__name__}")
-    return tree
 
 
 def _intrinsics_of(camera: dict[str, Any]) -> CameraIntrinsics:

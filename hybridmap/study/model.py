@@ -14,7 +14,7 @@ import yaml
 from pydantic import BeforeValidator, Field, ValidationError
 
 from hybridmap.config.backends import BackendsConfig
-from hybridmap.config.section import Section, said
+from hybridmap.config.section import Section, read_mapping, said
 from hybridmap.errors import ConfigError
 
 
@@ -185,13 +185,7 @@ class StudyConfig(Section):
             ConfigError: no such file, not YAML, an unknown key (named with its path), a value out of range.
         """
         path = _find(source)
-        try:
-            tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: not a YAML file: {' '.join(str(error).split())}") from None
-        if not isinstance(tree, dict):
-            raise ConfigError(f"{path}: expected a mapping with `sources` and `backends`, found {type(tree).__name__}")
-        tree = {"name": path.stem, **tree}
+        tree = {"name": path.stem, **read_mapping(path)}
         changed = deepcopy(tree)
         for dotted, value in (overrides or {}).items():
             merge(changed, nested(dotted, value))

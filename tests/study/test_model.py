@@ -73,7 +73,11 @@ def test_refusals_name_the_key(changes, expected):
 def test_a_missing_or_damaged_file_is_refused(tmp_path):
     (tmp_path / "list.yaml").write_text("- 1\n")
     (tmp_path / "torn.yaml").write_text("a: [\n")
-    for name, expected in (("none.yaml", "studies that come with"), ("list.yaml", "a mapping"), ("torn.yaml", "not a YAML")):
+    for name, expected in (
+        ("none.yaml", "studies that come with"),
+        ("list.yaml", "a mapping"),
+        ("torn.yaml", "not YAML"),
+    ):
         with pytest.raises(ConfigError, match=expected):
             StudyConfig.load(tmp_path / name)
 
