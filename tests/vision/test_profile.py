@@ -71,3 +71,14 @@ def test_laser_profile_resamples_by_bearing_and_skips_invalid():
     holes[1::2] = np.nan
     assert np.abs(laser_profile(holes, bearings, 64) - whole).max() < 0.2
     assert np.argmax(whole) == pytest.approx(48, abs=1)  # sin(2 b) peaks at b = pi / 4
+
+
+def test_each_column_of_a_scan_is_the_mean_of_its_returns_from_the_first_to_the_last():
+    ranges = np.arange(1.0, 9.0, dtype=np.float32)
+    bearings = np.linspace(-1.0, 1.0, 8)  # one beam a column
+    assert np.allclose(laser_profile(ranges, bearings, 8, "mean")[0], ranges / ranges.mean())
+    ranges[2] = np.nan  # that column takes the mean of the others
+    expected = np.where(np.isnan(ranges), np.nanmean(ranges), ranges) / np.nanmean(ranges)
+    assert np.allclose(laser_profile(ranges, bearings, 8, "mean")[0], expected)
+    pairs = np.repeat(np.arange(1.0, 9.0), 2) + np.tile([-0.25, 0.25], 8)
+    assert np.allclose(laser_profile(pairs.astype(np.float32), np.linspace(-1, 1, 16), 8, "mean")[0], np.arange(1.0, 9.0) / 4.5)
