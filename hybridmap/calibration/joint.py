@@ -36,10 +36,13 @@ from hybridmap.graph.pose_graph import PoseGraph
 BIAS_STARTS_RAD_M = (0.0, -0.02, 0.02, -0.06, 0.06, -0.12, 0.12)
 """Starts of the heading bias, rad/m; the drift of wheels seldom exceeds 3 deg/m."""
 
+PRIOR = np.array([0.2, 0.2, 0.2, 0.2])
+"""Standard deviations before the drive of gain, turn gain, heading bias (rad/m) and delay (s): so wide that they hold only
+what the drive leaves open."""
+
 _AGREEING_STARTS = 5
 _SAME_RAD_M = 2e-4
 _OPEN_WAY = 0.1  # share of the way that only odometry spans; below it no winding of the chain is in doubt
-_PRIOR = np.array([0.2, 0.2, 0.2, 0.2])  # so wide that it only holds what the drive leaves open
 _OPEN = 0.5  # of the prior's variance that is left: above it, the prior says more than the drive does
 _HELD = 3  # edges besides odometry: nine equations for four unknowns
 _NEUTRAL = np.append(NEUTRAL.to_array(), 0.0)
@@ -79,7 +82,7 @@ def solve(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config
         BackendError: no start led to a solution.
     """
     require_told_by(Sighting(motion, stamps_ns, graph.initial))
-    problem = _Problem(graph, motion, stamps_ns, config)
+    problem = Problem(graph, motion, stamps_ns, config)
     found: list[Joint] = []
     for bias in BIAS_STARTS_RAD_M if problem.open_way() > _OPEN_WAY else BIAS_STARTS_RAD_M[:1]:
         start = Gains(heading_bias_rad_m=bias)
@@ -98,16 +101,16 @@ def solve(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config
     scale = problem.scale(best.poses, variable)
     final = problem.solve(best.poses, variable, scale, best.bias_start_rad_m) or best
     problem.require_held(final.poses)
-    return replace(final, estimate=_told(final.estimate))
+    return replace(final, estimate=told_by_the_drive(final.estimate))
 
 
-def _told(estimate: Estimate) -> Estimate:
+def told_by_the_drive(estimate: Estimate) -> Estimate:
     """The estimate without the gain and the delay that only the prior held.
 
     Raises:
         NotToldError: it holds turn gain or heading bias.
     """
-    open_ = np.diag(estimate.covariance) > _OPEN * estimate.unit_variance * _PRIOR**2
+    open_ = np.diag(estimate.covariance) > _OPEN * estimate.unit_variance * PRIOR**2
     if open_[1] or open_[2]:
         raise NotToldError(
             "calibration: the drive and its loops tell neither turn gain nor heading bias better than was known before; "
@@ -120,7 +123,7 @@ def _told(estimate: Estimate) -> Estimate:
     return replace(estimate, gains=gains, delay_s=require_delay(float(values[3])), covariance=covariance)
 
 
-class _Problem:
+class Problem:
     """One graph with its calibration variable, to be solved from several starts."""
 
     def __init__(self, graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config: BackendsConfig) -> None:
@@ -240,13 +243,13 @@ class _Problem:
         unit = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Unit.Create(3))
         ends = zip(self.terms.sources.tolist(), self.terms.targets.tolist(), strict=True)
         for index, (source, target) in enumerate(ends):
-            out.push_back(gtsam.CustomFactor(unit, [source, target, self.key], _leg_error(self, self.terms, index)))
+            out.push_back(gtsam.CustomFactor(unit, [source, target, self.key], leg_error(self, self.terms, index)))
         out.push_back(anchor(self.graph.initial[0]))
-        out.push_back(gtsam.PriorFactorVector(self.key, _NEUTRAL, gtsam.noiseModel.Diagonal.Sigmas(_PRIOR)))
+        out.push_back(gtsam.PriorFactorVector(self.key, _NEUTRAL, gtsam.noiseModel.Diagonal.Sigmas(PRIOR)))
         return out
 
 
-def _leg_error(problem: _Problem, terms: OdometryTerms, index: int) -> Callable[[Any, Any, Any], Array]:
+def leg_error(problem: Problem, terms: OdometryTerms, index: int) -> Callable[[Any, Any, Any], Array]:
     """Whitened error (3,) of one term: where the target is, seen from where calibrated odometry has it."""
     source, target = int(terms.sources[index]), int(terms.targets[index])
     whiten, key = terms.whiten[index], problem.key

@@ -144,7 +144,7 @@ def place_maps(
         rates = population.respond(seen.T)
         maps[name] = _population(_as_maps(rates, order, count))
         shown = _onto_sheet(population.respond(learnt.T), bump, rates)
-        for stage, activity in (("input", shown), ("settled", _settled(integrator, shown))):
+        for stage, activity in (("input", shown), ("settled", settled_sheets(integrator, shown))):
             sheet[name, stage] = _population(_as_maps(activity, order, count), floor=_FIRING)
             one_bump[name, stage] = one_bump_share(activity)
     return PlaceResult(pitch_m, maps["recruited"], maps["printed"], sheet, one_bump)
@@ -194,7 +194,7 @@ def _onto_sheet(learnt: NDArray[np.float32], bumps: NDArray[np.float32], rates: 
     return np.asarray(shown / np.where(total > 0.0, total, 1.0), dtype=np.float32)
 
 
-def _settled(integrator: PathIntegrator, shown: NDArray[np.float32]) -> NDArray[np.float32]:
+def settled_sheets(integrator: PathIntegrator, shown: NDArray[np.float32]) -> NDArray[np.float32]:
     """The sheet's activity (S, P) after its cells have competed over each input (S, P)."""
     attractor = integrator.attractor
     settled = np.zeros_like(shown)

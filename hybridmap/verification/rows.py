@@ -174,14 +174,14 @@ def recurrence_verdict(place: PlaceResult) -> str:
         before, after = (100.0 * place.sheet[learnt, stage].single for stage in ("input", "settled"))
         several, one = (100.0 * place.one_bump[learnt, stage] for stage in ("input", "settled"))
         sentences.append(
-            f"Behind {cells}, settled competition {_change(after - before)} the share of the attractor's cells with a single "
-            f"field ({before:.1f} % before, {after:.1f} % after). The sheet holds one bump at a time in {several:.1f} % of the "
+            f"Behind {cells}, settled competition {verb_of_change(after - before)} the share of the attractor's cells with a "
+            f"single field ({before:.1f} % before, {after:.1f} % after). The sheet holds one bump at a time in {several:.1f} % of the "
             f"places before and in {one:.1f} % after."
         )
     return " ".join(sentences)
 
 
-def _change(percent: float) -> str:
+def verb_of_change(percent: float) -> str:
     """The verb for a change by some per cent of all cells."""
     if abs(percent) < 0.5:
         return "does not change"

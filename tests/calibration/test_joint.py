@@ -83,13 +83,13 @@ def test_a_circle_is_refused_before_anything_is_solved():
 
 def test_what_the_drive_leaves_open_is_the_prior_and_not_reported():
     """The variance that is left of the prior says so."""
-    covariance = np.diag(joint._PRIOR**2 * [0.9, 0.01, 0.01, 0.9])
-    estimate = joint._told(Estimate(Gains(1.02, 1.01, 0.01), 0.05, covariance, 4.0, 20.0, 80.0, 1.0, 0.0))
+    covariance = np.diag(joint.PRIOR**2 * [0.9, 0.01, 0.01, 0.9])
+    estimate = joint.told_by_the_drive(Estimate(Gains(1.02, 1.01, 0.01), 0.05, covariance, 4.0, 20.0, 80.0, 1.0, 0.0))
     assert estimate.measured.tolist() == [False, True, True, False]
     assert (estimate.gains, estimate.delay_s) == (Gains(1.0, 1.01, 0.01), 0.0)
-    open_ = np.diag(joint._PRIOR**2 * [0.01, 0.01, 0.9, 0.01])
+    open_ = np.diag(joint.PRIOR**2 * [0.01, 0.01, 0.9, 0.01])
     with pytest.raises(EvaluationError, match="tell neither turn gain nor heading bias"):
-        joint._told(Estimate(Gains(1.02, 1.01, 0.01), 0.05, open_, 4.0, 20.0, 80.0, 1.0, 0.0))
+        joint.told_by_the_drive(Estimate(Gains(1.02, 1.01, 0.01), 0.05, open_, 4.0, 20.0, 80.0, 1.0, 0.0))
 
 
 def test_registrations_leave_no_winding_in_doubt_and_long_legs_enter():
@@ -109,8 +109,8 @@ def test_derivatives_agree_with_differences(bent):
     import gtsam
 
     graph, motion, stamps, truth = bent
-    problem = joint._Problem(graph, motion, stamps, CONFIG)
-    error = joint._leg_error(problem, problem.terms, 7)
+    problem = joint.Problem(graph, motion, stamps, CONFIG)
+    error = joint.leg_error(problem, problem.terms, 7)
     source, target = int(problem.terms.sources[7]), int(problem.terms.targets[7])
     variable = np.array([1.02, 0.97, 0.03, 0.01])
 

@@ -120,10 +120,13 @@ def test_a_gain_that_was_not_measured_stays_in_use_on_the_map_too(tmp_path, monk
     estimate = Estimate(Gains(1.0, 0.97, -0.04), 0.0, np.diag([np.inf, 1e-6, 1e-6, 1e-4]), 4.0, 20.0, 80.0, 1.0, 0.0)
     rng = np.random.default_rng(0)
     read = read_drive(write_session(tmp_path / "s", drive(rng, laps=2), rng, gains=Gains(1.05, 1.0, 0.0)))
-    used = []
+    used: list[Gains] = []
+
+    def noted(drive, gains, delay_s):
+        used.append(gains)
+        return corrected(drive, gains, delay_s)
+
     monkeypatch.setattr(sessions, "regress", lambda sightings, leg_m: estimate)
-    monkeypatch.setattr(
-        sessions, "corrected", lambda drive, gains, delay_s: used.append(gains) or corrected(drive, gains, delay_s)
-    )
+    monkeypatch.setattr(sessions, "corrected", noted)
     assert not alternating([read]).measured[0]
     assert used == [Gains(1.05, 0.97, -0.04)]

@@ -137,7 +137,7 @@ def test_the_larger_of_two_bumps_is_what_settles():
     bump = integrator.attractor.activity
     two = bump + 0.7 * np.roll(bump, (9, -12), axis=(0, 1))
     shown = np.stack([two.ravel(), 0.0 * two.ravel()], axis=1).astype(np.float32)
-    settled = rate_maps._settled(integrator, shown)
+    settled = rate_maps.settled_sheets(integrator, shown)
     assert rate_maps.one_bump_share(shown) == 0.0
     assert rate_maps.one_bump_share(settled) == 1.0
     assert settled[:, 0].reshape(bump.shape) == pytest.approx(bump, abs=1e-3)

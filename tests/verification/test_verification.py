@@ -6,7 +6,7 @@ import pytest
 from hybridmap import geometry
 from hybridmap.verification import rows_of, verify_cells
 from hybridmap.verification.drives import corridor, pixel_order, raster, wander
-from hybridmap.verification.rows import _change, recurrence_verdict
+from hybridmap.verification.rows import recurrence_verdict, verb_of_change
 from tests.verification.cells_for_tests import TINY
 
 
@@ -49,7 +49,7 @@ def test_recurrence_is_stated_whichever_way_it_comes_out(result):
     assert "printed rule" in text
     settled = dataclasses.replace(result.place, sheet=dict.fromkeys(result.place.sheet, result.place.recruited))
     assert recurrence_verdict(settled).count("does not change") == 2
-    assert [_change(percent) for percent in (0.4, 1.0, -4.9, 6.0, -6.0)] == [
+    assert [verb_of_change(percent) for percent in (0.4, 1.0, -4.9, 6.0, -6.0)] == [
         "does not change", "hardly changes", "hardly changes", "raises", "lowers",
     ]  # fmt: skip
 
