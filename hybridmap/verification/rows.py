@@ -175,8 +175,8 @@ def recurrence_verdict(place: PlaceResult) -> str:
         several, one = (100.0 * place.one_bump[learnt, stage] for stage in ("input", "settled"))
         sentences.append(
             f"Behind {cells}, settled competition {verb_of_change(after - before)} the share of the attractor's cells with a "
-            f"single field ({before:.1f} % before, {after:.1f} % after). The sheet holds one bump at a time in {several:.1f} % of the "
-            f"places before and in {one:.1f} % after."
+            f"single field ({before:.1f} % before, {after:.1f} % after). The sheet holds one bump at a time in {several:.1f} % "
+            f"of the places before and in {one:.1f} % after."
         )
     return " ".join(sentences)
 
