@@ -5,7 +5,8 @@
 
 The error is that of the primary back-end, which runs alone: the mean translation error over verified relations, or the ATE
 against the recording's own truth. Rows are added to `docs/sensitivity.csv` one by one, and those that are there are not run
-again, so that a run can be broken off and taken up; delete the file to begin anew. `tools/configuration_page.py` shows those that matter.
+again, so that a run can be broken off and taken up; delete the file to begin anew. `tools/configuration_page.py` shows those
+that matter.
 """
 
 from __future__ import annotations
