@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hybridmap.backends import objective
-from hybridmap.backends.base import SolveReport
+from hybridmap.backends.base import ODOMETRY, SolveReport
 from hybridmap.calibration.sessions import GAIN_CHANGES
 from hybridmap.config import Config
 from hybridmap.errors import StreamError
@@ -174,12 +174,12 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
     store = recorder.store
     store.put_anchors(mapper.anchors)
     track = store.track()
-    folder.write_trajectory("odometry", track.odometry)
+    folder.write_trajectory(ODOMETRY, track.odometry)
     for name in mapper.backends.names:
         solution = mapper.backends.solutions.get(name)
         if solution is not None:
             store.put_solution(name, solution.poses, solution.report)
-            if name != "odometry":
+            if name != ODOMETRY:
                 folder.write_trajectory(name, trajectory_of(track, solution.poses))
             folder.write_trajectory(f"{name}_online", store.online(name))
     free = unobserved(mapper.map, mapper.poses())
@@ -267,7 +267,7 @@ def _figures(mapper: Mapper, recorder: _Recorder, duration_s: float) -> list[Met
         Metric("chi2/odometry", chain, "1", "referee's chi2 of the odometry chain"),
     ]
     for name, solution in mapper.backends.solutions.items():
-        if name == "odometry":
+        if name == ODOMETRY:
             continue
         report = solution.report
         rows += [

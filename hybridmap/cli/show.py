@@ -30,8 +30,10 @@ def emit(head: dict[str, Any], metrics: Iterable[Metric], *, as_json: bool, titl
         return
     from rich.console import Console
 
+    from hybridmap.backends.base import ODOMETRY
+
     console = Console(width=None if sys.stdout.isatty() else 140)
-    columns = [str(name) for name in ("odometry", *head["backends"])] if "backends" in head else []
+    columns = [str(name) for name in (ODOMETRY, *head["backends"])] if "backends" in head else []
     columns = [name for name in dict.fromkeys(columns) if any(_stage(row) == name for row in rows)]
     plain = [row for row in rows if _stage(row) not in columns]
     print_title(console, title)

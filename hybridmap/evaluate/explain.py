@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.backends.base import ODOMETRY
 from hybridmap.errors import EvaluationError
 from hybridmap.evaluate.association import known_at
 from hybridmap.evaluate.checks import Check, checks_of, otherwise, setting
@@ -266,7 +267,7 @@ class Explainer:
             node, since = node + 1, np.zeros(3)
         made, moved = self._is_of(node, stamp), _moved(since)
         after = self._map.node(node + 1) if node + 1 < len(self._map) else None
-        believed = {"odometry": track.poses_odom[at]}
+        believed = {ODOMETRY: track.poses_odom[at]}
         for name in self._store.online_backends():
             believed[name] = self._store.online(name).at(np.array([stamp]))[0]
         return FrameStory(
@@ -319,7 +320,7 @@ class Explainer:
         return read_tum(self._folder.groundtruth) if self._folder.groundtruth.is_file() else None
 
     def _poses(self, number: int) -> dict[str, Array]:
-        out = {"odometry": self._map.node(number).pose_odom}
+        out = {ODOMETRY: self._map.node(number).pose_odom}
         for name, solution in self._store.solutions().items():
             if number < len(solution.poses):
                 out[name] = solution.poses[number]

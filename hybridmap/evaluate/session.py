@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
+from hybridmap.backends.base import ODOMETRY
 from hybridmap.errors import EvaluationError
 from hybridmap.evaluate.association import associate
 from hybridmap.evaluate.closures import ClosureErrors, closure_errors
@@ -19,7 +20,6 @@ from hybridmap.trajectory import Trajectory, read_tum
 
 log = logging.getLogger(__name__)
 
-ODOMETRY = "odometry"
 _ONLINE = "_online"
 
 

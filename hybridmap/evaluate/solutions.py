@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from hybridmap.backends.base import ODOMETRY
 from hybridmap.evaluate.relations import relations_of
-from hybridmap.evaluate.session import ODOMETRY, against_relations, against_truth
+from hybridmap.evaluate.session import against_relations, against_truth
 from hybridmap.evaluate.trajectory import absolute_error
 from hybridmap.geometry import Array, compose, inverse
 from hybridmap.graph.carries import grounded, pieces

@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from hybridmap.backends import Solution, create, names
+from hybridmap.backends.base import ODOMETRY
 from hybridmap.config import Config
 from hybridmap.errors import ExportError
 from hybridmap.geometry import Array
@@ -16,8 +17,6 @@ from hybridmap.store import MapStore, SessionFolder, trajectory_of
 from hybridmap.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
-
-ODOMETRY = "odometry"
 
 
 @dataclass(frozen=True, slots=True)

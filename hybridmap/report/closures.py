@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.backends.base import ODOMETRY
 from hybridmap.evaluate.scores import in_words
 from hybridmap.geometry import Array, between, transform_points
 from hybridmap.graph.edges import Edge, Status
 from hybridmap.report import style
 from hybridmap.report.map_figure import loops_by_fate
-from hybridmap.report.scene import ODOMETRY, Scene
+from hybridmap.report.scene import Scene
 from hybridmap.store import MapStore
 from hybridmap.trajectory import NS_PER_S
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hybridmap.backends.base import ODOMETRY
 from hybridmap.backends.comparison import Row, Way
 from hybridmap.backends.objective import squared_norms
 from hybridmap.geometry import Array
@@ -36,7 +37,7 @@ def overlay(rows: Sequence[Row], truth: Sequence[Array], carried: Sequence[Carry
     maps = solved(rows)
     if not maps:
         return ""
-    framed = [poses for title, poses in maps.items() if title != "odometry"] or list(maps.values())
+    framed = [poses for title, poses in maps.items() if title != ODOMETRY] or list(maps.values())
     low, high = _box([*framed, *truth])
     with style.figure(*style.fitted_size(high - low)) as picture:
         axes = picture.subplots()
@@ -83,7 +84,7 @@ def panels(graph: PoseGraph, rows: Sequence[Row], start: str, carried: Sequence[
 
 def convergence(rows: Sequence[Row]) -> str:
     """Batch: chi2 over iterations; incremental: unit variance over nodes; a `data:` URI, empty where nothing was traced."""
-    traced = [row for row in rows if row.has_map and row.curve is not None and row.backend != "odometry"]
+    traced = [row for row in rows if row.has_map and row.curve is not None and row.backend != ODOMETRY]
     ways = [way for way in Way if any(row.way is way for row in traced)]
     if not ways:
         return ""
@@ -150,8 +151,8 @@ def _looks(rows: Sequence[Row]) -> Mapping[str, dict[str, Any]]:
     Each is thinner than those before and on top of them, so that of lines which coincide the last is seen with a rim of others.
     """
     colors = (style.PRIMARY, *style.OTHERS)
-    names = [name for name in dict.fromkeys(row.backend for row in rows) if name != "odometry"]
-    color_of = {"odometry": style.ODOMETRY} | {name: colors[i % len(colors)] for i, name in enumerate(names)}
+    names = [name for name in dict.fromkeys(row.backend for row in rows) if name != ODOMETRY]
+    color_of = {ODOMETRY: style.ODOMETRY} | {name: colors[i % len(colors)] for i, name in enumerate(names)}
     width = dict(zip((row.title for row in rows), np.linspace(_THICK_PT, _THIN_PT, len(rows)), strict=True))
     return {
         row.title: {
@@ -159,7 +160,7 @@ def _looks(rows: Sequence[Row]) -> Mapping[str, dict[str, Any]]:
             "zorder": 5,
             **(
                 {"linewidth": _THIN_PT, "linestyle": (0, (1, 1)), "zorder": 4}
-                if row.backend == "odometry"
+                if row.backend == ODOMETRY
                 else {"linewidth": width[row.title], "linestyle": (0, (4, 1.6)) if row.way is Way.INCREMENTAL else "-"}
             ),
         }

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from hybridmap.backends.base import ODOMETRY
 from hybridmap.geometry import Array, wrap_angle
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.report import style
-from hybridmap.report.scene import ODOMETRY, ONLINE, Scene
+from hybridmap.report.scene import ONLINE, Scene
 from hybridmap.trajectory import NS_PER_S
 
 _FLOOR_M, _FLOOR_DEG = 1e-3, 1e-2

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from hybridmap.backends.base import ODOMETRY
 from hybridmap.graph.carries import carries, pieces
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.report import style
@@ -38,7 +39,7 @@ def draw_trajectories(axes: Any, scene: Scene, building: Raster | None) -> None:
         if name in scene.estimates:
             label = f"{name} (primary)" if name == scene.primary else name
             _draw_ways(axes, scene.estimates[name], scene, label=label, **styles[name])
-    start = scene.estimates.get(scene.primary, scene.estimates["odometry"]).poses[0]
+    start = scene.estimates.get(scene.primary, scene.estimates[ODOMETRY]).poses[0]
     axes.plot(*start[:2], marker="o", markersize=7, color="white", markeredgecolor="black", zorder=8, label="start")
     style.metric_axes(axes)
 

@@ -7,6 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from hybridmap.backends.base import ODOMETRY
 from hybridmap.graph.carries import carries
 from hybridmap.metrics import Metric
 from hybridmap.output import write_text
@@ -16,7 +17,7 @@ from hybridmap.report.correction_figure import correction_figure
 from hybridmap.report.error_figure import error_figure
 from hybridmap.report.map_figure import graph_figure, trajectories_figure
 from hybridmap.report.outline import outlines, raster
-from hybridmap.report.scene import ODOMETRY, Scene, load_scene
+from hybridmap.report.scene import Scene, load_scene
 from hybridmap.report.template import rendered
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.trajectory import NS_PER_S

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from hybridmap.backends.base import SolveReport
+from hybridmap.backends.base import ODOMETRY, SolveReport
 from hybridmap.errors import EvaluationError, HybridMapError
 from hybridmap.evaluate.association import Pairs, associate
 from hybridmap.evaluate.session import session_trajectories
@@ -16,7 +16,6 @@ from hybridmap.metrics import Metric
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
 
-ODOMETRY = "odometry"
 ONLINE = "_online"
 
 

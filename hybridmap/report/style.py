@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.backends import base
 from hybridmap.geometry import Array
 from hybridmap.report.outline import Raster
 
@@ -47,7 +48,7 @@ _SETTINGS = {
 def line_styles(backends: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Name -> how its line is drawn; `backends` begins with `odometry` and the primary, as a scene's do."""
     styles: dict[str, dict[str, Any]] = {}
-    others = [name for name in backends if name != "odometry"]
+    others = [name for name in backends if name != base.ODOMETRY]
     dashes = ((0, (4, 1.2)), (0, (6, 1.2, 1, 1.2)), (0, (1.2, 1.2)))
     for rank, name in enumerate(others):
         if rank == 0:
@@ -59,7 +60,7 @@ def line_styles(backends: Sequence[str]) -> dict[str, dict[str, Any]]:
                 "linestyle": dashes[(rank - 1) % len(dashes)],
                 "zorder": 5,
             }
-    styles["odometry"] = {"color": ODOMETRY, "linewidth": 1.2, "linestyle": (0, (1, 1)), "zorder": 4}
+    styles[base.ODOMETRY] = {"color": ODOMETRY, "linewidth": 1.2, "linestyle": (0, (1, 1)), "zorder": 4}
     return styles
 
 

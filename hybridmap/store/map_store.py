@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.backends.base import Solution, SolveReport
+from hybridmap.backends.base import ODOMETRY, Solution, SolveReport
 from hybridmap.config.section import mapping_of
 from hybridmap.errors import StoreError
 from hybridmap.geometry import Array, RelativePose
@@ -206,7 +206,7 @@ class MapStore:
         if recorded is not None:
             return str(recorded)
         names = (self.config_tree.get("backends") or {}).get("names") or list(self.solutions())
-        return str(names[0]) if names else "odometry"
+        return str(names[0]) if names else ODOMETRY
 
     @property
     def ended(self) -> bool:
