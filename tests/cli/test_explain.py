@@ -14,7 +14,7 @@ NODES_BY_TRAVEL = "nodes: {rule: travel, distance_m: 0.1, angle_deg: 15.0}"
 
 @pytest.fixture
 def run(monkeypatch, capsys):
-    def call(*arguments: object) -> tuple[int, str, str]:
+    def call(*arguments: object) -> tuple[str | int | None, str, str]:
         monkeypatch.setattr(sys, "argv", ["hybridmap", "explain", *map(str, arguments)])
         with pytest.raises(SystemExit) as stopped:
             main()

@@ -13,13 +13,14 @@ from hybridmap.evaluate.association import travel
 from hybridmap.simulation import world_names
 from hybridmap.streams import open_stream
 from hybridmap.streams.laser import LaserScan
+from tests.narrowing import known
 
 SHORT = ["--duration", "1", "--set", "simulation.camera.width_px=32", "--set", "simulation.camera.height_px=24"]
 
 
 @pytest.fixture
 def run(monkeypatch, capsys):
-    def call(*arguments: str) -> tuple[int, str, str]:
+    def call(*arguments: str) -> tuple[str | int | None, str, str]:
         monkeypatch.setattr(sys, "argv", ["hybridmap", *arguments])
         with pytest.raises(SystemExit) as stopped:
             main()
@@ -103,7 +104,7 @@ def test_kidnap_says_when_and_how_far(run, tmp_path):
     assert code == 0
     values = {row["name"]: row["value"] for row in json.loads(out)["metrics"]}
     assert values["carried/simulation"] > 5
-    truth = open_stream(tmp_path / "t", Config()).groundtruth
+    truth = known(open_stream(tmp_path / "t", Config()).groundtruth)
     since_s = truth.stamps_s - truth.stamps_s[0]
     on_floor = (since_s < values["picked_up/simulation"], since_s > values["put_down/simulation"])
     driven_m = sum(travel(truth.poses[part])[-1] for part in on_floor)
