@@ -77,10 +77,6 @@ class Isam2Config(Section):
 
     loop_kernel: Literal["none", "cauchy"] = "none"
     """Kernel on the loop edges."""
-    patience: float = Field(default=0.5, ge=0)
-    """Closures wait while together they could move no pose by more than this many of its standard deviations.
-
-    Watch: 0 works on every closure at once, which costs time."""
 
 
 class BackendsConfig(Section):

@@ -20,7 +20,7 @@ neural neural/decoder.py decode_box_m
 neural neural/path_integrator.py orientation_deg orientation_step_deg neuron_noise_seed
 neural.place neural/path_integrator.py theta_hz
 neural.place neural/attractor.py attractor_width_cells
-neural.place neural/place.py grid_inputs_side recruit_threshold inhibition
+neural.place neural/place.py grid_inputs_side recruit_threshold inhibition max_cells
 calibration calibration/online.py first_m every_m
 backends.relaxation backends/relaxation/relaxing.py tolerance_m
 backends.relaxation backends/relaxation/sweeps.py robust_scale_m robust_scale_rad robust_start
@@ -29,6 +29,7 @@ backends.robust backends/judging/weak.py odometry_scale
 backends.gnc backends/gtsam/gnc.py chunk_nodes mu_factor max_rounds
 backends.consistency backends/judging/consistency.py quantile neighbours
 backends.isam2 backends/gtsam/smoother.py relinearize_m relinearize_rad settle_updates
+backends.isam2 backends/gtsam/incremental.py patience
 """
 
 RENAMED: dict[str, str] = {}

@@ -125,7 +125,7 @@ class WheelErrorConfig(Section):
     heading_bias_deg_per_m: float = 0.16
     """Pull to the left, degrees per metre driven.
 
-    Watch: of the three biases it bends a map most."""
+    Watch: it bends a map more than any other error of wheels."""
     noise: float = Field(default=1.0, ge=0, le=100)
     """Factor on the white noise and on the number and size of slips; 0: none.
 
@@ -147,8 +147,6 @@ class CameraConfig(Section):
     """Frames a second."""
     range_max_m: float = Field(default=5.0, gt=0, lt=13)
     """No depth beyond this, m along the optical axis."""
-    noise: float = Field(default=1.0, ge=0, le=10)
-    """Factor on the noise of depth and colour, the holes in depth and the change of exposure; 0: a perfect camera."""
 
 
 class LaserScannerConfig(Section):
@@ -162,8 +160,6 @@ class LaserScannerConfig(Section):
     """Scans a second."""
     range_max_m: float = Field(default=12.0, gt=0)
     """No return beyond this, m."""
-    noise: float = Field(default=1.0, ge=0, le=100)
-    """Factor on the noise of ranges and the share of lost beams; 0: a perfect laser."""
 
 
 class SimulationConfig(Section):
@@ -173,6 +169,8 @@ class SimulationConfig(Section):
     """Name of the world and its drive."""
     sensors: Literal["rgbd", "laser", "both"] = "rgbd"
     """What the robot carries besides its wheels."""
+    noise: float = Field(default=1.0, ge=0, le=10)
+    """Factor on the noise of these sensors: of depth, colour and ranges, holes, lost beams and changes of exposure; 0: none."""
     duration_s: float | None = Field(default=None, gt=0)
     """Stop the drive after so many seconds; None: drive to its end."""
     carried_m: float | None = Field(default=None, gt=0)

@@ -24,10 +24,6 @@ class PlaceConfig(Section):
     """eta of the Hebbian rule, per learning step.
 
     Watch: fields drift towards where the robot is most often."""
-    max_cells: int = Field(default=32768, ge=1, le=262144)
-    """No more place cells than this are recruited.
-
-    Watch: each takes some 0.5 kB and a little of every learning step; beyond it new places get no cell of their own."""
     attractor_input: float = Field(default=0.0, ge=0, lt=1)
     """Share of the place cells' input in the attractor's activity at each learning step.
 

@@ -16,6 +16,8 @@ RECRUIT_THRESHOLD = 0.3
 """A cell is recruited where no other responds above this share of its peak: fields overlap a little, none is left out."""
 INHIBITION = 0.6
 """C_inh_p, as a share of a field's peak drive: fields are some 7 cm wide, and 97 % and more have one peak."""
+MAX_CELLS = 32768
+"""No more place cells than this are recruited: with their weights some 16 MB, and as many learning steps."""
 
 log = logging.getLogger(__name__)
 
@@ -74,13 +76,13 @@ class PlaceCells:
         return np.asarray(above)
 
     def _recruit(self, drive: NDArray[np.float32]) -> None:
-        if self._recruited == self.config.max_cells:
+        if self._recruited == MAX_CELLS:
             return
         if self._recruited == len(self._weights):
             self._weights = np.concatenate([self._weights, np.zeros_like(self._weights)])
         self._weights[self._recruited] = drive
         self._recruited += 1
-        if self._recruited == self.config.max_cells:
+        if self._recruited == MAX_CELLS:
             log.warning("all %d place cells are recruited; new places get no cell of their own", self._recruited)
 
     def inputs(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:

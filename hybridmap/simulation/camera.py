@@ -64,16 +64,17 @@ class _Exposure:
 class CameraModel:
     """Renders frames of one scene."""
 
-    def __init__(self, scene: Scene, config: CameraConfig, rng: np.random.Generator) -> None:
+    def __init__(self, scene: Scene, config: CameraConfig, rng: np.random.Generator, noise: float = 1.0) -> None:
         self._scene = scene
         self._config = config
+        self._level = noise
         self.camera = camera_of(config)
         columns, rows = np.meshgrid(np.arange(config.width_px), np.arange(config.height_px))
         c = self.camera
         ray = np.stack([(columns - c.cx_px) / c.fx_px, (rows - c.cy_px) / c.fy_px, np.ones(columns.shape)], axis=-1)
         self._rays_base = ray @ c.T_base_camera[:3, :3].T
         self._ray_length = np.linalg.norm(ray, axis=-1).astype(np.float32)
-        self._exposure = _Exposure(config.noise * EXPOSURE_CHANGE, rng.uniform(0.02, 0.25, 4), rng.uniform(0, 2 * np.pi, 4))
+        self._exposure = _Exposure(noise * EXPOSURE_CHANGE, rng.uniform(0.02, 0.25, 4), rng.uniform(0, 2 * np.pi, 4))
 
     def frame(self, stamp_ns: int, time_s: float, pose_world_base: Array, rng: np.random.Generator) -> RgbdFrame:
         """What the camera sees from a pose.
@@ -102,13 +103,13 @@ class CameraModel:
         seen = self._scene.atlas.sample(hits.surface, hits.across, hits.down, footprint)
         seen[~hits.hit] = _SKY
         seen *= np.float32(gain)
-        seen += np.float32(self._config.noise * COLOR_NOISE) * rng.standard_normal(seen.shape, dtype=np.float32)
+        seen += np.float32(self._level * COLOR_NOISE) * rng.standard_normal(seen.shape, dtype=np.float32)
         return np.asarray(np.clip(seen + np.float32(0.5), 0, 255), dtype=np.uint8)
 
     def _depth(self, hits: Hits, cosine: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
         """Depth (H, W) float32 in whole millimetres; axial noise after Nguyen et al. 2012, growing with z^2."""
         z = np.where(hits.hit, hits.length, np.float32(99.0))
-        sigma = self._config.noise * (DEPTH_NOISE_M + DEPTH_NOISE_PER_M * (z - 0.4) ** 2)
+        sigma = self._level * (DEPTH_NOISE_M + DEPTH_NOISE_PER_M * (z - 0.4) ** 2)
         noisy = z + sigma.astype(np.float32) * self._noise(z.shape, rng)
         lost = (
             ~hits.hit
@@ -138,7 +139,7 @@ class CameraModel:
 
     def _patches(self, shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.bool_]:
         """Blobs without depth, as dark or shiny spots give."""
-        share = self._config.noise * HOLE_FRACTION
+        share = self._level * HOLE_FRACTION
         if share <= 0.0:
             return np.zeros(shape, dtype=np.bool_)
         field = smooth_noise(rng, (shape[0], shape[1]), shape[1] / 28.0)

@@ -35,9 +35,9 @@ def laser_of(config: LaserScannerConfig) -> Laser:
 class LaserModel:
     """Scans one scene in a plane parallel to the floor."""
 
-    def __init__(self, scene: Scene, config: LaserScannerConfig) -> None:
+    def __init__(self, scene: Scene, config: LaserScannerConfig, noise: float = 1.0) -> None:
         self._scene = scene
-        self._config = config
+        self._noise = noise
         self.laser = laser_of(config)
 
     def scan(self, stamp_ns: int, pose_world_base: Array, rng: np.random.Generator) -> LaserScan:
@@ -48,8 +48,8 @@ class LaserModel:
         origin = np.array([x + FORWARD_M * np.cos(yaw), y + FORWARD_M * np.sin(yaw), HEIGHT_M])
         hits = self._scene.cast(origin, rays)
         ranges = np.where(hits.hit, hits.length, np.inf).astype(np.float64)
-        ranges = ranges + self._config.noise * NOISE_M * rng.standard_normal(len(ranges))
-        dropped = rng.random(len(ranges)) < self._config.noise * DROP_FRACTION
+        ranges = ranges + self._noise * NOISE_M * rng.standard_normal(len(ranges))
+        dropped = rng.random(len(ranges)) < self._noise * DROP_FRACTION
         return LaserScan(stamp_ns, self._valid(ranges.astype(np.float32), dropped))
 
     def _valid(self, ranges: NDArray[np.float32], dropped: NDArray[np.bool_]) -> NDArray[np.float32]:

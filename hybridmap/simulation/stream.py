@@ -128,8 +128,8 @@ class SimulatedStream:
         from hybridmap.simulation.laser import LaserModel
 
         generators = self._generators()
-        camera = CameraModel(self._scene, self._config.camera, generators[_CAMERA])
-        laser = LaserModel(self._scene, self._config.laser)
+        camera = CameraModel(self._scene, self._config.camera, generators[_CAMERA], self._config.noise)
+        laser = LaserModel(self._scene, self._config.laser, self._config.noise)
         frame_noise = generators[_CAMERA].spawn(len(self._frame_stamps))
         scan_noise = generators[_LASER].spawn(len(self._scan_stamps))
         due = [(int(stamp), 0, index) for index, stamp in enumerate(self._frame_stamps)]

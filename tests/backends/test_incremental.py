@@ -7,11 +7,10 @@ import pytest
 from graphs_for_tests import laps
 
 from hybridmap import backends
-from hybridmap.backends.gtsam import smoother
+from hybridmap.backends.gtsam import incremental, smoother
 from hybridmap.backends.gtsam.covariance import Covariances
 from hybridmap.backends.gtsam.factors import NoiseModels, poses_of
-from hybridmap.backends.gtsam.incremental import Smoother, create
-from hybridmap.config.backends import BackendsConfig, Isam2Config
+from hybridmap.backends.gtsam.smoother import Smoother
 from hybridmap.errors import BackendError
 from hybridmap.geometry import between, log
 from hybridmap.graph.growth import prefix
@@ -25,10 +24,6 @@ def modest(seed, nodes=90):
     return graph
 
 
-def patient(patience):
-    return create("gtsam-isam2", BackendsConfig(isam2=Isam2Config(patience=patience)))
-
-
 def grown(backend, graph):
     return [backend.update(prefix(graph, nodes)) for nodes in range(1, graph.n_nodes + 1)]
 
@@ -39,7 +34,10 @@ def test_closures_wait_only_while_no_pose_would_move_by_more_than_the_patience(p
     monkeypatch.setattr(smoother, "RELINEARIZE_M", 1e-4)
     graph = modest(0)
     waited = 0
-    lazy, eager = grown(patient(patience), graph), grown(patient(0.0), graph)
+    monkeypatch.setattr(incremental, "PATIENCE", patience)
+    lazy = grown(backends.create("gtsam-isam2"), graph)
+    monkeypatch.setattr(incremental, "PATIENCE", 0.0)
+    eager = grown(backends.create("gtsam-isam2"), graph)
     for nodes, mine, best in zip(range(1, 91), lazy, eager, strict=True):
         if "closures wait" not in mine.report.message:
             continue
@@ -58,9 +56,10 @@ def test_where_the_stated_noise_is_the_true_one_every_closure_is_worked_on_at_on
     assert all(solution.report.iterations > 0 for solution in solutions[20:])
 
 
-def test_the_end_of_the_drive_leaves_nothing_waiting():
+def test_the_end_of_the_drive_leaves_nothing_waiting(monkeypatch):
     graph = modest(1)
-    backend = patient(1e6)
+    monkeypatch.setattr(incremental, "PATIENCE", 1e6)
+    backend = backends.create("gtsam-isam2")
     driven = grown(backend, graph)[-1]
     best = backends.create("gtsam-lm").solve(graph)
     assert driven.report.chi2 > 1.05 * best.report.chi2

@@ -68,7 +68,7 @@ def test_a_folder_that_cannot_be_made_is_refused_before_anything_runs(run, tmp_p
     "setting",
     [
         "spacing_min_m=1e-9", "spacing_max_m=1e9", "place.attractor_cell_m=1e-9",
-        "place.max_cells=1000000000", "head_direction_cells=100000000", "sheet_side=1000000000",
+        "place.attractor_side=1000000000", "head_direction_cells=100000000", "sheet_side=1000000000",
     ],
 )  # fmt: skip
 def test_cells_that_no_machine_could_hold_are_an_error_and_no_missed_bar(run, tmp_path, setting):

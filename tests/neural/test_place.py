@@ -3,6 +3,7 @@ import pytest
 
 from hybridmap.config.mapping import NeuralConfig, PlaceConfig
 from hybridmap.neural import PathIntegrator
+from hybridmap.neural import place as place_cells
 from hybridmap.neural.place import PlaceCells
 from hybridmap.neural.torus import shift_sheets
 
@@ -63,8 +64,9 @@ def test_fields_are_single(integrator):
     assert far <= 0.05 * maps.shape[-1]
 
 
-def test_recruitment_stops_at_the_limit_and_says_so(integrator, caplog):
-    place = cells(integrator, max_cells=3)
+def test_recruitment_stops_at_the_limit_and_says_so(integrator, caplog, monkeypatch):
+    monkeypatch.setattr(place_cells, "MAX_CELLS", 3)
+    place = cells(integrator)
     for x in range(6):
         place.learn(sheets_at(integrator, float(x), 0.0))
     assert len(place.weights) == 3

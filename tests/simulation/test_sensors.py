@@ -25,8 +25,8 @@ def scene(world: str) -> Scene:
     return Scene(build_world(world))
 
 
-def frame(world: str = "corridor", pose=(9.0, 1.2, 0.0), time_s: float = 0.0, seed: int = 0, **changes):
-    model = CameraModel(scene(world), CAMERA.model_copy(update=changes), np.random.default_rng(1))
+def frame(world: str = "corridor", pose=(9.0, 1.2, 0.0), time_s: float = 0.0, seed: int = 0, noise: float = 1.0, **changes):
+    model = CameraModel(scene(world), CAMERA.model_copy(update=changes), np.random.default_rng(1), noise)
     return model, model.frame(0, time_s, np.array(pose), np.random.default_rng(seed))
 
 

@@ -17,6 +17,8 @@ from hybridmap.geometry import Array
 from hybridmap.graph.growth import Change, prefix
 from hybridmap.graph.pose_graph import PoseGraph
 
+PATIENCE = 0.5
+"""Closures wait while together they could move no pose by more than this many of its standard deviations: not to be seen."""
 _RISE = 1e-3  # relative, of chi2: what the thresholds of linearisation leave open
 
 _SETTLED = 1e-5  # relative decrease of the cost that no longer counts: the batch optimisers' tolerance
@@ -45,8 +47,8 @@ class Isam2:
 
     Closures that agree with the map wait. Measurements with residuals r, added to a least-squares map, move to first order no
     pose by more than sqrt(sum of r' information r) of its standard deviations (Cauchy-Schwarz on the Kalman gain), and
-    without them chi2 is above its minimum by that sum at the most. ISAM2 works once the root is beyond the configured
-    patience.
+    without them chi2 is above its minimum by that sum at the most. ISAM2 works once the root is beyond
+    `PATIENCE`.
     """
 
     def __init__(self, config: BackendsConfig) -> None:
@@ -65,7 +67,7 @@ class Isam2:
         """An update, which may let closures wait."""
         if self._smoother is not None:
             shift = _largest_shift(graph, self._smoother.lacks(graph), start)
-            if shift <= self._config.isam2.patience:
+            if shift <= PATIENCE:
                 message = f"isam2: closures wait; they could move no pose by more than {shift:.2g} of its standard deviations"
                 return Outcome(start, SolveStatus.CONVERGED, message, 0, self._weights, self._rejected)
         return self._kept(*self._brought_up(graph, start), graph)
