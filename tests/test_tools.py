@@ -112,3 +112,40 @@ def test_the_study_of_false_loops_gives_its_table_as_figures(
     assert found["false_kept/gtsam-lm-random-10%"] >= 5
     assert found["true_lost/gtsam-lm-random-10%"] == 0.0
     assert "gtsam-gnc" in printed.err
+
+
+def test_size_counts_lines_importers_and_settings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    size = importlib.import_module("size")
+    texts = {
+        "hybridmap/__init__.py": "from hybridmap.alone import x\n",
+        "hybridmap/alone.py": "x = 1\n\ny = 2\n",
+        "hybridmap/shared.py": "",
+        "hybridmap/cli/one.py": "from hybridmap import shared\n",
+        "hybridmap/cli/two.py": "def later():\n    import hybridmap.shared\n",
+        "tools/one.py": "\n",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    files = {size.name_of(path, tmp_path): path for path in (tmp_path / "hybridmap").rglob("*.py")}
+    assert size.importers(files) == {
+        "hybridmap.alone": {"hybridmap"},
+        "hybridmap.shared": {"hybridmap.cli.one", "hybridmap.cli.two"},
+    }
+    size.main(tmp_path)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:4] == [
+        "hybridmap: 7 lines, 6 of them not blank",
+        "tools: 1 lines, 0 of them not blank",
+        "modules: 4, with the packages themselves 5",
+        "modules outside cli/ with a single importer: 1",
+    ]
+    assert lines[-1] == "  hybridmap.alone"
+
+
+def test_walk_sees_the_files_of_each_node() -> None:
+    walk = importlib.import_module("walk")
+    overrides = {"simulation.sensors": "laser", "vision.sensor": "laser"}
+    visited = walk.walk("sim:corridor", 6.0, ROOT / "hybridmap", overrides)
+    assert len(visited) > 3
+    assert all({"mapper.py", "neural/grid.py", "vision/laser/front_end.py"} <= files for files in visited[1:])
