@@ -14,10 +14,6 @@ class AgreementConfig(Section):
     """Nodes whose closures must put the robot at one and the same place."""
     span_m: float = Field(default=0.75, ge=0)
     """Travel that they must cover, m; more where they fit badly (`mismatch_max`)."""
-    agree_m: float = Field(default=0.3, gt=0)
-    """They agree if they put the robot within this of each other, m (plus 5 % of the travel between them)."""
-    agree_deg: float = Field(default=5.0, gt=0)
-    """The same for its heading, degrees (plus 1 per metre)."""
     mismatch_max: float = Field(default=0.15, gt=0)
     """Mean mismatch, of sightings that say how badly they fit, at which no travel is enough; half of it doubles `span_m`."""
     mismatch_scale: float = Field(default=0.03, gt=0)

@@ -7,7 +7,7 @@ Merging" (2018), keep the largest set of loops that are consistent in pairs.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +51,14 @@ class Loops:
         covariance = np.where(forward[:, None, None], relative.covariance, back.covariance)
         return cls(np.minimum(sources, targets), np.maximum(sources, targets), RelativePose(delta, covariance))
 
+    @classmethod
+    def measured(cls, loops: Sequence[tuple[int, int, RelativePose]]) -> Loops:
+        """Single loops: source, target, and the target seen from the source."""
+        ends = np.array([(source, target) for source, target, _ in loops], dtype=np.int64).reshape(-1, 2)
+        delta = np.array([relative.delta for *_, relative in loops]).reshape(-1, 3)
+        covariance = np.array([relative.covariance for *_, relative in loops]).reshape(-1, 3, 3)
+        return cls.of(ends[:, 0], ends[:, 1], RelativePose(delta, covariance))
+
     def __getitem__(self, chosen: Indices) -> Loops:
         """Some of them (P,)."""
         relative = RelativePose(self.relative.delta[chosen], self.relative.covariance[chosen])
@@ -91,6 +99,11 @@ def ring(first: Loops, second: Loops, ways: Ways) -> Ring:
     return Ring(error, along_new.covariance + along_old.covariance)
 
 
+def agrees(loops: Loops, one: int, others: Indices, ways: Ways, bound: float = BOUND) -> NDArray[np.bool_]:
+    """Which others (P,) of some loops agree with one of them; see `agreement`."""
+    return np.asarray(ring(loops[np.full(len(others), one)], loops[others], ways).distance <= bound)
+
+
 def agreement(loops: Loops, ways: Ways, bound: float = BOUND, known: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
     """Which loops agree in pairs: (L, L), symmetric, with a true diagonal. Costs a ring for each pair that is not known.
 
@@ -106,7 +119,7 @@ def agreement(loops: Loops, ways: Ways, bound: float = BOUND, known: NDArray[np.
         out[:first, :first] = known
     for new in range(max(first, 1), count):
         before = np.arange(new)
-        out[new, before] = out[before, new] = ring(loops[np.full(new, new)], loops[before], ways).distance <= bound
+        out[new, before] = out[before, new] = agrees(loops, new, before, ways, bound)
     return out
 
 

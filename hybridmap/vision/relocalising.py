@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.agreement import AgreementConfig
 from hybridmap.geometry import Array, RelativePose, between, compose, inverse
+from hybridmap.graph.agreement import Loops, agreement, largest_consistent_set
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.vision.base import Belief
 from hybridmap.vision.whereabouts import Chain, Whereabouts
@@ -23,8 +24,6 @@ WHERE_IT_WAS = 2.0
 """A robot that is found within so many of these deviations of where the chain has it was not carried."""
 KEPT_STEPS = 1000
 """The newest registrations, which are taken back where they reach across a break."""
-DRIFT_M_PER_M, DRIFT_DEG_PER_M = 0.05, 1.0
-"""How much further apart sightings may put the robot for every metre that it drove between them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +58,7 @@ class Relocaliser:
         self._config = config
         self._new_key = new_key
         self._waiting: list[Edge] = []
+        self._agree: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
         self._steps: deque[Edge] = deque(maxlen=KEPT_STEPS)
 
     def tracked(self, node: int, chain: Chain, steps: list[Edge]) -> None:
@@ -67,18 +67,20 @@ class Relocaliser:
         self._steps += [step for step in steps if step.status is Status.ACCEPTED]
 
     def settle(self, found: list[Edge], belief: Belief) -> Settlement:
-        """Let new sightings wait; accept the one that most agree with, and these with it, if they are good enough.
+        """Let new sightings wait; accept the largest set of them that agree through the chain, if it is good enough.
 
         Args:
             found: what was looked at, in any state; those that are pending are sightings.
             belief: the map's; poses on either side of the break are right among themselves.
         """
-        self._waiting += [p for p in found if p.status is Status.PENDING]
         out = found + self._expired(belief)
+        self._waiting += [p for p in found if p.status is Status.PENDING and p.relative is not None]
         if not self._waiting:
             return Settlement(out)
-        agree, weights = self._agreement(belief), self._weights()
-        chosen = np.flatnonzero(agree[int(np.argmax(agree @ weights))])
+        loops = Loops.measured([(s.source, s.target, s.relative) for s in self._waiting if s.relative is not None])
+        self._agree = agreement(loops, belief.ways, known=self._agree)
+        weights = self._weights()
+        chosen = np.flatnonzero(largest_consistent_set(self._agree, weights))
         if not self._enough(chosen, weights, belief):
             return Settlement(out)
         reason = f"lost; {len(chosen)} closures put the robot there"
@@ -95,7 +97,7 @@ class Relocaliser:
     def dismiss(self, reason: str | None = None) -> list[Edge]:
         """Refuse all sightings that wait; without a reason they are given up."""
         out = [replace(s, status=Status.REJECTED, reason=reason or self._given_up) for s in self._waiting]
-        self._waiting = []
+        self._waiting, self._agree = [], self._agree[:0, :0]
         return out
 
     def rehang(self, broken_at: int, friends: tuple[Edge, ...], belief: Belief) -> list[Edge]:
@@ -121,20 +123,11 @@ class Relocaliser:
 
     def _expired(self, belief: Belief) -> list[Edge]:
         """Refuse sightings that have waited too long."""
-        oldest_m = float(belief.travel_m[-1]) - self._config.wait_m
-        old = [s for s in self._waiting if belief.travel_m[s.source] < oldest_m]
-        self._waiting = [s for s in self._waiting if belief.travel_m[s.source] >= oldest_m]
+        old_nodes = belief.travel_m < belief.travel_m[-1] - self._config.wait_m
+        old = [s for s in self._waiting if old_nodes[s.source]]
+        kept = [i for i, s in enumerate(self._waiting) if not old_nodes[s.source]]
+        self._waiting, self._agree = [self._waiting[i] for i in kept], self._agree[np.ix_(kept, kept)]
         return [replace(s, status=Status.REJECTED, reason=self._given_up) for s in old]
-
-    def _agreement(self, belief: Belief) -> NDArray[np.bool_]:
-        """(n, n) which sightings put the robot at the same pose, each carried along the chain to the newest node."""
-        poses, sources = belief.poses_map_node, self._sources()
-        newest = int(sources.max())
-        placed = np.array([_placed(s, newest, poses) for s in self._waiting])
-        apart = between(placed[:, None], placed[None])
-        travelled = np.abs(belief.travel_m[sources][:, None] - belief.travel_m[sources][None])
-        near = np.hypot(apart[..., 0], apart[..., 1]) <= self._config.agree_m + DRIFT_M_PER_M * travelled
-        return np.asarray(near & (np.degrees(np.abs(apart[..., 2])) <= self._config.agree_deg + DRIFT_DEG_PER_M * travelled))
 
     def _weights(self) -> Array:
         """(n,) 1 for each node's best sighting, less for those of the same node that fit worse."""

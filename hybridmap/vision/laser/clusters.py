@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.laser import CommitmentConfig
-from hybridmap.geometry import RelativePose
 from hybridmap.graph.agreement import Loops, agreement, largest_consistent_set
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.hypotheses import Hypothesis
@@ -112,7 +111,9 @@ class Commitment:
         self._queue = [self._queue[p] for p in positions]
 
     def _ripe(self, belief: Belief, span_per_efold_m: float) -> Cluster | None:
-        self._consistent = agreement(self._loops(), belief.ways, known=self._consistent)
+        hypotheses = (w.hypothesis for w in self._queue)
+        loops = Loops.measured([(h.probe, h.anchor, h.relative) for h in hypotheses])
+        self._consistent = agreement(loops, belief.ways, known=self._consistent)
         clusters = self._clusters()
         if not clusters:
             return None
@@ -169,10 +170,3 @@ class Commitment:
             max(travels) - min(travels),
             float(np.median([h.sigma_m for h in chosen])),
         )
-
-    def _loops(self) -> Loops:
-        waiting = [w.hypothesis for w in self._queue]
-        delta = np.array([h.relative.delta for h in waiting]).reshape(-1, 3)
-        covariance = np.array([h.relative.covariance for h in waiting]).reshape(-1, 3, 3)
-        ends = np.array([(h.probe, h.anchor) for h in waiting], dtype=np.int64).reshape(-1, 2)
-        return Loops.of(ends[:, 0], ends[:, 1], RelativePose(delta, covariance))
