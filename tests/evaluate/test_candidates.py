@@ -18,6 +18,8 @@ from hybridmap.evaluate.candidates import (
 from hybridmap.geometry import compose
 from hybridmap.simulation import SimulatedStream
 from hybridmap.simulation.camera import CameraModel
+from hybridmap.simulation.scene import Scene
+from hybridmap.simulation.worlds import build_world
 from hybridmap.trajectory import Trajectory
 from hybridmap.vision.profile import image_profile
 
@@ -67,8 +69,9 @@ def test_pairs_are_judged_by_distance_heading_and_age():
 @pytest.fixture(scope="module")
 def office():
     """Twenty-four places of the office, each seen again from 40 cm farther on and 40 cm to the side; profiles by bands."""
-    stream = SimulatedStream(SimulationConfig(world="office", camera=CameraConfig(width_px=96, height_px=72)), 3)
-    camera = CameraModel(stream._scene, stream._config.camera, np.random.default_rng(1))
+    config = SimulationConfig(world="office", camera=CameraConfig(width_px=96, height_px=72))
+    stream = SimulatedStream(config, 3)
+    camera = CameraModel(Scene(build_world(config.world)), config.camera, np.random.default_rng(1))
     first = np.linspace(4.0, 120.0, 24)
     start = stream.groundtruth.stamps_ns[0]
     poses = stream.groundtruth.at((start + first * SECOND).astype(np.int64))

@@ -10,6 +10,7 @@ from hybridmap.errors import ConfigError
 from hybridmap.geometry import between, compose, wrap_angle
 from hybridmap.simulation import SimulatedStream
 from hybridmap.simulation.carry import carry
+from hybridmap.streams.rgbd import RgbdFrame
 from tests.simulation.test_stream import PERFECT_WHEELS, fingerprint
 
 
@@ -38,7 +39,7 @@ def test_the_wheels_stand_still_and_nothing_is_seen_on_the_way():
     after = compose(truth.poses[carry.last], between(odometry.poses[carry.last], odometry.poses[carry.last :]))
     assert np.allclose(after[:, :2], truth.poses[carry.last :, :2], atol=2e-3)
     up, down = truth.stamps_ns[carry.first], truth.stamps_ns[carry.last]
-    seen = carried._frame_stamps
+    seen = np.array([sample.stamp_ns for sample in carried if isinstance(sample, RgbdFrame)])
     assert not np.any((seen > up) & (seen < down))
     assert np.any(seen > down)
     assert carried.expected_observations == len(seen)

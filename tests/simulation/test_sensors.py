@@ -89,7 +89,7 @@ def test_exposure_changes_over_time_and_can_be_turned_off():
 
 
 def corners(image) -> int:
-    return len(cv2.ORB_create(500).detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)))
+    return len(cv2.ORB.create(500).detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)))
 
 
 def test_the_corridor_is_featureless_and_the_landmarks_are_not():
@@ -99,7 +99,7 @@ def test_the_corridor_is_featureless_and_the_landmarks_are_not():
 
 
 def test_the_same_place_gives_features_that_match_from_elsewhere():
-    orb = cv2.ORB_create(500)
+    orb = cv2.ORB.create(500)
     found = []
     for pose in ((4.0, 1.15, 0.0), (4.3, 1.25, 0.05)):
         grey = cv2.cvtColor(frame("corridor-landmarks", pose, width_px=240, height_px=180)[1].color, cv2.COLOR_RGB2GRAY)

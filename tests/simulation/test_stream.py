@@ -13,6 +13,7 @@ from hybridmap.geometry import align, between, compose, wrap_angle
 from hybridmap.simulation import SimulatedStream, wheels, world_names
 from hybridmap.simulation.drive import DriveLimits, drive
 from hybridmap.simulation.wheels import wheel_odometry
+from hybridmap.simulation.worlds import build_world
 from hybridmap.streams.base import SelfMotion
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
@@ -30,8 +31,8 @@ def fingerprint(samples) -> list[tuple]:
 
 
 def short(seed: int = 5, **changes) -> SimulatedStream:
-    settings = {"world": "corridor", "duration_s": 2.0, "sensors": "both", "camera": SMALL} | changes
-    return SimulatedStream(SimulationConfig(**settings), seed)
+    settings: dict[str, object] = {"world": "corridor", "duration_s": 2.0, "sensors": "both", "camera": SMALL}
+    return SimulatedStream(SimulationConfig.model_validate(settings | changes), seed)
 
 
 def ate_m(odometry, truth) -> float:
@@ -122,7 +123,7 @@ def test_the_robot_never_touches_the_furniture(world):
     stream = SimulatedStream(SimulationConfig(world=world), 0)
     from hybridmap.simulation.scene import Caster
 
-    caster = Caster(stream._world.surfaces)
+    caster = Caster(build_world(world).surfaces)
     angle = np.linspace(-np.pi, np.pi, 48, endpoint=False)
     around = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(48)])
     for height_m in (0.1, 0.45, 0.8, 1.05):
