@@ -17,13 +17,10 @@ from hybridmap.config import Config
 from hybridmap.edge_book import EdgeBook
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, inverse
 from hybridmap.graph.edges import Edge, EdgeKind, Status
-from hybridmap.graph.experience_map import ExperienceMap, Node
-from hybridmap.graph.motion_noise import odometry_covariance
-from hybridmap.graph.novelty import Novelty
-from hybridmap.graph.uncertainty import relative_covariances
+from hybridmap.graph.experience_map import ExperienceMap, Node, Novelty
+from hybridmap.graph.uncertainty import odometry_covariance, relative_covariances
 from hybridmap.metrics import StageClock
-from hybridmap.neural.path_integrator import PathIntegrator
-from hybridmap.neural.reanchoring import Reanchoring
+from hybridmap.neural.path_integrator import PathIntegrator, Reanchoring
 from hybridmap.streams.base import Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame

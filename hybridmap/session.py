@@ -18,7 +18,7 @@ from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.carries import carries
 from hybridmap.graph.edges import EdgeKind, Status
-from hybridmap.graph.hashing import graph_hash
+from hybridmap.graph.io import graph_hash
 from hybridmap.graph.observability import unobserved
 from hybridmap.mapper import Mapper, Update
 from hybridmap.metrics import Metric

@@ -10,7 +10,7 @@ from hybridmap.errors import StreamError
 from hybridmap.evaluate import absolute_error
 from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind, Status
-from hybridmap.graph.hashing import graph_hash
+from hybridmap.graph.io import graph_hash
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import SelfMotion
 from hybridmap.streams.laser import LaserScan

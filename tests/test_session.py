@@ -20,7 +20,7 @@ from hybridmap.errors import OutputError, StreamError
 from hybridmap.evaluate import evaluate_session
 from hybridmap.evaluate.explain import Explainer
 from hybridmap.geometry import between
-from hybridmap.graph.hashing import graph_hash
+from hybridmap.graph.io import graph_hash
 from hybridmap.store import MapStore
 from hybridmap.trajectory import read_tum
 from hybridmap.vision.laser.front_end import LaserFrontEnd

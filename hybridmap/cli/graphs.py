@@ -13,8 +13,7 @@ from hybridmap.config.gone import without_gone
 from hybridmap.config.section import read_mapping
 from hybridmap.errors import GraphError
 from hybridmap.graph.carries import Carry, carries
-from hybridmap.graph.hashing import graph_hash
-from hybridmap.graph.io import read_graph
+from hybridmap.graph.io import graph_hash, read_graph
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.store import MapStore, SessionFolder
 

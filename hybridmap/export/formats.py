@@ -35,8 +35,8 @@ class Format:
 
 
 FORMATS: dict[str, Format] = {
-    "tum": Format("trajectories:write_tum_trajectory", ".tum", "trajectory: stamp, position, quaternion a line"),
-    "kitti": Format("trajectories:write_kitti_trajectory", ".txt", "trajectory: the 12 numbers of a 3x4 pose a line"),
+    "tum": Format("graphs:write_tum_trajectory", ".tum", "trajectory: stamp, position, quaternion a line"),
+    "kitti": Format("graphs:write_kitti_trajectory", ".txt", "trajectory: the 12 numbers of a 3x4 pose a line"),
     "g2o": Format("graphs:write_g2o_graph", ".g2o", "pose graph: VERTEX_SE2, EDGE_SE2"),
     "lineset": Format("graphs:write_lineset", ".ply", "graph as an Open3D LineSet, edges coloured by kind", by_suffix=True),
     "posegraph": Format("graphs:write_posegraph", ".json", "graph as an Open3D PoseGraph", by_suffix=True),

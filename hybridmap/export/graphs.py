@@ -1,4 +1,4 @@
-"""The graph for other tools: g2o, Open3D LineSet, Open3D PoseGraph."""
+"""Poses for other tools: trajectories as TUM and KITTI, the graph as g2o, Open3D LineSet, Open3D PoseGraph."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from hybridmap.geometry import Array, RelativePose, invert_relative
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.io import write_g2o
 from hybridmap.metrics import Metric
+from hybridmap.output import write_text
+from hybridmap.trajectory import write_tum
 
 _COLORS = {
     EdgeKind.ODOMETRY: (0.30, 0.35, 0.45),
@@ -102,3 +104,18 @@ def _accepted(view: SessionView) -> dict[int, Edge]:
 
 def _counts(name: str, nodes: int, edges: int) -> list[Metric]:
     return [Metric(f"nodes/{name}", nodes, "1", "nodes written"), Metric(f"edges/{name}", edges, "1", "edges written")]
+
+
+def write_tum_trajectory(view: SessionView, path: Path) -> list[Metric]:
+    """`stamp x y z qx qy qz qw` of `base_link` in `map` at every stamp; s and m."""
+    write_tum(path, view.trajectory)
+    return [Metric("poses/tum", len(view.trajectory), "1", "poses written")]
+
+
+def write_kitti_trajectory(view: SessionView, path: Path) -> list[Metric]:
+    """The upper 3x4 of `T_map_base`, row by row, a line a stamp (the stamps are those of the `tum` export); z points up."""
+    poses = view.trajectory.poses
+    cos, sin, zero, one = np.cos(poses[:, 2]), np.sin(poses[:, 2]), np.zeros(len(poses)), np.ones(len(poses))
+    rows = np.stack([cos, -sin, zero, poses[:, 0], sin, cos, zero, poses[:, 1], zero, zero, one, zero], axis=1)
+    write_text(path, "".join(" ".join(f"{value + 0.0:.17g}" for value in row) + "\n" for row in rows))
+    return [Metric("poses/kitti", len(poses), "1", "poses written")]

@@ -1,7 +1,8 @@
-"""Pose-graph files: g2o and TORO in, g2o out; planar only."""
+"""Pose graphs as files (g2o and TORO in, g2o out; planar only), and the hash that says whether two of them are the same."""
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +12,8 @@ import numpy as np
 from hybridmap.errors import GraphError
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.connectivity import chain
-from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.pose_graph import GraphFile, PoseGraph
 from hybridmap.output import write_text
 
@@ -166,3 +168,31 @@ def write_g2o(path: Path, graph: PoseGraph, poses: Array) -> None:
 
 def _row(numbers: Array) -> str:
     return " ".join(f"{number:.17g}" for number in numbers)
+
+
+def graph_hash(experiences: ExperienceMap) -> str:
+    """SHA-256 over the nodes (stamps, initial poses) and the accepted edges (ends, kinds, deltas, covariances).
+
+    Numbers enter as little-endian int64 and float64, negative zero as zero; scores, reasons, place codes and edges that
+    are not part of the graph do not enter.
+
+    Returns:
+        64 hexadecimal digits.
+    """
+    digest = hashlib.sha256()
+    stamps = np.array([node.stamp_ns for node in experiences.nodes], dtype="<i8")
+    digest.update(np.int64(len(stamps)).astype("<i8").tobytes())
+    digest.update(stamps.tobytes())
+    digest.update(_float_bytes(experiences.initial))
+    for edge in experiences.edges:
+        if edge.status is not Status.ACCEPTED:
+            continue
+        digest.update(np.array([edge.source, edge.target, int(edge.kind)], dtype="<i8").tobytes())
+        if edge.relative is not None:
+            digest.update(_float_bytes(edge.relative.delta))
+            digest.update(_float_bytes(edge.relative.covariance))
+    return digest.hexdigest()
+
+
+def _float_bytes(values: Array) -> bytes:
+    return np.ascontiguousarray(np.asarray(values, dtype="<f8") + 0.0).tobytes()

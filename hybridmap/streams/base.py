@@ -13,8 +13,7 @@ from hybridmap.geometry import Array
 from hybridmap.trajectory import NS_PER_S, Trajectory
 
 if TYPE_CHECKING:
-    from hybridmap.streams.bagindex import BagIndex
-    from hybridmap.streams.topics import TopicChooser
+    from hybridmap.streams.bagindex import BagIndex, TopicChooser
 
 Keyframe = Mapping[str, NDArray[Any]]
 """What a map keeps of a node's observation: arrays by name."""

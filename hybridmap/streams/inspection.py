@@ -145,8 +145,8 @@ def _gaps(part: Part) -> list[str]:
 
 def _bag_parts(path: Path, problems: list[str]) -> list[Part]:
     from hybridmap.streams.bagfile import BagFile
+    from hybridmap.streams.bagindex import ODOMETRY
     from hybridmap.streams.sensors import message_types
-    from hybridmap.streams.topics import ODOMETRY
 
     bag = BagFile(path)
     types = ODOMETRY + message_types()

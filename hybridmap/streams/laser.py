@@ -17,8 +17,7 @@ from hybridmap.streams.mounting import planar
 from hybridmap.streams.order import sorted_order
 
 if TYPE_CHECKING:
-    from hybridmap.streams.bagindex import BagIndex
-    from hybridmap.streams.topics import TopicChooser
+    from hybridmap.streams.bagindex import BagIndex, TopicChooser
 
 _TYPES = ("sensor_msgs/msg/LaserScan",)
 _NAMES = (r"^/scan$", r"^/base_scan$", r"/(scan|base_scan)$", r"front|laser")

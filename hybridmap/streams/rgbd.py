@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hybridmap.config.inputs import SensorsConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array
+from hybridmap.streams.bagindex import TRANSPORT
 from hybridmap.streams.base import InBag, Keyframe, Observation, Planned, Rig, Seen, SensorKind, SensorPlan
 from hybridmap.streams.cameras import (
     Calibration,
@@ -26,11 +27,9 @@ from hybridmap.streams.cameras import (
     mounted,
 )
 from hybridmap.streams.order import pair_nearest, sorted_order
-from hybridmap.streams.topics import TRANSPORT
 
 if TYPE_CHECKING:
-    from hybridmap.streams.bagindex import BagIndex
-    from hybridmap.streams.topics import TopicChooser
+    from hybridmap.streams.bagindex import BagIndex, TopicChooser
 
 _IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _CAMERA_INFO = ("sensor_msgs/msg/CameraInfo",)

@@ -13,12 +13,11 @@ from hybridmap.config.root import Config
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array
 from hybridmap.streams.bagfile import BagFile, RawMessage
-from hybridmap.streams.bagindex import PoseTrack, build_index
+from hybridmap.streams.bagindex import ODOMETRY, TRANSFORM, PoseTrack, build_index, select
 from hybridmap.streams.base import MessageKey, Observation, Sample, SelfMotion, SensorPlan, StreamReport
 from hybridmap.streams.mounting import clean_frame, planar
 from hybridmap.streams.order import Window, check_overlap, merge
 from hybridmap.streams.sensors import kind_of, kinds, message_types, wanted
-from hybridmap.streams.topics import ODOMETRY, TRANSFORM, select
 from hybridmap.trajectory import Trajectory
 
 

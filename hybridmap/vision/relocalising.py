@@ -14,7 +14,7 @@ from hybridmap.geometry import Array, RelativePose, between, compose, inverse
 from hybridmap.graph.agreement import Loops, agreement, largest_consistent_set
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.vision.base import Belief
-from hybridmap.vision.whereabouts import Chain, Whereabouts
+from hybridmap.vision.gating import Chain, Whereabouts
 
 Indices = NDArray[np.int64]
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from hybridmap.config.mapping import EdgesConfig, NodesConfig
 from hybridmap.geometry import compose, exp
-from hybridmap.graph.motion_noise import odometry_covariance
-from hybridmap.graph.novelty import Novelty
+from hybridmap.graph.experience_map import Novelty
+from hybridmap.graph.uncertainty import odometry_covariance
 
 HERE, ELSEWHERE = np.array([1.0, 0.0], np.float32), np.array([0.0, 2.0], np.float32)
 

@@ -11,7 +11,7 @@ from hybridmap.config.mapping import NeuralConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import between, compose
 from hybridmap.neural import PathIntegrator
-from hybridmap.neural.reanchoring import Reanchoring
+from hybridmap.neural.path_integrator import Reanchoring
 
 SOFTPLUS = NeuralConfig(rectifier="softplus")
 DELTA = st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6), st.floats(-2.0, 2.0)).map(np.array)

@@ -7,7 +7,7 @@ import numpy as np
 from hybridmap.geometry import RelativePose
 from hybridmap.graph.edges import Status
 from hybridmap.graph.experience_map import ExperienceMap
-from hybridmap.graph.hashing import graph_hash
+from hybridmap.graph.io import graph_hash
 from tests.narrowing import known
 from tests.store.sessions import ring_map
 

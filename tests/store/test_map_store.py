@@ -12,7 +12,7 @@ from hybridmap.backends.base import SolveReport, SolveStatus
 from hybridmap.errors import StoreError
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
-from hybridmap.graph.hashing import graph_hash
+from hybridmap.graph.io import graph_hash
 from hybridmap.store import MapStore
 from hybridmap.streams.base import Rig
 from hybridmap.trajectory import anchors_on

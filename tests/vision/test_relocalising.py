@@ -9,8 +9,8 @@ from hybridmap.config.agreement import AgreementConfig
 from hybridmap.geometry import RelativePose, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.vision.base import Belief
+from hybridmap.vision.gating import Chain, Whereabouts
 from hybridmap.vision.relocalising import Relocaliser
-from hybridmap.vision.whereabouts import Chain, Whereabouts
 
 STEP_M = 0.3
 X = STEP_M * np.arange(200)

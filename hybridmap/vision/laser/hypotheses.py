@@ -11,8 +11,8 @@ from hybridmap.config.laser import LaserConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, inverse, invert_relative, wrap_angle
 from hybridmap.streams.laser import Laser
 from hybridmap.vision.base import Belief
+from hybridmap.vision.laser.likelihood import STEP_DEG, STEP_M, Start, sharpened, spaced, square, survivors
 from hybridmap.vision.laser.registration import Alignment, align, second_mode
-from hybridmap.vision.laser.search import STEP_DEG, STEP_M, Start, sharpened, spaced, square, survivors
 from hybridmap.vision.laser.submap import Atlas, Field, Submap
 from hybridmap.vision.laser.visibility import violation
 

@@ -10,9 +10,8 @@ from hybridmap.geometry import Array, between, inverse, invert_relative, wrap_an
 from hybridmap.streams.laser import Laser
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.hypotheses import Hypothesis
-from hybridmap.vision.laser.likelihood import score_starts
+from hybridmap.vision.laser.likelihood import score_starts, spaced, square
 from hybridmap.vision.laser.registration import Prior, align, second_mode
-from hybridmap.vision.laser.search import spaced, square
 from hybridmap.vision.laser.submap import Atlas, Field, Submap
 from hybridmap.vision.laser.visibility import violation
 

@@ -10,9 +10,8 @@ import numpy as np
 from hybridmap.config.laser import LaserConfig, SearchConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, wrap_angle
 from hybridmap.vision.laser.cloud import Cloud, merged
-from hybridmap.vision.laser.likelihood import LikelihoodField, build_field, score_starts
+from hybridmap.vision.laser.likelihood import LikelihoodField, build_field, score_starts, spaced, square
 from hybridmap.vision.laser.registration import Alignment, Prior, align
-from hybridmap.vision.laser.search import spaced, square
 from hybridmap.vision.laser.submap import Atlas
 
 SCORED_POINTS = 90

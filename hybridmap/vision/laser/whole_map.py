@@ -10,13 +10,13 @@ import numpy as np
 from hybridmap.config.laser import LaserConfig
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.vision.base import Belief
+from hybridmap.vision.gating import Chain, Whereabouts
 from hybridmap.vision.laser.continuity import RECENT_M, Continuity
 from hybridmap.vision.laser.hypotheses import Hypothesis, Prober
 from hybridmap.vision.laser.submap import Atlas
 from hybridmap.vision.profile import Profile
 from hybridmap.vision.relocalising import Relocaliser, Settlement
 from hybridmap.vision.templates import Matcher
-from hybridmap.vision.whereabouts import Chain, Whereabouts
 
 MISFIT_STEPS = 10
 """Steps for which the usual misfit of scans is taken before any was seen."""

@@ -14,7 +14,7 @@ from hybridmap.geometry import Array, RelativePose, between, wrap_angle
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.metrics import StageClock
 from hybridmap.vision.base import Belief, Doubted
-from hybridmap.vision.gating import Gate, nodes_within
+from hybridmap.vision.gating import Gate, Whereabouts, nodes_within
 from hybridmap.vision.profile import Profile
 from hybridmap.vision.relocalising import Relocaliser
 from hybridmap.vision.rgbd.keyframe import Keyframe
@@ -24,7 +24,6 @@ from hybridmap.vision.rgbd.second_look import SecondLook
 from hybridmap.vision.rgbd.support import Hypothesis, Support
 from hybridmap.vision.rgbd.whole_map import RANKED, WholeMap, chain_of
 from hybridmap.vision.templates import MODERATE_THRESHOLD, Matcher
-from hybridmap.vision.whereabouts import Whereabouts
 
 Indices = NDArray[np.int64]
 DEFAULT_RELOCALISING = RelocalisingConfig()

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from hybridmap.geometry import Array
 from hybridmap.streams.rgbd import Camera
-from hybridmap.vision.rgbd.spatial import inverse_rigid
-from hybridmap.vision.rgbd.stance import Stance
+from hybridmap.vision.rgbd.stance import Stance, inverse_rigid
 
 MAX_JUMP = 0.05
 MAX_BEND = 0.015

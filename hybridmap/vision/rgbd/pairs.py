@@ -9,7 +9,7 @@ import numpy as np
 from hybridmap.geometry import Array
 from hybridmap.vision.rgbd.features import Correspondences
 from hybridmap.vision.rgbd.keyframe import Keyframe
-from hybridmap.vision.rgbd.spatial import apply, wrenches
+from hybridmap.vision.rgbd.stance import apply, wrenches
 
 AGREEING = 11.3
 """Squared error of a pair over its covariance that one in a hundred right pairs exceeds (3 degrees of freedom)."""

@@ -17,8 +17,7 @@ from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.noise_level import NoiseLevel
 from hybridmap.vision.rgbd.pairs import point_pairs
 from hybridmap.vision.rgbd.pnp_solver import PnpSolver
-from hybridmap.vision.rgbd.spatial import FloorPose, from_planar, inverse_rigid, to_floor
-from hybridmap.vision.rgbd.stance import level_pair
+from hybridmap.vision.rgbd.stance import FloorPose, from_planar, inverse_rigid, level_pair, to_floor
 
 GUESSED = 2.0
 """Standard deviations of a guess over which features are looked for around it."""

@@ -17,8 +17,7 @@ from hybridmap.vision.rgbd.features import match
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.noise_level import NoiseLevel
 from hybridmap.vision.rgbd.pairs import PointPairs, point_pairs
-from hybridmap.vision.rgbd.spatial import from_planar
-from hybridmap.vision.rgbd.stance import Stance
+from hybridmap.vision.rgbd.stance import Stance, from_planar
 
 SURE_INLIERS = 0.8
 SURE_SLACK_M = 0.03

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from hybridmap.config.vision import RelocalisingConfig
 from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.vision.gating import Chain
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp import Verifier
 from hybridmap.vision.templates import Matcher
-from hybridmap.vision.whereabouts import Chain
 
 Indices = NDArray[np.int64]
 

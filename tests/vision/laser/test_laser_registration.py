@@ -9,9 +9,20 @@ from laser_worlds import LASER, cast, corridor, room
 from hybridmap.config.laser import LaserConfig, RegistrationConfig, ScanConfig
 from hybridmap.geometry import IDENTITY, between, compose, log
 from hybridmap.vision.laser.cloud import EMPTY, cloud_of_scan
-from hybridmap.vision.laser.likelihood import LikelihoodField, build_field, score_poses, score_starts
+from hybridmap.vision.laser.likelihood import (
+    STEP_DEG,
+    STEP_M,
+    LikelihoodField,
+    build_field,
+    score_poses,
+    score_starts,
+    separated,
+    sharpened,
+    spaced,
+    square,
+    survivors,
+)
 from hybridmap.vision.laser.registration import Prior, align, second_mode
-from hybridmap.vision.laser.search import STEP_DEG, STEP_M, separated, sharpened, spaced, square, survivors
 from hybridmap.vision.laser.submap import Atlas, Field
 
 SETTINGS = RegistrationConfig()

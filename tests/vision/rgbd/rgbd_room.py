@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hybridmap.streams.rgbd import Camera, RgbdFrame
-from hybridmap.vision.rgbd.spatial import from_planar
+from hybridmap.vision.rgbd.stance import from_planar
 
 LOW, HIGH = np.array([-3.0, -2.0, 0.0]), np.array([3.0, 2.0, 2.4])
 CUPBOARD = np.array([1.0, 0.6, 0.0]), np.array([1.9, 1.5, 1.2])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hybridmap.vision.rgbd.pairs import PointPairs
-from hybridmap.vision.rgbd.spatial import from_planar, rotation_of
+from hybridmap.vision.rgbd.stance import from_planar, rotation_of
 
 POSE = from_planar(np.array([0.3, -0.2, 0.4]))
 

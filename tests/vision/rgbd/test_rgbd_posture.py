@@ -7,8 +7,7 @@ from hybridmap.streams.rgbd import Camera
 from hybridmap.vision.rgbd.depth_grid import make_grid
 from hybridmap.vision.rgbd.features import detect
 from hybridmap.vision.rgbd.pnp_solver import PnpSolver
-from hybridmap.vision.rgbd.posture import Posture
-from hybridmap.vision.rgbd.tilt import find_floor, vertical_of_structure
+from hybridmap.vision.rgbd.posture import Posture, find_floor, vertical_of_structure
 
 
 def look(view: Camera, pose):

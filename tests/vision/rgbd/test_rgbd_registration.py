@@ -6,8 +6,17 @@ from hybridmap.config.rgbd import RegistrationConfig
 from hybridmap.geometry import RelativePose, between, compose
 from hybridmap.vision.rgbd.depth_grid import make_grid, place
 from hybridmap.vision.rgbd.depth_registration import register
-from hybridmap.vision.rgbd.spatial import apply, from_planar, inverse_rigid, rotation_of, small_rotvec, to_floor
-from hybridmap.vision.rgbd.stance import Stance, camera_on, level_pair
+from hybridmap.vision.rgbd.stance import (
+    Stance,
+    apply,
+    camera_on,
+    from_planar,
+    inverse_rigid,
+    level_pair,
+    rotation_of,
+    small_rotvec,
+    to_floor,
+)
 
 CONFIG = RegistrationConfig()
 LEVEL = (np.deg2rad(0.2), 0.004)

@@ -15,10 +15,10 @@ from hybridmap.geometry import RelativePose, align, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import Rig
+from hybridmap.vision.gating import Chain
 from hybridmap.vision.rgbd.pnp import Verification
 from hybridmap.vision.rgbd.whole_map import WholeMap, chain_of
 from hybridmap.vision.templates import Matcher
-from hybridmap.vision.whereabouts import Chain
 
 VIEW = camera(width=240)
 PER_LAP, UP, DOWN = 16, 19, 28
