@@ -165,7 +165,7 @@ def compare(before: dict[str, Any], after: dict[str, Any]) -> int:
     print("| case | error | before, m | after, m | same graph | same trajectories |\n|---|---|---:|---:|---|---|")
     for name in (name for name in before if name in after):
         old, new = before[name], after[name]
-        graph, track = ("yes" if old[key] and old[key] == new[key] else "no" for key in ("graph_hash", "trajectories"))
+        graph, track = (same(old[key], new[key]) for key in ("graph_hash", "trajectories"))
         for figure, value in old["figures"].items():
             now = new["figures"].get(figure, float("nan"))
             bad = not now <= max(value * WORSE_SHARE, value + WORSE_M)
@@ -173,6 +173,11 @@ def compare(before: dict[str, Any], after: dict[str, Any]) -> int:
             print(f"| {name} | {figure} | {value:.5f} | {now:.5f}{' **worse**' if bad else ''} | {graph} | {track} |")
     print(f"\n{worse} figures got worse" if worse else "\nno figure got worse")
     return min(worse, 1)
+
+
+def same(before: str, after: str) -> str:
+    """Whether two hashes are equal, as a word of the table; a graph that was read has none."""
+    return "–" if not before else "yes" if before == after else "no"
 
 
 def speed(before: Path, after: Path, pairs: int) -> int:
