@@ -16,7 +16,7 @@ simulation.camera simulation/camera.py hole_fraction exposure_change color_noise
 simulation.laser simulation/laser.py forward_m height_m range_min_m noise_m drop_fraction
 neural neural/grid.py softplus_sharpness fourier_modes kernel_gain_first kernel_gain_zero kernel_widths
 neural neural/band.py band_cells band_width
-neural neural/decoder.py decode_box_m
+neural neural/grid.py decode_box_m
 neural neural/path_integrator.py orientation_deg orientation_step_deg neuron_noise_seed
 neural.place neural/path_integrator.py theta_hz
 neural.place neural/attractor.py attractor_width_cells
