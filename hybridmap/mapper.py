@@ -16,7 +16,7 @@ from hybridmap.calibration.online import OnlineCalibration
 from hybridmap.config import Config
 from hybridmap.edge_book import EdgeBook
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, inverse
-from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Method, Search, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node, Novelty
 from hybridmap.graph.uncertainty import odometry_covariance, relative_covariances
 from hybridmap.metrics import StageClock
@@ -168,7 +168,7 @@ class Mapper:
                 self._correct(final=True)
                 updates.append(self._update(pose_odom, "loops without weight measured again", None, edges))
             self._retrace()
-            updates.append(self._update(pose_odom, "end of the drive", None, self._report_rejected()))
+            updates.append(self._update(pose_odom, "end of the drive"))
         return updates
 
     @property
@@ -216,14 +216,10 @@ class Mapper:
         solution = self.backends.solutions.get(self.backends.primary)
         if solution is None or not isinstance(self.vision, VerifyingFrontEnd) or self.config.edges.gate == "odometry":
             return []
-        doubted = self.book.doubted(solution.report)
+        doubted = self.book.without_weight(solution.report)
         with self.clock.stage("matching"):
             proposals = self.vision.verify(doubted, self.belief(solution.report.rejected_edge_ids)) if doubted else []
-        return self.book.enter_again(proposals, self.backends.primary)
-
-    def _report_rejected(self) -> list[int]:
-        solution = self.backends.solutions.get(self.backends.primary)
-        return self.book.report(solution.report) if solution is not None else []
+        return self.book.enter_again(proposals)
 
     def _retrace(self) -> None:
         """Once the map is final, measure on it where the robot was between nodes."""
@@ -269,9 +265,8 @@ class Mapper:
         """Join the new node to the one that the robot was at; from now on the robot is at the new one."""
         edges = []
         if node > 0:
-            reason = "consecutive" if self._at_node == node - 1 else "re-hung on the matched node"
             relative = self._odometry_from(self._pose_odom_at_node, node)
-            edge = Edge(self._at_node, node, EdgeKind.ODOMETRY, Status.ACCEPTED, reason, relative)
+            edge = Edge.decided(self._at_node, node, EdgeKind.ODOMETRY, relative, method=Method.ODOMETRY, search=Search.CHAIN)
             edges.append(self.map.add_edge(edge))
         self._at_node, self._pose_odom_at_node = node, self.map.node(node).pose_odom
         return edges

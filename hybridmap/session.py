@@ -254,6 +254,7 @@ def _figures(mapper: Mapper, recorder: _Recorder, duration_s: float) -> list[Met
         Metric("loops_accepted", count[Status.ACCEPTED], "1", "loop closures in the graph"),
         Metric("loops_pending", count[Status.PENDING], "1", "loop closures still waiting at the end"),
         Metric("loops_rejected", count[Status.REJECTED], "1", "loop closures refused, each with its reason"),
+        Metric("loops_retracted", count[Status.RETRACTED], "1", "loop closures that were in the graph and were taken back"),
         *_second_look(mapper),
         Metric("odometry_dropped", len(dropped), "1", "odometry edges that a registration contradicted"),
         Metric("largest_correction", recorder.largest_correction_m, "m", "largest shift of a node at one closure"),

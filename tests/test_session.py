@@ -20,6 +20,7 @@ from hybridmap.errors import OutputError, StreamError
 from hybridmap.evaluate import evaluate_session
 from hybridmap.evaluate.explain import Explainer
 from hybridmap.geometry import between
+from hybridmap.graph.edges import Search, Status
 from hybridmap.graph.io import graph_hash
 from hybridmap.store import MapStore
 from hybridmap.trajectory import read_tum
@@ -83,9 +84,10 @@ def test_at_the_stamp_of_a_node_the_frame_is_that_of_the_node(finished):
 
 def test_an_accepted_loop_shows_no_figure_that_would_have_refused_it(finished):
     with MapStore.open(finished.folder.path) as store:
-        loops = [edge for edge in store.map().edges if edge.reason == "near on the optimised map"]
+        loops = [edge for edge in store.map().edges if edge.search is Search.NEAR and edge.status is Status.ACCEPTED]
     assert loops
-    assert all("second_mode" in edge.scores and "ambiguity" not in edge.scores for edge in loops)
+    assert not any(edge.failed for edge in loops)
+    assert all("ambiguity" in edge.figures for edge in loops)
 
 
 def test_scans_between_nodes_are_put_right_on_the_final_map(finished, tmp_path):

@@ -128,13 +128,12 @@ def _decisions(decisions: Iterable[Decision], node: int) -> Iterator[str]:
         edge = decision.edge
         other = edge.source if edge.target == node else edge.target
         yield f"  {edge.kind.name.lower():12} {other:>5}  {str(edge.status).upper():9} {edge.reason}"
-        if decision.checks:
-            yield _indented("figures", "; ".join(f"{check} {'yes' if check.passed else 'NO'}" for check in decision.checks))
-        rest = {name: value for name, value in edge.scores.items() if name not in {c.rule.figure for c in decision.checks}}
-        if rest:
-            yield _indented("also", ", ".join(f"{name} {value:.4g}" for name, value in rest.items()))
-        if decision.otherwise:
-            yield _indented("otherwise", decision.otherwise)
+        if edge.checks:
+            yield _indented("figures", "; ".join(f"{check} {'yes' if check.passed else 'NO'}" for check in edge.checks))
+        if edge.figures:
+            yield _indented("also", ", ".join(f"{name} {value:.4g}" for name, value in edge.figures.items()))
+        if edge.otherwise:
+            yield _indented("otherwise", edge.otherwise)
         if any(weight < 1.0 for weight in decision.weights.values()):
             yield _indented("weight", ", ".join(f"{name} {weight:.2g}" for name, weight in decision.weights.items()))
         if decision.error is not None:

@@ -14,15 +14,13 @@ from numpy.typing import NDArray
 from hybridmap.backends.base import ODOMETRY
 from hybridmap.errors import EvaluationError
 from hybridmap.evaluate.association import known_at
-from hybridmap.evaluate.checks import Check, checks_of, otherwise, setting
 from hybridmap.geometry import Array, between
-from hybridmap.graph.edges import Edge, EdgeKind
+from hybridmap.graph.edges import Check, Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.streams.sensors import carried
 from hybridmap.trajectory import NS_PER_S, Trajectory, format_motion, read_tum
 from hybridmap.vision.gating import Gate
-from hybridmap.vision.rgbd.keyframe import tilt_measured
 
 _AT_NODE_NS = 1_000
 _STAMPS_FROM_S = 1e6  # a time beyond it is a stamp, not seconds since the start
@@ -35,17 +33,13 @@ class Decision:
 
     Attributes:
         number: of the edge in the map file.
-        edge: itself: ends, kind, status, reason, measurement, scores.
-        checks: its figures against the settings, in the order in which they were asked.
-        otherwise: what would have had to be different for the other decision.
-        weights: back-end -> weight of an accepted loop there (0: held for false).
+        edge: itself, with the record of the decision.
+        weights: back-end -> weight of an accepted loop there (0: it has none).
         error: (m, deg) of its measurement against the truth, where that is known.
     """
 
     number: int
     edge: Edge
-    checks: list[Check]
-    otherwise: str
     weights: Mapping[str, float] = field(default_factory=dict)
     error: tuple[float, float] | None = None
 
@@ -61,19 +55,15 @@ class Decision:
             "reason": e.reason,
             "since_node": e.since_node,
             "relative": None if e.relative is None else e.relative.delta.tolist(),
-            "scores": {name: _plain(value) for name, value in e.scores.items()},
-            "checks": [
-                {
-                    "figure": c.rule.figure,
-                    "value": _plain(c.value),
-                    "needs": "at least" if c.rule.at_least else "at most",
-                    "limit": c.limit,
-                    "setting": c.rule.setting,
-                    "passed": c.passed,
-                }
-                for c in self.checks
-            ],
-            "otherwise": self.otherwise,
+            "checks": [_told(check) for check in e.checks],
+            "lack": e.lack,
+            "method": e.method,
+            "search": e.search,
+            "figures": {name: _plain(value) for name, value in e.figures.items()},
+            "carried_m": e.carried_m,
+            "broken_by": [_told(check) for check in e.broken_by],
+            "contradicts_odometry": e.contradicts_odometry,
+            "otherwise": e.otherwise,
             "weights": dict(self.weights),
             "error_m": None if self.error is None else self.error[0],
             "error_deg": None if self.error is None else self.error[1],
@@ -199,7 +189,6 @@ class Explainer:
             self._store.close()
             raise EvaluationError(f"{folder}: its map holds no node: there is nothing to explain")
         self._settings: dict[str, Any] = self._store.config_tree
-        self._held_at: dict[int, bool] = {}
 
     def __enter__(self) -> Explainer:
         return self
@@ -290,21 +279,21 @@ class Explainer:
         if number == 0:
             return "first experience"
         moved = _moved(between(self._map.node(number - 1).pose_odom, self._map.node(number).pose_odom))
-        if setting(self._settings, "nodes.rule") == "novelty":
+        if _setting(self._settings, "nodes.rule") == "novelty":
             return f"a new place or view, {format_motion(*moved)} since node {number - 1}"
         return f"{format_motion(*moved)} since node {number - 1}; {self._node_rule()}"
 
     def _why_no_node(self, moved: tuple[float, float]) -> str:
-        if setting(self._settings, "nodes.rule") == "novelty":
-            least = setting(self._settings, "nodes.place_threshold")
+        if _setting(self._settings, "nodes.rule") == "novelty":
+            least = _setting(self._settings, "nodes.place_threshold")
             return f"neither a new view template nor a place code {least} from every node's (nodes.place_threshold)"
-        limits = [setting(self._settings, f"nodes.{name}") for name in ("distance_m", "angle_deg")]
+        limits = [_setting(self._settings, f"nodes.{name}") for name in ("distance_m", "angle_deg")]
         due = any(value >= limit for value, limit in zip(moved, limits, strict=True) if isinstance(limit, int | float))
         why = f"no view at this instant, though {format_motion(*moved)}" if due else f"only {format_motion(*moved)}"
         return f"{why} since the last node; {self._node_rule()}"
 
     def _node_rule(self) -> str:
-        metres, degrees = (setting(self._settings, f"nodes.{name}") for name in ("distance_m", "angle_deg"))
+        metres, degrees = (_setting(self._settings, f"nodes.{name}") for name in ("distance_m", "angle_deg"))
         return f"a node is made every {metres} m (nodes.distance_m) or {degrees} deg (nodes.angle_deg)"
 
     def _since_start(self, stamp_ns: int) -> float:
@@ -329,18 +318,18 @@ class Explainer:
     def _why_no_loops(self, gate: Gate | None) -> str:
         if gate is not None:
             if gate.older == 0:
-                least = setting(self._settings, "vision.rgbd.closing.min_age_s")
+                least = _setting(self._settings, "vision.rgbd.closing.min_age_s")
                 return f"no node was old enough: {least} s (vision.rgbd.closing.min_age_s)"
             return "no older node lay inside the gate" if gate.inside == 0 else ""
         for kind, _ in carried(self._store.rig):
-            every = setting(self._settings, kind.seeks_every)
+            every = _setting(self._settings, kind.seeks_every)
             if isinstance(every, int | float):
                 return f"the {kind.name} looks for them every {every:g} m of travel ({kind.seeks_every}), inside its gate"
         return ""
 
     def _nearest(self, number: int) -> tuple[int, float, float] | None:
         """By distance and turn together (1 rad counts as 1 m), of the nodes old enough to be loops."""
-        age = setting(self._settings, "vision.rgbd.closing.min_age_s")
+        age = _setting(self._settings, "vision.rgbd.closing.min_age_s")
         young_ns = round((age if isinstance(age, int | float) else 10.0) * NS_PER_S)
         stamps = np.array([node.stamp_ns for node in self._map.nodes[:number]], dtype=np.int64)
         old = np.flatnonzero(stamps <= self._map.node(number).stamp_ns - young_ns)
@@ -353,21 +342,13 @@ class Explainer:
         return int(old[best]), float(metres[best]), float(np.degrees(turned[best]))
 
     def _decision(self, number: int, edge: Edge) -> Decision:
-        held = self._held(edge.source) or self._held(edge.target)
-        checks = [] if edge.kind is EdgeKind.ODOMETRY else checks_of(edge, self._settings, held)
         weights = {}
-        if edge.kind is EdgeKind.LOOP and edge.status == "accepted":
+        if edge.kind is EdgeKind.LOOP and edge.status is Status.ACCEPTED:
             for name, solution in self._store.solutions().items():
                 rejected = number in solution.report.rejected_edge_ids
                 weights[name] = 0.0 if rejected else solution.report.weights.get(number, 1.0)
             weights.pop("odometry", None)
-        return Decision(number, edge, checks, otherwise(edge, checks, self._settings), weights, self._error(edge))
-
-    def _held(self, node: int) -> bool:
-        """The camera's tilt was measured at a node and not taken from the mounting."""
-        if node not in self._held_at:
-            self._held_at[node] = tilt_measured(self._store.keyframe(node), self._store.rig)
-        return self._held_at[node]
+        return Decision(number, edge, weights, self._error(edge))
 
     def _error(self, edge: Edge) -> tuple[float, float] | None:
         if self._truth is None or edge.relative is None:
@@ -387,6 +368,18 @@ def _nearest_frame(stamps_ns: NDArray[np.int64], time_s: float) -> int | None:
     apart = np.abs(stamps_ns - (since_ns + round(time_s * NS_PER_S)))
     at = int(np.argmin(apart))
     return at if apart[at] <= np.max(np.diff(stamps_ns), initial=NS_PER_S) else None
+
+
+def _setting(settings: Mapping[str, Any], dotted: str) -> Any:
+    """A value of a nested configuration; None where there is none."""
+    value: Any = settings
+    for key in dotted.split("."):
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return value
+
+
+def _told(check: Check) -> dict[str, Any]:
+    return {**asdict(check), "value": _plain(check.value), "limit": _plain(check.limit), "passed": check.passed}
 
 
 def _plain(value: float) -> float | None:

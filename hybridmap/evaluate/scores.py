@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from hybridmap.graph.edges import Edge
 
 _WORDS: dict[str, tuple[str, str]] = {
     "profile_G": ("difference of the scanlines (G)", ""),
     "shift": ("scanlines shifted by", "columns"),
     "map_distance_m": ("apart on the map at the time", "m"),
     "matches": ("features matched", ""),
-    "inliers": ("features that agree on the pose", ""),
-    "inliers_reverse": ("that agree the other way round", ""),
+    "feature_inliers": ("features that agree on the pose", ""),
+    "feature_inliers_reverse": ("that agree the other way round", ""),
+    "feature_inliers_both": ("that agree both ways round", ""),
     "height_m": ("measured off the floor by", "m"),
     "tilt_deg": ("measured tilt", "deg"),
     "reverse_m": ("the two ways round differ by", "m"),
@@ -29,21 +30,26 @@ _WORDS: dict[str, tuple[str, str]] = {
     "off_deg": ("off the expected heading by", "deg"),
     "loosest_m": ("standard deviation in the loosest direction", "m"),
     "ambiguity": ("ambiguity: likelihood left when slid that way", ""),
-    "second_mode": ("likelihood left when slid along its loosest direction, in which it is held the looser", ""),
     "violation": ("share of points seen through", ""),
-    "whole_map": ("sought in the whole map", ""),
+    "inliers": ("share of all points that lie close", ""),
+    "off_features_m": ("depth is off the features' pose by", "m"),
+    "off_features_deg": ("and in heading by", "deg"),
+    "map_sigma": ("off the map, in standard deviations of it", ""),
+    "supporting": ("other edges that agree", ""),
+    "agreeing": ("loops that put the robot there", ""),
+    "probes": ("probes that agree", ""),
+    "span_m": ("travel that they cover", "m"),
+    "rival": ("score of the best rival, as a share", ""),
     "mismatch": ("mismatch (0 fits perfectly)", ""),
 }
-_OF_SCANS = {"inliers": ("share of all points that lie close", "")}
-_FLAGS = ("whole_map",)
 
 
-def in_words(scores: Mapping[str, float]) -> list[tuple[str, str]]:
-    """(words, value with unit) of each figure of a loop, in their order; one that has no words goes by its own name."""
-    words = _WORDS | (_OF_SCANS if "near" in scores else {})
+def in_words(edge: Edge) -> list[tuple[str, str]]:
+    """(words, value with unit) of each figure of an edge, those that decided first; one without words goes by its own name."""
+    figures = {check.figure: check.value for check in edge.checks} | dict(edge.figures)
+    figures |= {"shift": edge.shift} if edge.shift else {}
     rows = []
-    for name, value in scores.items():
-        said, unit = words.get(name, (name.replace("_", " "), ""))
-        text = ("yes" if value else "no") if name in _FLAGS else f"{value:.4g} {unit}".rstrip()
-        rows.append((said, text))
+    for name, value in figures.items():
+        said, unit = _WORDS.get(name, (name.replace("_", " "), ""))
+        rows.append((said, f"{value:.4g} {unit}".rstrip()))
     return rows

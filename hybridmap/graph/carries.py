@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.geometry import Array
-from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.graph.edges import Status
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.trajectory import Trajectory
@@ -41,9 +41,9 @@ def carries(experiences: ExperienceMap) -> tuple[Carry, ...]:
     """Every carry of a drive, in its order: the edges that a search of the whole map hung in the place of broken ones."""
     found = []
     for edge in experiences.edges:
-        if edge.kind is EdgeKind.REGISTRATION and edge.status is Status.ACCEPTED and "carried_m" in edge.scores:
+        if edge.status is Status.ACCEPTED and edge.carried_m is not None:
             search_m = experiences.node(edge.since_node).travel_m - experiences.node(edge.target).travel_m
-            found.append(Carry(edge.source, edge.target, edge.since_node, edge.scores["carried_m"], search_m))
+            found.append(Carry(edge.source, edge.target, edge.since_node, edge.carried_m, search_m))
     return tuple(sorted(found, key=lambda carry: carry.after))
 
 

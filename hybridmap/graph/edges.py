@@ -1,10 +1,15 @@
-"""The words for edges, shared by all that propose, keep, solve and judge them: kind, status, edge."""
+"""The words for edges, shared by all that propose, keep, solve and judge them: kind, status, check, edge.
+
+A decision about an edge is a record: the checks that were asked, in their order, and what else it lacked. The verdict, the
+reason in words and what would have had to be different follow from that record alone.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
+from typing import Any, Self
 
 from hybridmap.geometry import RelativePose
 
@@ -19,7 +24,10 @@ class EdgeKind(IntEnum):
 
 
 class Status(StrEnum):
-    """What became of an edge; only accepted ones are in the graph."""
+    """What became of an edge; only accepted ones are in the graph.
+
+    A rejected edge never was in the graph, a retracted one was and has been taken back.
+    """
 
     ACCEPTED = "accepted"
     PENDING = "pending"
@@ -27,31 +35,268 @@ class Status(StrEnum):
     RETRACTED = "retracted"
 
 
+class Method(StrEnum):
+    """What an edge was measured by."""
+
+    ODOMETRY = "odometry"
+    SCANS = "scans"
+    DEPTH = "depth"
+    FEATURES = "features"
+    FEATURES_AND_DEPTH = "features and depth"
+    PROFILE = "profile"
+    LOOPS = "loops"
+
+    @property
+    def words(self) -> str:
+        """What it says of an edge that was accepted."""
+        return _METHODS[self]
+
+
+class Search(StrEnum):
+    """How the two nodes of an edge came to be compared."""
+
+    CHAIN = "chain"
+    GATE = "gate"
+    WHOLE_MAP = "whole map"
+    NEAR = "near"
+    AGAIN = "again"
+
+    @property
+    def words(self) -> str:
+        """How it is said behind the method; empty where it goes without saying."""
+        return _SEARCHES[self]
+
+
+class Lack(StrEnum):
+    """What an edge that is not in the graph lacks, where that is not a check."""
+
+    WAITING = "waiting"
+    UNSUPPORTED = "unsupported"
+    CONTRADICTED = "contradicted"
+    NOT_LOST = "not lost"
+    NO_DEPTH = "no depth"
+    OVERRULED = "overruled"
+    KIDNAPPED = "kidnapped"
+
+    @property
+    def words(self) -> str:
+        """What it is, for people."""
+        return _LACKS[self][0]
+
+    @property
+    def needed(self) -> str:
+        """What would have had to be different."""
+        return _LACKS[self][1]
+
+
+_METHODS = {
+    Method.ODOMETRY: "odometry",
+    Method.SCANS: "scans agree",
+    Method.DEPTH: "depth agrees",
+    Method.FEATURES: "features agree",
+    Method.FEATURES_AND_DEPTH: "features and depth agree",
+    Method.PROFILE: "profile alone, not verified",
+    Method.LOOPS: "where the loops put the robot",
+}
+_SEARCHES = {
+    Search.CHAIN: "",
+    Search.GATE: "",
+    Search.WHOLE_MAP: "found on the whole map",
+    Search.NEAR: "near on the map",
+    Search.AGAIN: "measured again, as a back-end gave it no weight",
+}
+_LACKS = {
+    Lack.WAITING: ("waits for other edges that agree with it", "other edges near it that agree with it"),
+    Lack.UNSUPPORTED: (
+        "no other edges agreed with it in time",
+        "other edges near it that agree with it, before it is given up",
+    ),
+    Lack.CONTRADICTED: (
+        "contradicts the loops that were accepted",
+        "loops that agree with it and outweigh those that it contradicts",
+    ),
+    Lack.NOT_LOST: ("the robot was where the map had it", "a robot that is lost"),
+    Lack.NO_DEPTH: ("too little depth in common view", "more surfaces in common view"),
+    Lack.OVERRULED: (
+        "contradicted by a registration",
+        "a registration that agrees with the odometry, or edges.drop_contradicted: false",
+    ),
+    Lack.KIDNAPPED: ("the robot was kidnapped between the two nodes", "a robot that drove from one node to the other"),
+}
+
+
+class Need(StrEnum):
+    """On which side of its limit a figure must be."""
+
+    AT_LEAST = "at least"
+    AT_MOST = "at most"
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """A figure held against a limit.
+
+    Attributes:
+        figure: its name, which carries its unit.
+        value: what was found; NaN never passes.
+        needs: whether it must be at least or at most the limit.
+        limit: the limit as it was applied.
+        setting: dotted name of the setting that the limit comes from; None for a constant, and where it is worked out.
+    """
+
+    figure: str
+    value: float
+    needs: Need
+    limit: float
+    setting: str | None = None
+
+    @property
+    def passed(self) -> bool:
+        """Whether the figure keeps to the limit."""
+        return self.value >= self.limit if self.needs is Need.AT_LEAST else self.value <= self.limit
+
+    @property
+    def slack(self) -> float:
+        """How far from the limit, as a share of it; negative where it is missed."""
+        away = self.value - self.limit if self.needs is Need.AT_LEAST else self.limit - self.value
+        return away / max(abs(self.limit), 1e-12)
+
+    def __str__(self) -> str:
+        sign = ">=" if self.needs is Need.AT_LEAST else "<="
+        where = "" if self.setting is None else f", {self.setting}"
+        return f"{self.figure} {self.value:.4g} ({sign} {self.limit:.4g}{where})"
+
+    @property
+    def miss(self) -> str:
+        """How a figure that does not pass misses its limit."""
+        sign = "<" if self.needs is Need.AT_LEAST else ">"
+        return f"{self.figure} {self.value:.3g} {sign} {self.limit:.3g}"
+
+    @property
+    def otherwise(self) -> str:
+        """What would have had to be different for the other outcome."""
+        least = self.needs is Need.AT_LEAST
+        if self.passed:
+            change = "above" if least else "below"
+            return f"refused with {self.setting or 'a limit'} {change} {self.value:.4g} (now {self.limit:.4g})"
+        wanted = f"{self.figure} {'>=' if least else '<='} {self.limit:.4g} instead of {self.value:.4g}"
+        return (
+            wanted
+            if self.setting is None
+            else f"{wanted}, or {self.setting} {'at most' if least else 'at least'} {self.value:.4g}"
+        )
+
+
+def at_least(figure: str, value: float, limit: float, setting: str | None = None) -> Check:
+    """A figure that must not be below a limit."""
+    return Check(figure, float(value), Need.AT_LEAST, float(limit), setting)
+
+
+def at_most(figure: str, value: float, limit: float, setting: str | None = None) -> Check:
+    """A figure that must not be above a limit."""
+    return Check(figure, float(value), Need.AT_MOST, float(limit), setting)
+
+
+def passed(checks: Sequence[Check]) -> bool:
+    """Whether every one of some checks did."""
+    return all(check.passed for check in checks)
+
+
+def verdict(checks: Sequence[Check], lack: Lack | None) -> Status:
+    """What becomes of an edge with such a record."""
+    if lack not in (None, Lack.WAITING) or not passed(checks):
+        return Status.REJECTED
+    return Status.ACCEPTED if lack is None else Status.PENDING
+
+
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """A relative pose between two nodes, in the frame of the source, with its fate.
+    """A relative pose between two nodes, in the frame of the source, with its fate and the record of the decision.
 
-    A front-end proposes one under a key of its own; it gets its number from the map.
+    A front-end proposes one under a key of its own; it gets its number from the map. An edge that is rejected or retracted
+    has a check that failed or something else that it lacks; one that is accepted has neither.
 
     Attributes:
         source, target: node numbers.
         kind: where it comes from.
-        status, reason: what became of it, and why.
+        status: what became of it.
         relative: the measurement; None where a candidate was refused before one was made.
-        scores: the figures that the decision rested on.
+        checks: the figures that decided, each against its limit, in the order in which they were asked.
+        lack: what else it lacked; None where that is nothing.
+        method, search: what measured it, and how its nodes came to be compared; None where that is not known.
+        shift: columns by which the view of the target is shifted against that of the source.
+        figures: further figures for people, by name; nothing is decided by them.
+        carried_m: of the edge that joins the chain again where the robot was kidnapped: how far from where the odometry has it
+            the robot was found; None for every other edge.
+        broken_by: the checks that say that the robot did not drive from the source to the target; empty where it may have.
+        contradicts_odometry: a registration so good that the odometry edge beside it is wrong and is to be dropped.
         since_node: number of the newest node when the edge got its present status (-1: let the map note it), so that a
             replay brings an edge that was committed late at the same moment.
         key: number within the front-end that proposed it (-1: none did): a later proposal of the same key replaces this one.
-        contradicts_odometry: a registration so good that the odometry edge beside it is wrong and is to be dropped.
     """
 
     source: int
     target: int
     kind: EdgeKind
     status: Status
-    reason: str
-    relative: RelativePose | None
-    scores: Mapping[str, float] = field(default_factory=dict)
-    since_node: int = -1
-    key: int = field(default=-1, kw_only=True, compare=False)
+    relative: RelativePose | None = None
+    checks: tuple[Check, ...] = field(default=(), kw_only=True)
+    lack: Lack | None = field(default=None, kw_only=True)
+    method: Method | None = field(default=None, kw_only=True)
+    search: Search | None = field(default=None, kw_only=True)
+    shift: int = field(default=0, kw_only=True)
+    figures: Mapping[str, float] = field(default_factory=dict, kw_only=True)
+    carried_m: float | None = field(default=None, kw_only=True)
+    broken_by: tuple[Check, ...] = field(default=(), kw_only=True)
     contradicts_odometry: bool = field(default=False, kw_only=True)
+    since_node: int = field(default=-1, kw_only=True)
+    key: int = field(default=-1, kw_only=True, compare=False)
+
+    @classmethod
+    def decided(
+        cls,
+        source: int,
+        target: int,
+        kind: EdgeKind,
+        relative: RelativePose | None,
+        checks: Sequence[Check] = (),
+        lack: Lack | None = None,
+        **more: Any,
+    ) -> Self:
+        """An edge whose status follows from its record."""
+        return cls(source, target, kind, verdict(checks, lack), relative, checks=tuple(checks), lack=lack, **more)
+
+    def settled(self, *more: Check, lack: Lack | None = None) -> Self:
+        """The same edge with further checks and with what it lacks now; its status follows from these."""
+        checks = (*self.checks, *more)
+        return replace(self, status=verdict(checks, lack), checks=checks, lack=lack)
+
+    @property
+    def failed(self) -> tuple[Check, ...]:
+        """The checks that it did not pass."""
+        return tuple(check for check in self.checks if not check.passed)
+
+    @property
+    def reason(self) -> str:
+        """Why it is as it is, in words: from its record."""
+        words = [] if self.lack is None else [self.lack.words]
+        words += [check.miss for check in self.failed]
+        if self.method is not None and not words:
+            words.append(self.method.words)
+        if self.search is not None and self.search.words:
+            words.append(self.search.words)
+        if self.carried_m is not None:
+            words.append(f"kidnapped: {self.carried_m:.1f} m from where the odometry has it")
+        if self.contradicts_odometry:
+            words.append("contradicts the odometry")
+        if self.broken_by:
+            words.append(f"may have been kidnapped: {', '.join(check.miss for check in self.broken_by)}")
+        return "; ".join(words) or str(self.status)
+
+    @property
+    def otherwise(self) -> str:
+        """What would have had to be different for another status; empty where nothing is known."""
+        if self.lack is not None:
+            return self.lack.needed
+        asked = self.failed or sorted(self.checks, key=lambda check: check.slack)
+        return asked[0].otherwise if asked else ""

@@ -102,12 +102,8 @@ class ExperienceMap:
         self._edges_into.setdefault(edge.target, []).append(len(self._edges) - 1)
         return len(self._edges) - 1
 
-    def set_status(self, number: int, status: Status, reason: str) -> None:
-        """Change what became of an edge, and why."""
-        self.update_edge(number, replace(self._edges[number], status=status, reason=reason, since_node=-1))
-
     def update_edge(self, number: int, edge: Edge) -> None:
-        """Replace an edge by a later measurement or verdict between the same two nodes.
+        """Replace an edge by a later measurement or decision between the same two nodes; what was in the graph is retracted.
 
         Raises:
             GraphError: the ends differ, or an accepted edge carries no measurement.
@@ -117,6 +113,8 @@ class ExperienceMap:
             raise GraphError(
                 f"map: edge {number} joins {before.source} -> {before.target}, found {edge.source} -> {edge.target}"
             )
+        if edge.status is Status.REJECTED and before.status in (Status.ACCEPTED, Status.RETRACTED):
+            edge = replace(edge, status=Status.RETRACTED)
         _require_measurement(edge)
         self._edges[number] = self._dated(edge)
         self._write(number)

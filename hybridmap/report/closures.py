@@ -112,7 +112,7 @@ def _example(scene: Scene, store: MapStore, edge: Edge, points_of: Mapping[int, 
         facts=_facts(scene, edge),
         photos=photos if len(photos) == 2 else (),
         overlay=_overlay(scene, edge, points_of),
-        profiles=_profiles(profiles[0], profiles[1], round(edge.scores.get("shift", 0.0))) if len(profiles) == 2 else None,
+        profiles=_profiles(profiles[0], profiles[1], edge.shift) if len(profiles) == 2 else None,
     )
 
 
@@ -132,7 +132,7 @@ def _facts(scene: Scene, edge: Edge) -> tuple[tuple[str, str], ...]:
         rows.append(("final map disagrees by", f"{_contradiction_m(scene, edge):.3f} m"))
     else:
         rows.append(("measured", "nothing"))
-    return (*rows, *in_words(edge.scores))
+    return (*rows, *in_words(edge))
 
 
 def _seen_around(scene: Scene, node: int, points_of: Mapping[int, Array]) -> Array:

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from hybridmap.backends.base import SolveReport, SolveStatus
 from hybridmap.errors import StoreError
+from hybridmap.graph.edges import Check, Edge, Lack, Method, Need, Search
+from hybridmap.store.schema import VERSION
 from hybridmap.streams.base import Rig
 from hybridmap.streams.sensors import kinds
 
@@ -99,6 +101,40 @@ def _array(value: Any) -> Any:
 
 def _plain(fields: dict[str, Any]) -> dict[str, Any]:
     return {key: value.tolist() if isinstance(value, np.ndarray | np.generic) else value for key, value in fields.items()}
+
+
+def record_to_json(edge: Edge) -> str:
+    """The record of the decision about an edge as one JSON object; what says nothing is left out."""
+    fields = {
+        "checks": [_row(check) for check in edge.checks],
+        "lack": edge.lack,
+        "method": edge.method,
+        "search": edge.search,
+        "figures": {name: float(value) for name, value in edge.figures.items()},
+        "shift": edge.shift,
+        "carried_m": edge.carried_m,
+        "broken_by": [_row(check) for check in edge.broken_by],
+        "contradicts_odometry": edge.contradicts_odometry,
+    }
+    return json.dumps({name: value for name, value in fields.items() if value})
+
+
+def record_from_json(text: str, version: int = VERSION) -> dict[str, Any]:
+    """The fields of an edge that `record_to_json` wrote; a file before version 3 has figures alone."""
+    fields: dict[str, Any] = json.loads(text)
+    if version < 3:
+        carried_m = fields.pop("carried_m", None)
+        return {"figures": fields, "carried_m": carried_m}
+    for name in ("checks", "broken_by"):
+        fields[name] = tuple(Check(figure, value, Need(needs), *limit) for figure, value, needs, *limit in fields.get(name, ()))
+    for name, kind in (("lack", Lack), ("method", Method), ("search", Search)):
+        if name in fields:
+            fields[name] = kind(fields[name])
+    return fields
+
+
+def _row(check: Check) -> list[Any]:
+    return [check.figure, check.value, check.needs, check.limit, check.setting]
 
 
 def report_to_json(report: SolveReport) -> str:

@@ -126,9 +126,9 @@ class MapStore:
         measured: tuple[Any, ...] = (None,) * 4
         if edge.relative is not None:
             measured = (*_floats(edge.relative.delta), codec.pack_floats(edge.relative.covariance))
-        scores = json.dumps({name: float(score) for name, score in edge.scores.items()})
-        kind, status = EdgeKind(edge.kind).name.lower(), str(edge.status)
-        row = (number, int(edge.source), int(edge.target), kind, status, edge.reason, *measured, scores, int(edge.since_node))
+        ends, kind = (int(edge.source), int(edge.target)), EdgeKind(edge.kind).name.lower()
+        record = codec.record_to_json(edge)
+        row = (number, *ends, kind, str(edge.status), edge.reason, *measured, record, int(edge.since_node))
         self._write(f"INSERT OR REPLACE INTO edges VALUES ({_marks(len(row))})", row)
 
     def add_track(self, stamp_ns: int, node: int, delta_node_robot: Array, pose_odom: Array) -> None:
@@ -220,7 +220,7 @@ class MapStore:
 
     def map(self) -> ExperienceMap:
         """The experience map: the same nodes and edges in the same order."""
-        experiences = ExperienceMap()
+        experiences, version = ExperienceMap(), int(self._one("PRAGMA user_version", ()))
         codes = {row[0]: codec.Packed(*row[1:]) for row in self._arrays(_CODE)}
         for row in self._rows("SELECT * FROM nodes ORDER BY number"):
             node = Node(row[1], np.array(row[2:5]), codec.unpack(codes[row[0]]), row[8], row[9])
@@ -229,8 +229,8 @@ class MapStore:
             relative = None
             if row[9] is not None:
                 relative = RelativePose(np.array(row[6:9]), codec.unpack_floats(row[9], 3))
-            kind, status, scores = EdgeKind[row[3].upper()], Status(row[4]), json.loads(row[10])
-            experiences.add_edge(Edge(row[1], row[2], kind, status, row[5], relative, scores, row[11]))
+            kind, status, record = EdgeKind[row[3].upper()], Status(row[4]), codec.record_from_json(row[10], version)
+            experiences.add_edge(Edge(row[1], row[2], kind, status, relative, since_node=row[11], **record))
         return experiences
 
     def keyframe(self, node: int) -> dict[str, NDArray[Any]]:

@@ -8,11 +8,12 @@ from pathlib import Path
 
 from hybridmap.errors import StoreError
 
-VERSION = 2
+VERSION = 3
 """Raised whenever the tables change."""
 
-READABLE = (1, 2)
-"""Versions that can be read; a file of another one is refused. Version 1 has no anchors."""
+READABLE = (1, 2, 3)
+"""Versions that can be read; a file of another one is refused. Version 1 has no anchors; before version 3 an edge had figures
+and a reason in words, but no record of its checks."""
 
 APPLICATION_ID = 0x68796D70
 """Marks the SQLite file as a map (`hymp`)."""
@@ -33,7 +34,7 @@ CREATE TABLE arrays (
 CREATE TABLE edges (
     number INTEGER PRIMARY KEY, source INTEGER NOT NULL, target INTEGER NOT NULL,
     kind TEXT NOT NULL, status TEXT NOT NULL, reason TEXT NOT NULL,
-    x_m REAL, y_m REAL, yaw_rad REAL, covariance BLOB, scores TEXT NOT NULL,
+    x_m REAL, y_m REAL, yaw_rad REAL, covariance BLOB, record TEXT NOT NULL,
     since_node INTEGER NOT NULL);
 CREATE TABLE track (
     stamp_ns INTEGER PRIMARY KEY, node INTEGER NOT NULL,

@@ -93,20 +93,11 @@ class FrontEnd(Protocol):
         """What the map file keeps of a node's frame: `profile`, and `ranges_m`, or `color` and `depth_mm` (compact dtypes)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Doubted:
-    """A loop that a back-end holds for false: key of its proposal, and the nodes that it joins."""
-
-    key: int
-    source: int
-    target: int
-
-
 @runtime_checkable
 class VerifyingFrontEnd(FrontEnd, Protocol):
     """A front-end that can measure loops again."""
 
-    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Edge]:
+    def verify(self, doubted: Sequence[Edge], belief: Belief) -> list[Edge]:
         """Measure loops again from where their nodes lie on the map; each keeps its key. What is left out stays as it is."""
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hybridmap.config.agreement import AgreementConfig
 from hybridmap.geometry import Array, RelativePose, between, compose, inverse
 from hybridmap.graph.agreement import Loops, agreement, largest_consistent_set
-from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status, at_least
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import Chain, Whereabouts
 
@@ -47,14 +47,14 @@ class Relocaliser:
     Sightings wait until `support` of them, of distinct nodes over `span_m` of travel, put the robot at one and the same pose,
     and those that contradict them count for less than half as much. Then all of them enter the map together, and the odometry
     edge at which the chain broke gives way to one that leads to where they have it; registrations across the break are taken
-    back. A sighting may say how badly it fits (its score `mismatch`, 0 for perfectly): the worse those that agree best, the
+    back. A sighting may say how badly it fits (its figure `mismatch`, 0 for perfectly): the worse those that agree best, the
     more travel is needed, and of one node's sightings the worse count less.
     """
 
-    def __init__(self, config: AgreementConfig, whereabouts: Whereabouts, new_key: Callable[[], int], given_up: str) -> None:
-        """Start without a sighting; `given_up` is the reason of those that find no others to agree with."""
+    def __init__(self, config: AgreementConfig, whereabouts: Whereabouts, new_key: Callable[[], int], settings: str) -> None:
+        """Start without a sighting; `settings` is the dotted name of the configuration."""
         self.whereabouts = whereabouts
-        self._given_up = given_up
+        self._settings = settings
         self._config = config
         self._new_key = new_key
         self._waiting: list[Edge] = []
@@ -83,10 +83,10 @@ class Relocaliser:
         chosen = np.flatnonzero(largest_consistent_set(self._agree, weights))
         if not self._enough(chosen, weights, belief):
             return Settlement(out)
-        reason = f"lost; {len(chosen)} closures put the robot there"
-        friends = tuple(replace(self._waiting[i], status=Status.ACCEPTED, reason=reason) for i in chosen.tolist())
+        agreeing = at_least("agreeing", len(chosen), self._config.support, f"{self._settings}.support")
+        friends = tuple(self._waiting[i].settled(agreeing) for i in chosen.tolist())
         self._waiting = [s for i, s in enumerate(self._waiting) if i not in set(chosen.tolist())]
-        out += [*friends, *self.dismiss("contradicts the closures that put the robot elsewhere")]
+        out += [*friends, *self.dismiss(Lack.CONTRADICTED)]
         broken_at = self.whereabouts.break_before(min(s.source for s in friends))
         self.whereabouts.recognised()
         carried_to = broken_at if broken_at is not None and self._carried(broken_at, friends, belief) else None
@@ -94,9 +94,9 @@ class Relocaliser:
             out + (self.rehang(carried_to, friends, belief) if carried_to is not None else []), friends, carried_to
         )
 
-    def dismiss(self, reason: str | None = None) -> list[Edge]:
-        """Refuse all sightings that wait; without a reason they are given up."""
-        out = [replace(s, status=Status.REJECTED, reason=reason or self._given_up) for s in self._waiting]
+    def dismiss(self, lack: Lack = Lack.UNSUPPORTED) -> list[Edge]:
+        """Refuse all sightings that wait."""
+        out = [s.settled(lack=lack) for s in self._waiting]
         self._waiting, self._agree = [], self._agree[:0, :0]
         return out
 
@@ -112,12 +112,8 @@ class Relocaliser:
             The registrations taken back, and the edge from the node before the break to the one behind it.
         """
         crossing = [step for step in self._steps if step.source < broken_at <= step.target]
-        reason = f"the robot was carried between nodes {broken_at - 1} and {broken_at}; before that was known: "
         return [
-            *(
-                replace(step, status=Status.REJECTED, reason=reason + step.reason, contradicts_odometry=False)
-                for step in crossing
-            ),
+            *(replace(step.settled(lack=Lack.KIDNAPPED), contradicts_odometry=False) for step in crossing),
             self._rehung(broken_at, friends, belief),
         ]
 
@@ -127,7 +123,7 @@ class Relocaliser:
         old = [s for s in self._waiting if old_nodes[s.source]]
         kept = [i for i, s in enumerate(self._waiting) if not old_nodes[s.source]]
         self._waiting, self._agree = [self._waiting[i] for i in kept], self._agree[np.ix_(kept, kept)]
-        return [replace(s, status=Status.REJECTED, reason=self._given_up) for s in old]
+        return [s.settled(lack=Lack.UNSUPPORTED) for s in old]
 
     def _weights(self) -> Array:
         """(n,) 1 for each node's best sighting, less for those of the same node that fit worse."""
@@ -160,16 +156,15 @@ class Relocaliser:
         middle = placed_by(friends, broken_at, poses)
         relative = RelativePose(between(poses[broken_at - 1], middle), np.diag([REHUNG_M, REHUNG_M, REHUNG_RAD]) ** 2)
         moved_m = float(np.hypot(*(middle - poses[broken_at])[:2]))
-        reason = f"carried: {len(friends)} closures put the robot {moved_m:.1f} m from where the odometry has it"
-        scores = {"closures": float(len(friends)), "carried_m": moved_m}
-        return Edge(
+        return Edge.decided(
             broken_at - 1,
             broken_at,
             EdgeKind.REGISTRATION,
-            Status.ACCEPTED,
-            reason,
             relative,
-            scores,
+            method=Method.LOOPS,
+            search=Search.WHOLE_MAP,
+            figures={"agreeing": float(len(friends))},
+            carried_m=moved_m,
             key=self._new_key(),
             contradicts_odometry=True,
         )
@@ -178,7 +173,7 @@ class Relocaliser:
         return np.array([s.source for s in self._waiting], dtype=np.int64)
 
     def _mismatch(self) -> Array:
-        return np.array([s.scores.get("mismatch", 0.0) for s in self._waiting])
+        return np.array([s.figures.get("mismatch", 0.0) for s in self._waiting])
 
 
 def placed_by(sightings: Sequence[Edge], at: int, poses: Array) -> Array:

@@ -88,11 +88,11 @@ def experience_map(one, rng, every=10, registered=False):
         if number:
             delta = between(raw[chosen[number - 1]], raw[at])
             covariance = np.diag([4e-4, 4e-4, np.radians(1.0) ** 2])
-            edge = Edge(number - 1, number, EdgeKind.ODOMETRY, Status.ACCEPTED, "chain", RelativePose(delta, covariance))
+            edge = Edge(number - 1, number, EdgeKind.ODOMETRY, Status.ACCEPTED, RelativePose(delta, covariance))
             experiences.add_edge(edge)
         for old, kind in _seen_again(truth, number, registered):
             measured = compose(between(truth[number], truth[old]), exp(rng.normal(size=3) * np.sqrt(np.diag(COVARIANCE))))
-            experiences.add_edge(Edge(number, old, kind, Status.ACCEPTED, "true", RelativePose(measured, COVARIANCE)))
+            experiences.add_edge(Edge(number, old, kind, Status.ACCEPTED, RelativePose(measured, COVARIANCE)))
     return experiences, chosen
 
 

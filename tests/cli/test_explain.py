@@ -35,7 +35,7 @@ def test_a_node_is_told_in_words(run, session):
     assert out.startswith("node 59 at 59.000 s (stamp 59.000000000 s)")
     assert "nearest      of the older nodes on the final map: 19, 0.00 m" in out
     assert "loops to older nodes: 2 accepted, 1 rejected" in out
-    assert "REJECTED  too few inliers" in out
+    assert "REJECTED  matches 8 < 12" in out
     assert "off by     3.804 m" in out
 
 

@@ -25,7 +25,7 @@ def noisy_map(scale: float, loops: int = 1500) -> tuple[ExperienceMap, Trajector
     for (i, j), noise in zip(ends, rng.multivariate_normal(np.zeros(3), COVARIANCE, loops), strict=True):
         if i != j:
             relative = RelativePose(compose(between(truth[i], truth[j]), exp(noise)), scale * COVARIANCE)
-            experiences.add_edge(Edge(int(i), int(j), EdgeKind.LOOP, Status.ACCEPTED, "", relative))
+            experiences.add_edge(Edge(int(i), int(j), EdgeKind.LOOP, Status.ACCEPTED, relative))
     return experiences, Trajectory(stamps, truth)
 
 
@@ -38,10 +38,8 @@ def test_the_ratio_is_one_for_calibrated_covariances_and_says_how_far_others_are
 
 def test_wrong_edges_are_counted_and_those_that_were_kept():
     experiences, truth = noisy_map(1.0, loops=20)
-    number = experiences.add_edge(
-        Edge(3, 40, EdgeKind.LOOP, Status.ACCEPTED, "", RelativePose(np.array([9.0, 0, 0]), COVARIANCE))
-    )
-    refused = Edge(3, 41, EdgeKind.LOOP, Status.REJECTED, "", RelativePose(np.array([9.0, 0, 0]), COVARIANCE))
+    number = experiences.add_edge(Edge(3, 40, EdgeKind.LOOP, Status.ACCEPTED, RelativePose(np.array([9.0, 0, 0]), COVARIANCE)))
+    refused = Edge(3, 41, EdgeKind.LOOP, Status.REJECTED, RelativePose(np.array([9.0, 0, 0]), COVARIANCE))
     experiences.add_edge(refused)
     kept = edge_errors(experiences, truth)[EdgeKind.LOOP]
     assert (kept.wrong, kept.wrong_kept) == (1, 1)

@@ -19,28 +19,28 @@ def drive(*edges):
         pose = np.array([0.5 * k, 0.0, 0.0])
         experiences.add_node(Node(k * SECOND, pose, np.zeros(4, dtype=np.float32), -1, 0.5 * k), pose)
     relative = RelativePose(np.array([3.0, 4.0, 0.0]), np.eye(3))
-    for kind, status, scores in edges:
-        experiences.add_edge(Edge(2, 3, kind, status, "carried", relative, scores))
+    for kind, status, carried_m in edges:
+        experiences.add_edge(Edge(2, 3, kind, status, relative, carried_m=carried_m))
     return experiences
 
 
 def test_a_carry_is_what_was_hung_in_the_place_of_a_broken_edge():
-    hung = (EdgeKind.REGISTRATION, Status.ACCEPTED, {"carried_m": 5.0, "closures": 4.0})
+    hung = (EdgeKind.REGISTRATION, Status.ACCEPTED, 5.0)
     (carry,) = carries(drive(hung))
     assert (carry.before, carry.after, carry.found_at, carry.moved_m, carry.search_m) == (2, 3, 5, 5.0, 1.0)
     assert "between nodes 2 and 3: found 5.0 m from where the odometry has it, 1.0 m on, at node 5" in str(carry)
 
 
 def test_what_was_taken_back_or_is_of_another_kind_is_no_carry():
-    taken_back = (EdgeKind.REGISTRATION, Status.REJECTED, {"carried_m": 5.0})
-    ordinary = (EdgeKind.REGISTRATION, Status.ACCEPTED, {"fit": 0.9})
+    taken_back = (EdgeKind.REGISTRATION, Status.REJECTED, 5.0)
+    ordinary = (EdgeKind.REGISTRATION, Status.ACCEPTED, None)
     assert carries(drive(taken_back, ordinary)) == ()
 
 
 def test_a_trajectory_has_no_pose_of_the_way_through_the_air():
     stamps = np.arange(0, 5 * SECOND + 1, SECOND // 2)
     way = Trajectory(stamps, np.zeros((len(stamps), 3)))
-    hung = (EdgeKind.REGISTRATION, Status.ACCEPTED, {"carried_m": 5.0})
+    hung = (EdgeKind.REGISTRATION, Status.ACCEPTED, 5.0)
     left = grounded(way, drive(hung)).stamps_ns / SECOND
     assert left.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, 3.5, 4.0, 4.5, 5.0]
     assert [len(piece) for piece in pieces(way, drive(hung))] == [5, 4]
@@ -49,7 +49,7 @@ def test_a_trajectory_has_no_pose_of_the_way_through_the_air():
 
 
 def test_a_line_through_the_nodes_breaks_where_the_robot_was_carried():
-    experiences = drive((EdgeKind.REGISTRATION, Status.ACCEPTED, {"carried_m": 5.0}))
+    experiences = drive((EdgeKind.REGISTRATION, Status.ACCEPTED, 5.0))
     found = carries(experiences)
     assert parted(experiences.initial, found)[:, 0].tolist() == pytest.approx(
         [0.0, 0.5, 1.0, np.nan, 1.5, 2.0, 2.5], nan_ok=True
@@ -60,9 +60,9 @@ def test_a_line_through_the_nodes_breaks_where_the_robot_was_carried():
 
 def test_edges_through_the_air_are_those_of_motion_between_the_ends_of_a_carry():
     accepted = Status.ACCEPTED
-    experiences = drive((EdgeKind.REGISTRATION, accepted, {"carried_m": 5.0}), (EdgeKind.LOOP, accepted, {}))
+    experiences = drive((EdgeKind.REGISTRATION, accepted, 5.0), (EdgeKind.LOOP, accepted, None))
     relative = RelativePose(np.array([0.5, 0.0, 0.0]), np.eye(3))
-    experiences.add_edge(Edge(3, 4, EdgeKind.REGISTRATION, accepted, "driven", relative))
+    experiences.add_edge(Edge(3, 4, EdgeKind.REGISTRATION, accepted, relative))
     graph = experiences.pose_graph()
     assert through_the_air(graph, carries(experiences)).tolist() == [True, False, False]
     assert not through_the_air(graph, ()).any()

@@ -26,10 +26,10 @@ def drive(registrations, yaw=0.0):
         experiences.add_node(Node(k, pose, np.zeros(1, np.float32), -1, 0.5 * k), pose)
     for k, covariance in enumerate(registrations, start=1):
         odometry = RelativePose(step, ODOMETRY)
-        experiences.add_edge(Edge(k - 1, k, EdgeKind.ODOMETRY, Status.ACCEPTED, "", odometry))
+        experiences.add_edge(Edge(k - 1, k, EdgeKind.ODOMETRY, Status.ACCEPTED, odometry))
         status = Status.REJECTED if covariance is None else Status.ACCEPTED
         measured = RelativePose(step, HELD if covariance is None else covariance)
-        experiences.add_edge(Edge(k - 1, k, EdgeKind.REGISTRATION, status, "", measured))
+        experiences.add_edge(Edge(k - 1, k, EdgeKind.REGISTRATION, status, measured))
     return experiences, poses
 
 

@@ -15,7 +15,7 @@ from hybridmap.cli.graphs import open_graph
 from hybridmap.evaluate.solutions import judge_solutions
 from hybridmap.geometry import RelativePose, between
 from hybridmap.graph.carries import carries
-from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
 from hybridmap.report import comparison_figures, correction_figure, map_figure, style
 from hybridmap.report.scene import Correction, Scene, load_scene
 from hybridmap.store import MapStore, SessionFolder
@@ -29,10 +29,10 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> SessionFolder:
     """A circle of which the robot does not drive the way after node 24: its edge was hung anew."""
     experiences = ring_map()
     (odometry,) = [number for number in experiences.edges_into(PICKED_UP + 1) if experiences.edge(number).source == PICKED_UP]
-    experiences.set_status(odometry, Status.REJECTED, "contradicted")
+    experiences.update_edge(odometry, experiences.edge(odometry).settled(lack=Lack.OVERRULED))
     truth = truth_at(np.array([PICKED_UP, PICKED_UP + 1]) * SECOND)
     hung = RelativePose(between(truth[0], truth[1]), np.eye(3))
-    edge = Edge(PICKED_UP, PICKED_UP + 1, EdgeKind.REGISTRATION, Status.ACCEPTED, "carried", hung, {"carried_m": 5.0})
+    edge = Edge(PICKED_UP, PICKED_UP + 1, EdgeKind.REGISTRATION, Status.ACCEPTED, hung, carried_m=5.0)
     experiences.add_edge(edge)
     return write_session(tmp_path_factory.mktemp("carried") / "session", experiences, keyframes=False)
 

@@ -79,7 +79,7 @@ def test_shows_every_part(page: Page) -> None:
     assert "43.2 cm" in page.text
     assert "0.01 ✓" in page.text
     assert "not accepted" in page.text
-    assert "too few inliers" in page.text
+    assert "matches 8 < 12" in page.text
     assert sum(source.startswith("data:image/jpeg") for source in page.sources) == 2 * 4
 
 

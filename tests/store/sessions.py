@@ -8,7 +8,7 @@ import numpy as np
 
 from hybridmap.backends.base import SolveReport, SolveStatus
 from hybridmap.geometry import RelativePose, between, compose
-from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Status, at_least
 from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.store import MapStore, SessionFolder, trajectory_of
 from hybridmap.streams.base import Rig
@@ -50,15 +50,16 @@ def ring_map(laps: float = 1.5, *, loops: bool = True, false_loop: bool = False)
         experiences.add_node(Node(int(stamps[k]), odometry[k], code + k, k % 7, 0.314 * k), odometry[k])
         if k:
             relative = RelativePose(between(odometry[k - 1], odometry[k]), covariance * 4)
-            experiences.add_edge(Edge(k - 1, k, EdgeKind.ODOMETRY, Status.ACCEPTED, "chain", relative))
+            experiences.add_edge(Edge(k - 1, k, EdgeKind.ODOMETRY, Status.ACCEPTED, relative))
         if loops and k >= 40:
             relative = RelativePose(between(truth[k], truth[k - 40]) + np.array([0.01, 0, 0]), covariance)
-            scores = {"fit": 0.9, "overlap": 0.1 + 0.2}
-            experiences.add_edge(Edge(k, k - 40, EdgeKind.LOOP, Status.ACCEPTED, "verified", relative, scores))
-            experiences.add_edge(Edge(k, k - 30, EdgeKind.LOOP, Status.REJECTED, "too few inliers", None))
+            figures = {"overlap": 0.1 + 0.2}
+            checks = (at_least("fit", 0.9, 0.7, "vision.laser.probes.fit_min"),)
+            experiences.add_edge(Edge(k, k - 40, EdgeKind.LOOP, Status.ACCEPTED, relative, checks=checks, figures=figures))
+            experiences.add_edge(Edge.decided(k, k - 30, EdgeKind.LOOP, None, [at_least("matches", 8, 12)]))
     if false_loop:
         relative = RelativePose(np.zeros(3), covariance)
-        experiences.add_edge(Edge(count - 1, 3, EdgeKind.LOOP, Status.ACCEPTED, "aliased", relative))
+        experiences.add_edge(Edge(count - 1, 3, EdgeKind.LOOP, Status.ACCEPTED, relative))
     return experiences
 
 

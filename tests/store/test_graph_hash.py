@@ -18,7 +18,7 @@ def test_hash_is_of_the_graph_and_of_nothing_else():
     one, other = ring_map(), ring_map()
     assert graph_hash(one) == graph_hash(other)
     assert len(graph_hash(one)) == 64
-    other.update_edge(LOOP, replace(other.edge(LOOP), reason="other words", scores={}))
+    other.update_edge(LOOP, replace(other.edge(LOOP), checks=(), figures={"x": 1.0}))
     assert graph_hash(one) == graph_hash(other)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from hybridmap.config.agreement import AgreementConfig
 from hybridmap.geometry import RelativePose, between, compose
-from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import Chain, Whereabouts
 from hybridmap.vision.relocalising import Relocaliser
@@ -25,7 +25,7 @@ class Search:
 
     def __init__(self, config=None, steps=()):
         self.keys = count()
-        self.relocaliser = Relocaliser(config or AgreementConfig(), Whereabouts(0), self.keys.__next__, "given up")
+        self.relocaliser = Relocaliser(config or AgreementConfig(), Whereabouts(0), self.keys.__next__, "x")
         self.relocaliser.tracked(BROKEN_AT, Chain.BROKEN, list(steps))
         self.proposals = {}
         self.settlements = []
@@ -34,9 +34,9 @@ class Search:
         """Each sighting: the old node, and how badly it fits or None."""
         found = []
         for target, mismatch in sightings:
-            scores = {} if mismatch is None else {"mismatch": mismatch}
+            figures = {} if mismatch is None else {"mismatch": mismatch}
             relative = RelativePose(np.zeros(3), np.eye(3) * 1e-4)
-            found.append(Edge(node, target, EdgeKind.LOOP, Status.PENDING, "waits", relative, scores, key=next(self.keys)))
+            found.append(Edge(node, target, EdgeKind.LOOP, Status.PENDING, relative, figures=figures, key=next(self.keys)))
         self.settlements.append(self.relocaliser.settle(found, seen_until(node)))
         self.proposals |= {p.key: p for p in self.settlements[-1].proposals}
         return self
@@ -60,7 +60,7 @@ def seen_until(node):
 
 def step(source, target, status=Status.ACCEPTED):
     key = 10**6 + source
-    return Edge(source, target, EdgeKind.REGISTRATION, status, "", None, key=key, contradicts_odometry=True)
+    return Edge(source, target, EdgeKind.REGISTRATION, status, None, key=key, contradicts_odometry=True)
 
 
 def test_sightings_wait_until_enough_of_them_agree():
@@ -80,7 +80,7 @@ def test_the_chain_is_hung_where_the_sightings_have_it():
     assert (rehung.source, rehung.target, rehung.status) == (39, 40, Status.ACCEPTED)
     assert rehung.contradicts_odometry
     assert compose(BELIEF.poses_map_node[39], rehung.relative.delta) == pytest.approx([X[THERE], 0.0, 0.0])
-    assert rehung.scores["carried_m"] == pytest.approx(X[BROKEN_AT] - X[THERE])
+    assert rehung.carried_m == pytest.approx(X[BROKEN_AT] - X[THERE])
 
 
 def test_registrations_across_the_break_are_taken_back():
@@ -88,7 +88,7 @@ def test_registrations_across_the_break_are_taken_back():
     search = Search(steps=believed).drive(range(40, 44), THERE)
     taken_back = [p for p in search.proposals.values() if p.kind is EdgeKind.REGISTRATION and p.status is Status.REJECTED]
     assert [(p.source, p.target) for p in taken_back] == [(39, 40), (38, 40)]
-    assert all("carried between nodes 39 and 40" in p.reason and not p.contradicts_odometry for p in taken_back)
+    assert all(p.lack is Lack.KIDNAPPED and not p.contradicts_odometry for p in taken_back)
 
 
 def test_a_robot_found_where_the_chain_has_it_was_not_carried():
@@ -123,7 +123,7 @@ def test_a_rival_place_keeps_it_waiting():
     assert not search.lost
     refused = [p for p in search.proposals.values() if p.status is Status.REJECTED]
     assert {p.target for p in refused} == set(range(ELSEWHERE, ELSEWHERE + 6))
-    assert all("contradicts" in p.reason for p in refused)
+    assert all(p.lack is Lack.CONTRADICTED for p in refused)
 
 
 def test_of_one_nodes_sightings_the_better_fit_counts_for_more():
@@ -147,25 +147,25 @@ def test_old_sightings_are_given_up():
     search = Search(AgreementConfig(wait_m=6.0)).drive(range(40, 43), THERE)
     search.see(65)
     assert search.verdicts() == [Status.REJECTED] * 3
-    assert all(p.reason == "given up" for p in search.proposals.values())
-    assert search.relocaliser.dismiss("over") == []
+    assert all(p.lack is Lack.UNSUPPORTED for p in search.proposals.values())
+    assert search.relocaliser.dismiss() == []
 
 
 def test_what_waits_can_be_dismissed():
     search = Search().drive(range(40, 43), THERE)
-    dismissed = search.relocaliser.dismiss("over")
-    assert [(p.status, p.reason) for p in dismissed] == [(Status.REJECTED, "over")] * 3
-    assert search.relocaliser.dismiss("over") == []
+    dismissed = search.relocaliser.dismiss(Lack.NOT_LOST)
+    assert [(p.status, p.lack) for p in dismissed] == [(Status.REJECTED, Lack.NOT_LOST)] * 3
+    assert search.relocaliser.dismiss() == []
 
 
 def test_sightings_of_a_chain_that_holds_hang_nothing_anew():
-    relocaliser = Relocaliser(AgreementConfig(), Whereabouts(1), iter(range(99)).__next__, "given up")
+    relocaliser = Relocaliser(AgreementConfig(), Whereabouts(1), iter(range(99)).__next__, "x")
     relocaliser.whereabouts.unrecognised()
     found = []
     for node in range(40, 44):
         delta = between(BELIEF.poses_map_node[node], BELIEF.poses_map_node[node] + [0.0, 3.0, 0.0])
         relative = RelativePose(delta, np.eye(3) * 1e-4)
-        found.append(Edge(node, THERE + node - 40, EdgeKind.LOOP, Status.PENDING, "waits", relative, key=node))
+        found.append(Edge(node, THERE + node - 40, EdgeKind.LOOP, Status.PENDING, relative, key=node))
     settlement = relocaliser.settle(found, seen_until(43))
     assert len(settlement.friends) == 4
     assert settlement.carried_to is None

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from hybridmap.config.laser import CommitmentConfig
 from hybridmap.graph.agreement import Loops, agreement, largest_consistent_set
+from hybridmap.graph.edges import Check, Edge, Lack, passed
 from hybridmap.vision.base import Belief
+from hybridmap.vision.laser import checks
 from hybridmap.vision.laser.hypotheses import Hypothesis
 
 
@@ -25,12 +27,21 @@ class Waiting:
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """A hypothesis that waits no longer, and why."""
+    """A hypothesis that waits no longer: the checks of the cluster that committed it, or what it lacks."""
 
     key: int
     hypothesis: Hypothesis
-    accepted: bool
-    reason: str
+    checks: tuple[Check, ...] = ()
+    lack: Lack | None = None
+
+    @property
+    def accepted(self) -> bool:
+        """Whether it enters the map."""
+        return self.lack is None
+
+    def proposed(self) -> Edge:
+        """The edge that it stands for."""
+        return self.hypothesis.proposed(self.key).settled(*self.checks, lack=self.lack)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +63,14 @@ class Cluster:
     sigma_m: float
 
 
+@dataclass(frozen=True, slots=True)
+class Ripe:
+    """A cluster that is good enough, and the checks that it passed."""
+
+    cluster: Cluster
+    checks: tuple[Check, ...]
+
+
 class Commitment:
     """The queue of waiting hypotheses."""
 
@@ -69,8 +88,7 @@ class Commitment:
 
     def settle(self, travel_m: float, belief: Belief) -> list[Settled]:
         """Give up what waited too long; commit the best cluster if it is good enough, with all that agrees with it."""
-        reason = f"no cluster within {self._config.wait_m:g} m of travel"
-        out = [Settled(w.key, w.hypothesis, False, reason) for w in self._expire(travel_m)]
+        out = [Settled(w.key, w.hypothesis, lack=Lack.UNSUPPORTED) for w in self._expire(travel_m)]
         return out + self._commit_all(belief, self._config.span_per_efold_m)
 
     def flush(self, belief: Belief) -> list[Settled]:
@@ -90,7 +108,7 @@ class Commitment:
         self._expire(np.inf)
         settled = {s.key for s in out}
         left = [w for w in self._given_up if w.key in fresh and w.key not in settled]
-        return out + [Settled(w.key, w.hypothesis, False, "no cluster by the end") for w in left]
+        return out + [Settled(w.key, w.hypothesis, lack=Lack.UNSUPPORTED) for w in left]
 
     def _expire(self, travel_m: float) -> list[Waiting]:
         """Take out what has waited too long, and remember it for the end."""
@@ -101,8 +119,8 @@ class Commitment:
 
     def _commit_all(self, belief: Belief, span_per_efold_m: float) -> list[Settled]:
         out: list[Settled] = []
-        while (cluster := self._ripe(belief, span_per_efold_m)) is not None:
-            out += self._commit(cluster)
+        while (ripe := self._ripe(belief, span_per_efold_m)) is not None:
+            out += self._commit(ripe)
         return out
 
     def _keep(self, positions: list[int]) -> None:
@@ -110,7 +128,7 @@ class Commitment:
         self._consistent = self._consistent[np.ix_(known, known)]
         self._queue = [self._queue[p] for p in positions]
 
-    def _ripe(self, belief: Belief, span_per_efold_m: float) -> Cluster | None:
+    def _ripe(self, belief: Belief, span_per_efold_m: float) -> Ripe | None:
         hypotheses = (w.hypothesis for w in self._queue)
         loops = Loops.measured([(h.probe, h.anchor, h.relative) for h in hypotheses])
         self._consistent = agreement(loops, belief.ways, known=self._consistent)
@@ -118,28 +136,28 @@ class Commitment:
         if not clusters:
             return None
         best = clusters[0]
-        if not self._enough(best, span_per_efold_m):
-            return None
         rival = max((c.score for c in clusters[1:] if self._rivals(best, c)), default=0.0)
-        return best if rival < self._config.rival * best.score else None
+        asked = self._asked(best, rival, span_per_efold_m)
+        return Ripe(best, asked) if passed(asked) else None
 
-    def _enough(self, cluster: Cluster, span_per_efold_m: float) -> bool:
+    def _asked(self, cluster: Cluster, rival: float, span_per_efold_m: float) -> tuple[Check, ...]:
+        """What a cluster is held against; `rival`: score of the best one that contradicts it."""
         c = self._config
         wider = max(0.0, float(np.log(max(cluster.sigma_m, 1e-9) / c.sure_sigma_m)))
         probes = c.probes if wider > 0.0 else max(c.probes - 1, 1)
-        return cluster.probes >= probes and cluster.span_m >= c.span_m + span_per_efold_m * wider
+        span_m = c.span_m + span_per_efold_m * wider
+        return checks.of_cluster(cluster.probes, probes, cluster.span_m, span_m, rival / max(cluster.score, 1e-9), c)
 
-    def _commit(self, cluster: Cluster) -> list[Settled]:
+    def _commit(self, ripe: Ripe) -> list[Settled]:
         """Accept everything that agrees with all members; refuse what contradicts most of them."""
-        members = list(cluster.members)
+        members = list(ripe.cluster.members)
         agrees = self._consistent[:, members].mean(axis=1)
         out, left = [], []
-        reason = f"cluster of {cluster.probes} probes over {cluster.span_m:.1f} m, score {cluster.score:.2f}"
         for i, w in enumerate(self._queue):
-            if i in cluster.members or agrees[i] == 1.0:
-                out.append(Settled(w.key, w.hypothesis, True, reason))
+            if i in members or agrees[i] == 1.0:
+                out.append(Settled(w.key, w.hypothesis, ripe.checks))
             elif agrees[i] < 0.5:
-                out.append(Settled(w.key, w.hypothesis, False, f"contradicts the {reason}"))
+                out.append(Settled(w.key, w.hypothesis, lack=Lack.CONTRADICTED))
             else:
                 left.append(i)
         self._keep(left)

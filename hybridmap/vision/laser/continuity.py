@@ -8,17 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.laser import LaserConfig
-from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, inverse
-from hybridmap.graph.edges import Edge
+from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose
+from hybridmap.graph.edges import Check, Edge
 from hybridmap.streams.laser import Laser, LaserScan
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import nodes_within
+from hybridmap.vision.laser import checks
 from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan, merged_at
 from hybridmap.vision.laser.likelihood import build_field
 from hybridmap.vision.laser.registration import Prior, align
 from hybridmap.vision.laser.submap import Atlas, Submap
 from hybridmap.vision.laser.tracking import Step, Tracker
-from hybridmap.vision.laser.visibility import violation
+from hybridmap.vision.laser.visibility import violation_both_ways
 from hybridmap.vision.relocalising import placed_by
 
 RECENT_M = 4.0
@@ -40,8 +41,10 @@ class Continuity:
         self._laser = laser
         self._tracker = tracker
 
-    def broken(self, node: int, step: Step, odometry: RelativePose, on_the_way: Sequence[tuple[Array, LaserScan]]) -> str:
-        """Why the robot cannot have driven to the newest node of the atlas; empty where the chain holds.
+    def broken(
+        self, node: int, step: Step, odometry: RelativePose, on_the_way: Sequence[tuple[Array, LaserScan]]
+    ) -> tuple[Check, ...]:
+        """Checks that say that the robot did not drive to the newest node of the atlas; empty where the chain holds.
 
         The registration does not fit, or contradicts the odometry far beyond its covariance; the scans of the two nodes look
         through each other's walls; and on the way there is a scan that does not follow on the one before it, as it fits
@@ -56,17 +59,16 @@ class Continuity:
         """
         c = self._config.relocalising
         if c.violation >= 1.0:  # switched off
-            return ""
+            return ()
         error = between(odometry.delta, step.relative.delta)
         sigmas = float(np.sqrt(error @ np.linalg.solve(odometry.covariance, error)))
         if step.measured and sigmas <= c.contradiction_sigmas:
-            return ""
+            return ()
         last, here = (_alone(self._atlas.clouds[i], i) for i in (node - 1, node))
-        seen = self._violation(here, last, step.relative.delta, self._atlas.ranges)
+        seen = violation_both_ways(here, last, step.relative.delta, self._atlas.ranges, self._laser)
         if seen <= c.violation or self._follow(node, odometry.delta, on_the_way):
-            return ""
-        fits = f"{sigmas:.0f} sigma from the odometry" if step.measured else "fits nowhere near"
-        return f"{fits}, free space violated by {seen:.2f} > {c.violation}"
+            return ()
+        return checks.of_way(sigmas if step.measured else None, seen, c)
 
     def contradicted(self, node: int, belief: Belief) -> bool:
         """Whether the last scans and the old ones, where a sure map has the robot, look through each other's walls."""
@@ -76,7 +78,7 @@ class Continuity:
             return False
         here = self._atlas.submap(node, self._atlas.along(node, RECENT_M, 0.0))
         there = self._seen_about(poses[node], near, poses)
-        return self._violation(here, there, IDENTITY, self._atlas.ranges) > c.map_violation
+        return violation_both_ways(here, there, IDENTITY, self._atlas.ranges, self._laser) > c.map_violation
 
     def carried_unnoticed(self, sightings: Sequence[Edge], belief: Belief) -> int | None:
         """The node to which the robot was carried without anything that showed it, once sightings say where it is.
@@ -148,15 +150,10 @@ class Continuity:
         for i in range(len(clouds) - 1):
             found = self._tracker.pair(clouds[i], clouds[i + 1], between(wheels[i], wheels[i + 1]))
             here, there = _alone(clouds[i + 1], i + 1), _alone(clouds[i], i)
-            seen = self._violation(here, there, found.poses[0], ranges)
+            seen = violation_both_ways(here, there, found.poses[0], ranges, self._laser)
             if found.inliers[0] < c.tracking.inliers_weak or seen > c.relocalising.violation:
                 return False
         return True
-
-    def _violation(self, here: Submap, there: Submap, pose_there_here: Array, ranges_m: Sequence[NDArray[np.float32]]) -> float:
-        """Share of the walls of either submap in the free space of the other, the larger; `ranges_m` by number of the scan."""
-        forth = violation(here, there, pose_there_here, ranges_m, self._laser)
-        return max(forth, violation(there, here, inverse(pose_there_here), ranges_m, self._laser))
 
 
 def _alone(cloud: Cloud, number: int) -> Submap:

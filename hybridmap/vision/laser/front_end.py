@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, Array, RelativePose, compose
-from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status
 from hybridmap.metrics import StageClock
 from hybridmap.streams.base import Observation, Rig
 from hybridmap.streams.laser import LASER, Laser, LaserScan
 from hybridmap.trajectory import Anchors
-from hybridmap.vision.base import Belief, Doubted, View
+from hybridmap.vision.base import Belief, View
 from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan
-from hybridmap.vision.laser.clusters import Commitment, Settled
+from hybridmap.vision.laser.clusters import Commitment
 from hybridmap.vision.laser.continuity import Continuity
-from hybridmap.vision.laser.hypotheses import Hypothesis, Prober
+from hybridmap.vision.laser.hypotheses import Prober
 from hybridmap.vision.laser.retrace import Retracer, SeenScan
 from hybridmap.vision.laser.revisits import Reviser
 from hybridmap.vision.laser.submap import Atlas
@@ -110,7 +110,7 @@ class LaserFrontEnd:
         if sought.friends or travel_m - self._last_probe_m < self._config.probes.every_m:
             return sought.proposals
         out = sought.proposals + self._probe(node, belief)
-        settled = [_settled(s) for s in self._commitment.settle(travel_m, belief)]
+        settled = [s.proposed() for s in self._commitment.settle(travel_m, belief)]
         return out + settled + (self._whole_map.closed() if any(p.status is Status.ACCEPTED for p in settled) else [])
 
     def _probe(self, node: int, belief: Belief) -> list[Edge]:
@@ -119,11 +119,9 @@ class LaserFrontEnd:
         self._whole_map.probed(node, hypotheses, belief)
         for hypothesis in hypotheses:
             key = self._next_key()
-            if hypothesis.refusal:
-                out.append(_loop(key, hypothesis, Status.REJECTED, hypothesis.refusal))
-            else:
+            out.append(hypothesis.proposed(key, Lack.WAITING))
+            if hypothesis.passed:
                 self._commitment.add(key, hypothesis)
-                out.append(_loop(key, hypothesis, Status.PENDING, "waits for a cluster"))
         return out
 
     def finish(self, belief: Belief) -> list[Edge]:
@@ -132,22 +130,16 @@ class LaserFrontEnd:
         if last >= 0 and self._atlas.travel_m[last] - self._last_probe_m > LAST_PROBE_M:
             out = self._probe(last, belief)
         settled = self._commitment.flush(belief)
-        out += self._whole_map.finish() + [_settled(s) for s in settled]
+        out += self._whole_map.finish() + [s.proposed() for s in settled]
         if any(s.accepted for s in settled):
             return out
-        for hypothesis in self._reviser.round(belief, self._whole_map.since):
-            status = Status.REJECTED if hypothesis.refusal else Status.ACCEPTED
-            out.append(_loop(self._next_key(), hypothesis, status, hypothesis.refusal or "near on the optimised map"))
-        return out
+        near = self._reviser.round(belief, self._whole_map.since)
+        return out + [hypothesis.proposed(self._next_key()) for hypothesis in near]
 
-    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Edge]:
+    def verify(self, doubted: Sequence[Edge], belief: Belief) -> list[Edge]:
         """Register again, from where they lie on the map, nodes whose loop a back-end holds for false."""
-        out = []
-        for d in doubted:
-            hypothesis = self._reviser.register(d.source, d.target, belief.poses_map_node)
-            status = Status.REJECTED if hypothesis.refusal else Status.ACCEPTED
-            out.append(_loop(d.key, hypothesis, status, hypothesis.refusal or "agrees with the map"))
-        return out
+        poses = belief.poses_map_node
+        return [self._reviser.register(d.source, d.target, poses, Search.AGAIN).proposed(d.key) for d in doubted]
 
     def retrace(self, belief: Belief) -> Anchors:
         """Register every scan to the final map."""
@@ -174,14 +166,15 @@ class LaserFrontEnd:
         return ((seen.motion, self._cloud(seen.scan)) for seen in self._between)
 
     def _registration(self, node: int, step: Step) -> Edge:
-        return Edge(
-            source=node - 1,
-            target=node,
-            kind=EdgeKind.REGISTRATION,
-            status=Status.ACCEPTED if step.measured else Status.REJECTED,
-            reason=step.reason,
-            relative=step.relative if step.measured else None,
-            scores={"inliers": step.inliers, "fit": step.fit},
+        return Edge.decided(
+            node - 1,
+            node,
+            EdgeKind.REGISTRATION,
+            step.relative if step.measured else None,
+            step.checks,
+            method=Method.SCANS,
+            search=Search.CHAIN,
+            figures={"inliers": step.inliers, "fit": step.fit},
             key=self._next_key(),
             contradicts_odometry=step.contradicts_odometry,
         )
@@ -191,12 +184,3 @@ def create(config: VisionConfig, rig: Rig, seed: int, clock: StageClock) -> Lase
     """As `vision.Factory`; nothing here is random, and nothing has a stage of its own."""
     del seed, clock
     return LaserFrontEnd(config, rig.sensors[LASER.sensor_name])
-
-
-def _loop(key: int, h: Hypothesis, status: Status, reason: str) -> Edge:
-    return Edge(h.probe, h.anchor, EdgeKind.LOOP, status, reason, h.relative, h.scores, key=key)
-
-
-def _settled(settled: Settled) -> Edge:
-    status = Status.ACCEPTED if settled.accepted else Status.REJECTED
-    return _loop(settled.key, settled.hypothesis, status, settled.reason)

@@ -8,13 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybridmap.config.laser import LaserConfig
-from hybridmap.geometry import IDENTITY, Array, RelativePose, between, inverse, invert_relative, wrap_angle
+from hybridmap.geometry import IDENTITY, Array, RelativePose, between, invert_relative, wrap_angle
+from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, passed
 from hybridmap.streams.laser import Laser
 from hybridmap.vision.base import Belief
+from hybridmap.vision.laser import checks
 from hybridmap.vision.laser.likelihood import STEP_DEG, STEP_M, Start, sharpened, spaced, square, survivors
-from hybridmap.vision.laser.registration import Alignment, align, second_mode
+from hybridmap.vision.laser.registration import align, ambiguity_of
 from hybridmap.vision.laser.submap import Atlas, Field, Submap
-from hybridmap.vision.laser.visibility import violation
+from hybridmap.vision.laser.visibility import violation_both_ways
 
 REGISTERED_POINTS = 400
 UNKNOWN = 1e8
@@ -32,8 +34,11 @@ class Hypothesis:
         relative: pose of the anchor in the frame of the probe.
         quality: near x fit.
         sigma_m: standard deviation of the gate's position there.
-        scores: every figure of the verification.
-        refusal: why it is no hypothesis; empty if it is one.
+        search: how the two submaps came to be compared.
+        checks: that the registration was held against, in their order; it is no hypothesis if one failed.
+        figures: the further figures of the registration.
+        fits: whether the scans fit, be it at the right place or not.
+        misfit: share of the points that do not fit, and of those that are seen through.
     """
 
     probe: int
@@ -41,8 +46,31 @@ class Hypothesis:
     relative: RelativePose
     quality: float
     sigma_m: float
-    scores: dict[str, float]
-    refusal: str
+    search: Search
+    checks: tuple[Check, ...]
+    figures: dict[str, float]
+    fits: bool
+    misfit: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether it is a hypothesis."""
+        return passed(self.checks)
+
+    def proposed(self, key: int, lack: Lack | None = None) -> Edge:
+        """The edge that it stands for, with what it lacks beside checks."""
+        return Edge.decided(
+            self.probe,
+            self.anchor,
+            EdgeKind.LOOP,
+            self.relative,
+            self.checks,
+            lack if self.passed else None,
+            method=Method.SCANS,
+            search=self.search,
+            figures=self.figures,
+            key=key,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +113,7 @@ class Prober:
         self._anchors: list[int] = []
 
     def probe(self, node: int, belief: Belief, since: int = 0) -> list[Hypothesis]:
-        """Search the old submaps inside the gate for the last metres before a node; those refused carry the reason.
+        """Search the old submaps inside the gate for the last metres before a node; those that fail a check among them.
 
         Args:
             node: the newest node of the probe.
@@ -100,13 +128,13 @@ class Prober:
         gates = self._gates(probe.anchor, int(recent[0]), since, belief)
         modes = self._search(gates, probe)
         sure = all(mode.gate.sigma_m < self._config.commitment.sure_sigma_m for mode in modes)
-        return _distinct([self._verify(mode, probe) for mode in modes[: c.modes_sure if sure else c.modes]])
+        return _distinct([self._verify(mode, probe, Search.GATE) for mode in modes[: c.modes_sure if sure else c.modes]])
 
     def probe_anywhere(self, probe: Submap, anchors: Sequence[int]) -> list[Hypothesis]:
         """Hold a submap against those about some anchors, wherever the map has it and whatever its heading."""
         gates = [_Gate(anchor, IDENTITY, UNKNOWN, np.pi, UNKNOWN) for anchor in anchors]
         modes = self._search(gates, probe)[: self._config.relocalising.modes]
-        return _distinct([self._verify(mode, probe) for mode in modes])
+        return _distinct([self._verify(mode, probe, Search.WHOLE_MAP) for mode in modes])
 
     def anchors_before(self, node: int) -> list[int]:
         """Anchors of old submaps that lie wholly before a node."""
@@ -171,56 +199,29 @@ class Prober:
         starts = sharpened(sharp, probe.cloud.thinned(c.points).points, candidate.starts, c.modes_per_target)
         return [_Mode(candidate.gate, candidate.target, start.pose, start.score) for start in starts]
 
-    def _verify(self, mode: _Mode, probe: Submap) -> Hypothesis:
-        c = self._config.probes
+    def _verify(self, mode: _Mode, probe: Submap, search: Search) -> Hypothesis:
+        c, gate = self._config.probes, mode.gate
         cloud, field = probe.cloud.thinned(REGISTERED_POINTS), self._atlas.fine_field(mode.target)
         alignment = align(field, cloud, mode.pose[None], self._config.registration)
-        pose = alignment.poses[0]
-        scores = {
-            "start": mode.score,
-            "near": float(alignment.near[0]),
-            "fit": float(alignment.fit[0]),
-            "inliers": float(alignment.inliers[0]),
-            "rms_m": float(alignment.rms_m[0]),
-            "gate_sigma_m": mode.gate.sigma_m,
-        }
+        pose, near, fit = alignment.poses[0], float(alignment.near[0]), float(alignment.fit[0])
         covariance = alignment.covariance(0, self._config.registration, c.floor_m, np.deg2rad(c.floor_deg))
-        scores["loosest_m"] = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1]))
-        scores["ambiguity"] = second_mode(field, cloud, alignment)
-        refusal = self._refusal(mode, alignment, scores)
-        if not refusal:
-            refusal = self._free_space(mode.target, probe, pose, scores)
-        relative = invert_relative(self._atlas.joining(mode.gate.anchor, pose, covariance, probe.anchor))
-        quality = scores["near"] * scores["fit"]
-        return Hypothesis(probe.anchor, mode.gate.anchor, relative, quality, mode.gate.sigma_m, scores, refusal)
-
-    def _refusal(self, mode: _Mode, alignment: Alignment, scores: dict[str, float]) -> str:
-        c, pose = self._config.probes, alignment.poses[0]
-        off_m = float(np.hypot(*(pose - mode.gate.expected)[:2]))
-        off_rad = abs(float(wrap_angle(pose[2] - mode.gate.expected[2])))
-        scores["off_m"], scores["off_deg"] = off_m, float(np.rad2deg(off_rad))
-        if scores["near"] < c.near_min:
-            return f"near {scores['near']:.2f} < {c.near_min}"
-        if scores["fit"] < c.fit_min:
-            return f"fit {scores['fit']:.2f} < {c.fit_min}"
-        if off_m > mode.gate.radius_m or off_rad > mode.gate.heading_rad:
-            return f"{off_m:.2f} m, {np.rad2deg(off_rad):.1f} deg from the expected pose: outside the gate"
-        if scores["loosest_m"] > c.loosest_max_m:
-            return f"free along one direction: {scores['loosest_m']:.2f} m > {c.loosest_max_m} m"
-        if scores["ambiguity"] > c.ambiguity_max:
-            return (
-                f"ambiguity {scores['ambiguity']:.2f} > {c.ambiguity_max}: lies as well elsewhere along its weakest direction"
-            )
-        return ""
-
-    def _free_space(self, target: Submap, probe: Submap, pose: Array, scores: dict[str, float]) -> str:
-        c, ranges = self._config.probes, self._atlas.ranges
-        forth = violation(probe, target, pose, ranges, self._laser)
-        back = violation(target, probe, inverse(pose), ranges, self._laser)
-        scores["violation"] = max(forth, back)
-        if scores["violation"] > c.violation_max:
-            return f"free space violated by {scores['violation']:.2f} > {c.violation_max}"
-        return ""
+        loosest_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1]))
+        figures = {"start": mode.score, "inliers": float(alignment.inliers[0]), "rms_m": float(alignment.rms_m[0])}
+        asked, seen = checks.of_fit(near, fit, c), 0.0
+        fits = passed(asked)
+        if search is Search.GATE:
+            figures["gate_sigma_m"] = gate.sigma_m
+            off_m = float(np.hypot(*(pose - gate.expected)[:2]))
+            off_deg = float(np.rad2deg(abs(wrap_angle(pose[2] - gate.expected[2]))))
+            asked += checks.of_gate(off_m, off_deg, gate.radius_m, np.rad2deg(gate.heading_rad))
+        asked += checks.of_place(loosest_m, ambiguity_of(field, cloud, alignment), c)
+        if passed(asked):
+            seen = violation_both_ways(probe, mode.target, pose, self._atlas.ranges, self._laser)
+            asked += checks.of_free_space(seen, c)
+        relative = invert_relative(self._atlas.joining(gate.anchor, pose, covariance, probe.anchor))
+        return Hypothesis(
+            probe.anchor, gate.anchor, relative, near * fit, gate.sigma_m, search, asked, figures, fits, 1.0 - fit + seen
+        )
 
 
 def _distinct(found: list[Hypothesis]) -> list[Hypothesis]:

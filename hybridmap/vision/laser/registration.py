@@ -79,7 +79,7 @@ class Alignment:
         return np.asarray(out)
 
 
-def second_mode(field: LikelihoodField, cloud: Cloud, alignment: Alignment, k: int = 0) -> float:
+def ambiguity_of(field: LikelihoodField, cloud: Cloud, alignment: Alignment, k: int = 0) -> float:
     """Share of registration k's likelihood that the cloud keeps when it is shifted along its weakest direction."""
     pose = alignment.poses[k]
     weakest = alignment.weakest_direction(k)

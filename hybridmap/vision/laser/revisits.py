@@ -6,14 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.laser import LaserConfig
-from hybridmap.geometry import Array, between, inverse, invert_relative, wrap_angle
+from hybridmap.geometry import Array, between, invert_relative, wrap_angle
+from hybridmap.graph.edges import Search, passed
 from hybridmap.streams.laser import Laser
 from hybridmap.vision.base import Belief
+from hybridmap.vision.laser import checks
 from hybridmap.vision.laser.hypotheses import Hypothesis
 from hybridmap.vision.laser.likelihood import score_starts, spaced, square
-from hybridmap.vision.laser.registration import Prior, align, second_mode
-from hybridmap.vision.laser.submap import Atlas, Field, Submap
-from hybridmap.vision.laser.visibility import violation
+from hybridmap.vision.laser.registration import Prior, align, ambiguity_of
+from hybridmap.vision.laser.submap import Atlas, Field
+from hybridmap.vision.laser.visibility import violation_both_ways
 
 
 class Reviser:
@@ -65,8 +67,8 @@ class Reviser:
                 chosen.append(other)
         return [o for o in chosen[: c.partners] if (node, o) not in self._done]
 
-    def register(self, node: int, other: int, poses: Array) -> Hypothesis:
-        """Register the scans about a node to those about an older one, from where the poses (N, 3) have them."""
+    def register(self, node: int, other: int, poses: Array, search: Search = Search.NEAR) -> Hypothesis:
+        """Register the scans about a node to those about an older one, from where the poses (N, 3) have them; `search`: why."""
         c, settings = self._config.revisits, self._config.registration
         target, probe = self._atlas.around(other, c.target_half_m), self._atlas.around(node, c.probe_half_m)
         sharp, fine = self._atlas.scoring_field(target, Field.SHARP), self._atlas.fine_field(target)
@@ -80,34 +82,18 @@ class Reviser:
         alignment = align(fine, probe.cloud.thinned(300), start[None], settings, prior)
         covariance = alignment.covariance(0, settings, c.floor_m, np.deg2rad(c.floor_deg))
         pose = alignment.poses[0]
-        doubt = second_mode(fine, probe.cloud, alignment)
-        if doubt > self._config.probes.ambiguity_max:
+        near, fit, off = float(alignment.near[0]), float(alignment.fit[0]), pose - expected
+        ambiguity = ambiguity_of(fine, probe.cloud, alignment)
+        if ambiguity > self._config.probes.ambiguity_max:
             weakest = alignment.weakest_direction(0)
             covariance[:2, :2] += c.ambiguous_m**2 * np.outer(weakest, weakest)
-        figures = {
-            "near": float(alignment.near[0]),
-            "fit": float(alignment.fit[0]),
-            "second_mode": doubt,
-            "off_m": float(np.hypot(*(pose - expected)[:2])),
-            "off_deg": float(np.rad2deg(abs(wrap_angle(pose[2] - expected[2])))),
-        }
-        refusal = self._refusal(figures) or self._free_space(target, probe, pose, figures)
+        asked, seen = checks.of_fit(near, fit, self._config.probes), 0.0
+        fits = passed(asked)
+        off_deg = float(np.rad2deg(abs(wrap_angle(off[2]))))
+        asked += checks.of_gate(np.hypot(*off[:2]), off_deg, checks.OFF_MAX_M, checks.OFF_MAX_DEG)
+        if passed(asked):
+            seen = violation_both_ways(probe, target, pose, self._atlas.ranges, self._laser)
+            asked += checks.of_free_space(seen, self._config.probes)
         relative = invert_relative(self._atlas.joining(other, pose, covariance, node))
-        return Hypothesis(node, other, relative, figures["near"] * figures["fit"], 0.0, figures, refusal)
-
-    def _refusal(self, figures: dict[str, float]) -> str:
-        c = self._config.probes
-        if figures["near"] < c.near_min:
-            return f"near {figures['near']:.2f} < {c.near_min}"
-        if figures["fit"] < c.fit_min:
-            return f"fit {figures['fit']:.2f} < {c.fit_min}"
-        if figures["off_m"] > 1.0 or figures["off_deg"] > 10.0:
-            return f"{figures['off_m']:.2f} m, {figures['off_deg']:.1f} deg from the map"
-        return ""
-
-    def _free_space(self, target: Submap, probe: Submap, pose: Array, figures: dict[str, float]) -> str:
-        limit, ranges = self._config.probes.violation_max, self._atlas.ranges
-        forth = violation(probe, target, pose, ranges, self._laser)
-        back = violation(target, probe, inverse(pose), ranges, self._laser)
-        figures["violation"] = max(forth, back)
-        return f"free space violated by {figures['violation']:.2f} > {limit}" if figures["violation"] > limit else ""
+        figures = {"ambiguity": ambiguity}
+        return Hypothesis(node, other, relative, near * fit, 0.0, search, asked, figures, fits, 1.0 - fit + seen)

@@ -9,6 +9,8 @@ import numpy as np
 
 from hybridmap.config.laser import LaserConfig, SearchConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, wrap_angle
+from hybridmap.graph.edges import Check, passed
+from hybridmap.vision.laser import checks
 from hybridmap.vision.laser.cloud import Cloud, merged
 from hybridmap.vision.laser.likelihood import LikelihoodField, build_field, score_starts, spaced, square
 from hybridmap.vision.laser.registration import Alignment, Prior, align
@@ -24,20 +26,23 @@ class Step:
 
     Attributes:
         relative: pose of the new node in the frame of the one before; the odometry's where nothing was measured.
-        measured: whether it comes from a registration.
         contradicts_odometry: a good registration says that the odometry is wrong.
+        checks: that the registration was held against; the motion is the odometry's if one failed.
         inliers, fit: of the registration.
-        reason: one line for people.
         scatter: covariance (3, 3) of the new node's place in the submap.
     """
 
     relative: RelativePose
-    measured: bool
+    checks: tuple[Check, ...]
     contradicts_odometry: bool
     inliers: float
     fit: float
-    reason: str
     scatter: Array
+
+    @property
+    def measured(self) -> bool:
+        """Whether it comes from a registration."""
+        return passed(self.checks)
 
 
 class Tracker:
@@ -132,19 +137,15 @@ class Tracker:
         c = self._config.tracking
         pose, inliers, fit = alignment.poses[0], float(alignment.inliers[0]), float(alignment.fit[0])
         off_m = float(np.hypot(*(pose - odometry.delta)[:2]))
-        if inliers < c.inliers_weak:
-            reason = f"inliers {inliers:.2f} < {c.inliers_weak}: odometry kept"
-            return Step(odometry, False, False, inliers, fit, reason, odometry.covariance)
-        if off_m > c.translation_max_m and inliers < c.inliers_min:
-            reason = f"{off_m:.2f} m from the odometry > {c.translation_max_m} m"
-            return Step(odometry, False, False, inliers, fit, reason, odometry.covariance)
+        asked = checks.of_step(inliers, off_m, c)
+        if not passed(asked):
+            return Step(odometry, asked, False, inliers, fit, odometry.covariance)
         covariance = alignment.covariance(0, self._config.registration, c.floor_m, np.deg2rad(c.floor_deg))
         if self._doubtful(alignment, odometry.delta):
             covariance = covariance + np.diag([0.05**2, 0.05**2, np.deg2rad(1.5) ** 2])
-        wrong = inliers >= c.inliers_min and self._contradicts(pose, odometry.delta)
-        reason = "contradicts the odometry" if wrong else "agrees with the odometry"
+        wrong = bool(inliers >= c.inliers_min and self._contradicts(pose, odometry.delta))
         edge = self._atlas.joining(len(self._atlas) - 1, pose, covariance)
-        return Step(edge, True, wrong, inliers, fit, f"inliers {inliers:.2f}, {reason}", covariance)
+        return Step(edge, asked, wrong, inliers, fit, covariance)
 
 
 def _better(first: Alignment, second: Alignment, gain: float) -> Alignment:

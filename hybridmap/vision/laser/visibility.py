@@ -41,6 +41,14 @@ def violation(
     return float((2.0 * through > seen)[judged].mean()) if judged.any() else 0.0
 
 
+def violation_both_ways(
+    here: Submap, there: Submap, pose_there_here: Array, ranges: Sequence[NDArray[np.float32]], laser: Laser
+) -> float:
+    """The larger share of the two, each submap looking at the walls of the other."""
+    forth = violation(here, there, pose_there_here, ranges, laser)
+    return max(forth, violation(there, here, inverse(pose_there_here), ranges, laser))
+
+
 def _look(cloud: Cloud, poses_laser_cloud: Array, ranges_m: NDArray[np.float32], laser: Laser) -> tuple[Marks, Marks]:
     """Which points of a cloud each of some scans looks through, and which it sees as walls; (V, P) each.
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from hybridmap.config.laser import LaserConfig
-from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.edges import Check, Edge, Lack
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import Chain, Whereabouts
 from hybridmap.vision.laser.continuity import RECENT_M, Continuity
@@ -22,8 +22,6 @@ MISFIT_STEPS = 10
 """Steps for which the usual misfit of scans is taken before any was seen."""
 ALIKE = (0.5, 0.5)
 """Weights of intensity and depth where views are ranked: a laser's profile has the one band, and they do not matter."""
-GATED = ("gate_sigma_m", "off_m", "off_deg")
-"""Figures of a hypothesis that mean nothing where there is no gate."""
 
 
 class WholeMap:
@@ -49,8 +47,7 @@ class WholeMap:
         self._new_key = new_key
         self._continuity = continuity
         self._whereabouts = Whereabouts(config.relocalising.unrecognised_probes)
-        given_up = "too few other submaps put the robot there"
-        self._relocaliser = Relocaliser(config.relocalising, self._whereabouts, new_key, given_up)
+        self._relocaliser = Relocaliser(config.relocalising, self._whereabouts, new_key, "vision.laser.relocalising")
         self._views = Matcher("plain", *ALIKE, max_shift=config.scan.profile_width // 4)
         self._misfits, self._steps = MISFIT_STEPS * config.relocalising.misfit, MISFIT_STEPS
         self._broken_at: int | None = None
@@ -66,25 +63,25 @@ class WholeMap:
         """The first node of the piece of map that the robot surely is on: 0, or where the chain broke."""
         return self._broken_at or 0
 
-    def tracked(self, registration: Edge, why: str) -> Edge:
+    def tracked(self, registration: Edge, broken_by: tuple[Check, ...]) -> Edge:
         """Take notice of how the newest node of the atlas was registered; a new piece begins with it if the chain broke.
 
         Args:
             registration: of the newest node to those before it.
-            why: why the robot cannot have driven there; empty where the chain holds.
+            broken_by: the checks that say that the robot did not drive there; empty where the chain holds.
 
         Returns:
-            The registration with the reason.
+            The registration with these checks.
         """
         node = registration.target
-        if why:
+        if broken_by:
             self._atlas.part(node)
             self._broken_at = node
             self._lost_m, self._searched_m = self._atlas.travel_m[node], -np.inf
-            registration = replace(registration, reason=f"{registration.reason}; may have been carried: {why}")
+            registration = replace(registration, broken_by=broken_by)
         else:
-            self._misfits, self._steps = self._misfits + 1.0 - registration.scores["fit"], self._steps + 1
-        self._relocaliser.tracked(node, Chain.BROKEN if why else Chain.HOLDS, [registration])
+            self._misfits, self._steps = self._misfits + 1.0 - registration.figures["fit"], self._steps + 1
+        self._relocaliser.tracked(node, Chain.BROKEN if broken_by else Chain.HOLDS, [registration])
         return registration
 
     def probed(self, node: int, hypotheses: Sequence[Hypothesis], belief: Belief) -> None:
@@ -92,12 +89,11 @@ class WholeMap:
 
         A bare corridor fits, if anywhere along itself: that says neither.
         """
-        c = self._config.probes
         if self._broken_at is not None:
             return
-        if any(not h.refusal for h in hypotheses):
+        if any(h.passed for h in hypotheses):
             self._whereabouts.recognised()
-        elif any(h.scores["near"] >= c.near_min and h.scores["fit"] >= c.fit_min for h in hypotheses):
+        elif any(h.fits for h in hypotheses):
             return
         elif self._continuity.contradicted(node, belief):
             if not self._whereabouts.lost:
@@ -109,7 +105,7 @@ class WholeMap:
         if self._broken_at is not None:
             return []
         self._whereabouts.recognised()
-        return self._relocaliser.dismiss("the robot is where the map had it")
+        return self._relocaliser.dismiss(Lack.NOT_LOST)
 
     def finish(self) -> list[Edge]:
         """The drive is over: sightings that still wait are refused."""
@@ -148,14 +144,12 @@ class WholeMap:
         return [anchors[i] for i in sorted(likeliest)]
 
     def _sighting(self, h: Hypothesis) -> Edge:
-        scores = {name: value for name, value in h.scores.items() if name not in GATED} | {"whole_map": 1.0}
-        status, reason = Status.REJECTED, h.refusal
-        if not h.refusal:
-            misfit = self._misfits / self._steps
-            worse = max(1.0, self._config.relocalising.misfit / misfit)
-            scores["mismatch"] = worse * (1.0 - scores["fit"] + scores["violation"])
-            status, reason = Status.PENDING, "lost: waits for other submaps that put the robot there"
-        return Edge(h.probe, h.anchor, EdgeKind.LOOP, status, reason, h.relative, scores, key=self._new_key())
+        """What fits is a sighting; it fits the worse, the better the scans of this drive fit one another."""
+        sighting = h.proposed(self._new_key(), Lack.WAITING)
+        if not h.passed:
+            return sighting
+        worse = max(1.0, self._config.relocalising.misfit / (self._misfits / self._steps))
+        return replace(sighting, figures={**h.figures, "mismatch": worse * h.misfit})
 
     def _found(self, settlement: Settlement, belief: Belief) -> Settlement:
         """The robot knows where it is; where nothing had shown when it was carried, find that out."""

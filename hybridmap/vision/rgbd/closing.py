@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 from hybridmap.config.rgbd import RgbdConfig
 from hybridmap.config.vision import MatchingConfig, RelocalisingConfig
 from hybridmap.geometry import Array, RelativePose, between, wrap_angle
-from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status
 from hybridmap.metrics import StageClock
-from hybridmap.vision.base import Belief, Doubted
+from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import Gate, Whereabouts, nodes_within
 from hybridmap.vision.profile import Profile
 from hybridmap.vision.relocalising import Relocaliser
+from hybridmap.vision.rgbd import checks
 from hybridmap.vision.rgbd.keyframe import Keyframe
-from hybridmap.vision.rgbd.pnp import Verification, Verifier
+from hybridmap.vision.rgbd.pnp import Candidate, Verification, Verifier
 from hybridmap.vision.rgbd.revisits import Revisits
 from hybridmap.vision.rgbd.second_look import SecondLook
 from hybridmap.vision.rgbd.support import Hypothesis, Support
@@ -56,7 +57,7 @@ class LoopCloser:
             config.matching, matching.mu_r, matching.mu_d, matching.max_shift, matching.g_bar, matching.sequence
         )
         whereabouts = Whereabouts(relocalising.unrecognised_nodes, relocalising.doubt_nodes)
-        self._relocaliser = Relocaliser(relocalising, whereabouts, new_key, "too few others put the robot there")
+        self._relocaliser = Relocaliser(relocalising, whereabouts, new_key, "vision.relocalising")
         self._whole_map = WholeMap(keyframes, self._matcher, verifier, relocalising, new_key)
         self._relocalising = relocalising
         unverified = config.verify == "none"
@@ -124,7 +125,7 @@ class LoopCloser:
         whereabouts = self._relocaliser.whereabouts
         if any(p.status is Status.ACCEPTED for p in changed):
             whereabouts.recognised()
-            return self._relocaliser.dismiss("the robot is where the map had it")
+            return self._relocaliser.dismiss(Lack.NOT_LOST)
         near, turn = self._relocalising.known_m, np.deg2rad(self._relocalising.known_deg)
         if len(np.intersect1d(nodes_within(belief.poses_map_node, node, near, turn), gated)):
             whereabouts.unrecognised()
@@ -154,15 +155,14 @@ class LoopCloser:
         out += self._relocaliser.dismiss()
         return [*out, *self._support.give_up(before=len(self._keyframes))]
 
-    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Edge]:
+    def verify(self, doubted: Sequence[Edge], belief: Belief) -> list[Edge]:
         """Measure doubted loops again; `belief` is that of the map without them."""
         if self._config.verify == "none":
             return []
         out = []
         for d in doubted:
             found = self._second_look.measure(d, belief)
-            status = Status.REJECTED if found.relative is None else Status.ACCEPTED
-            out.append(Edge(d.source, d.target, EdgeKind.LOOP, status, found.reason, found.relative, found.scores, key=d.key))
+            out.append(found.proposed(d.source, d.target, d.key, Candidate(Search.AGAIN)))
             self._support.replace(out[-1])
         return out
 
@@ -191,42 +191,43 @@ class LoopCloser:
         self._gate_of_newest = Gate(*widths, int(old.sum()), int(inside.sum()))
         return np.flatnonzero(inside).astype(np.int64)
 
-    def _ranked(self, node: int, gated: Indices) -> dict[int, dict[str, float]]:
-        """The best candidates by profile, some nodes apart, with their scores."""
+    def _ranked(self, node: int, gated: Indices) -> dict[int, Candidate]:
+        """The best candidates by profile, some nodes apart, with their figures."""
         ranked = RANKED * self._closing.candidates
         with self._clock.stage("search"):
             match = self._matcher.best(self._keyframes[node].profile, ranked, gated, ending_at=node)
         self._ranking = np.column_stack([match.indices, match.score, match.shift])
-        chosen: dict[int, dict[str, float]] = {}
+        chosen: dict[int, Candidate] = {}
         for i, target in enumerate(match.indices.tolist()):
             if self._c_t is not None and match.score[i] >= self._c_t:
                 break
             if all(abs(target - other) >= self._closing.separation for other in chosen):
-                chosen[target] = {"profile_G": float(match.score[i]), "shift": float(match.shift[i])}
+                profile = {"profile_G": float(match.score[i])}
+                chosen[target] = Candidate(Search.GATE, int(match.shift[i]), profile)
             if len(chosen) == self._closing.candidates:
                 break
         return chosen
 
-    def _try_candidates(self, node: int, ranked: dict[int, dict[str, float]], belief: Belief) -> list[Edge]:
+    def _try_candidates(self, node: int, ranked: dict[int, Candidate], belief: Belief) -> list[Edge]:
         """Measure each candidate, the best first, until enough have entered."""
         if self._config.verify == "none":
             return self._accept_unverified(node, ranked, belief)
         out: list[Edge] = []
         entered = 0
-        for target, scores in ranked.items():
+        for target, candidate in ranked.items():
             if entered == self._closing.accept:
                 break
             self._tried.add((node, target))
             found = self._verifier.verify(self._keyframes[node], self._keyframes[target])
-            changed = self._file(node, target, scores, found, belief)
+            changed = self._file(node, target, candidate, found, belief)
             entered += changed[0].status is Status.ACCEPTED
             out += changed
         return out
 
-    def _try_again(self, node: int, near: dict[int, dict[str, float]], belief: Belief, by_depth: Collection[int]) -> list[Edge]:
+    def _try_again(self, node: int, near: dict[int, Candidate], belief: Belief, by_depth: Collection[int]) -> list[Edge]:
         """Measure pairs that the map puts side by side: by features if that was not tried, else some by depth."""
         out: list[Edge] = []
-        for target, scores in near.items():
+        for target, candidate in near.items():
             found: Verification | None = None
             if (node, target) not in self._tried:
                 self._tried.add((node, target))
@@ -235,22 +236,20 @@ class LoopCloser:
                 guess = RelativePose(between(belief.poses_map_node[node], belief.poses_map_node[target]), self._map_covariance)
                 found = self._verifier.verify_on_map(self._keyframes[node], self._keyframes[target], guess)
             if found is not None:
-                out += self._file(node, target, scores, found, belief)
+                out += self._file(node, target, candidate, found, belief)
         return out
 
-    def _file(self, node: int, target: int, scores: dict[str, float], found: Verification, belief: Belief) -> list[Edge]:
+    def _file(self, node: int, target: int, candidate: Candidate, found: Verification, belief: Belief) -> list[Edge]:
         """Turn a verification into proposals: its own first, then those that it supports."""
-        scores = {**scores, **found.scores}
-        proposal = Edge(node, target, EdgeKind.LOOP, Status.REJECTED, found.reason, found.relative, scores, key=self._new_key())
+        waiting = found.proposed(node, target, self._new_key(), candidate, Lack.WAITING)
         if found.relative is None:
-            return [proposal]
-        waiting = replace(proposal, status=Status.PENDING, reason="waits for support")
-        changed = self._support.file(Hypothesis(waiting, found.relative, found.reason), belief)
+            return [waiting]
+        changed = self._support.file(Hypothesis(waiting, found.relative), belief)
         if changed[0].status is Status.ACCEPTED:
             self._travel_at_closure = max(self._travel_at_closure, float(belief.travel_m[node]))
         return changed
 
-    def _nearest(self, node: int, most: int, belief: Belief) -> dict[int, dict[str, float]]:
+    def _nearest(self, node: int, most: int, belief: Belief) -> dict[int, Candidate]:
         """Earlier nodes that see the same place from nearly the same pose and are not joined to this one yet, nearest first."""
         poses = belief.poses_map_node
         gap = np.hypot(*(poses[:node, :2] - poses[node, :2]).T)
@@ -258,24 +257,36 @@ class LoopCloser:
         old = belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s
         near = old & (gap <= self._closing.repropose_m) & (turned <= np.deg2rad(self._closing.heading_deg))
         cost = gap + turned
-        chosen: dict[int, dict[str, float]] = {}
+        chosen: dict[int, Candidate] = {}
         for i in np.argsort(np.where(near, cost, np.inf), kind="stable")[: int(near.sum())]:
             target = int(i)
             if self._support.has(node, target):
                 continue
             if all(abs(target - other) >= self._closing.separation for other in chosen):
-                chosen[target] = {"map_distance_m": float(gap[i])}
+                chosen[target] = Candidate(Search.NEAR, figures={"map_distance_m": float(gap[i])})
             if len(chosen) == most:
                 break
         return chosen
 
-    def _accept_unverified(self, node: int, ranked: dict[int, dict[str, float]], belief: Belief) -> list[Edge]:
+    def _accept_unverified(self, node: int, ranked: dict[int, Candidate], belief: Belief) -> list[Edge]:
         """The seed's way: the best match is a closure; its shift gives the yaw, and nothing gives the translation."""
-        for target, scores in ranked.items():
-            delta = np.array([0.0, 0.0, self._yaw_of_shift(int(scores["shift"]))])
+        for target, candidate in ranked.items():
+            delta = np.array([0.0, 0.0, self._yaw_of_shift(candidate.shift)])
             sigma = np.array([self._closing.shift_sigma_m] * 2 + [np.deg2rad(self._closing.shift_sigma_deg)])
             relative = RelativePose(delta, np.diag(sigma**2))
             self._travel_at_closure = float(belief.travel_m[node])
-            reason = "profile below c_t, not verified"
-            return [Edge(node, target, EdgeKind.LOOP, Status.ACCEPTED, reason, relative, scores, key=self._new_key())]
+            asked = () if self._c_t is None else checks.of_profile(candidate.figures["profile_G"], self._c_t)
+            edge = Edge.decided(
+                node,
+                target,
+                EdgeKind.LOOP,
+                relative,
+                asked,
+                method=Method.PROFILE,
+                search=candidate.search,
+                shift=candidate.shift,
+                figures=candidate.figures,
+                key=self._new_key(),
+            )
+            return [edge]
         return []

@@ -16,7 +16,7 @@ from hybridmap.graph.edges import Edge
 from hybridmap.metrics import StageClock
 from hybridmap.streams.base import Observation, Rig
 from hybridmap.streams.rgbd import RGBD, Camera, RgbdFrame
-from hybridmap.vision.base import Belief, Doubted, View
+from hybridmap.vision.base import Belief, View
 from hybridmap.vision.profile import image_profile
 from hybridmap.vision.rgbd.closing import LoopCloser
 from hybridmap.vision.rgbd.depth_grid import make_grid, place
@@ -125,7 +125,7 @@ class RgbdFrontEnd:
         """Re-propose on the optimised map; settle what is pending."""
         return self._closer.finish(belief)
 
-    def verify(self, doubted: Sequence[Doubted], belief: Belief) -> list[Edge]:
+    def verify(self, doubted: Sequence[Edge], belief: Belief) -> list[Edge]:
         """Measure again, from where their nodes lie on the map, loops that a back-end holds for false."""
         return self._closer.verify(doubted, belief)
 

@@ -79,9 +79,3 @@ def image_profile_again(
         return None
     image = working_image(frame, working_factor(camera, max_width_px))
     return image_profile(image.grey, image.depth_m, settings.width, bands, settings.normalise)
-
-
-def tilt_measured(kept: Mapping[str, NDArray[np.generic]], rig: Rig) -> bool:
-    """Whether the camera's tilt was measured at a stored keyframe and not taken from the mounting."""
-    camera, own = rig.sensors.get(RGBD.sensor_name), kept.get("T_base_camera")
-    return camera is not None and own is not None and not np.allclose(own, camera.T_base_camera, atol=1e-6)

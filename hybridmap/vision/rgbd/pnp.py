@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.rgbd import FeaturesConfig, PnpConfig, RegistrationConfig
 from hybridmap.geometry import Array, RelativePose, between, loosest_direction, wrap_angle
+from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, passed
 from hybridmap.streams.rgbd import Camera
+from hybridmap.vision.rgbd import checks
 from hybridmap.vision.rgbd.depth_registration import Registration, register
 from hybridmap.vision.rgbd.features import Correspondences, match
 from hybridmap.vision.rgbd.keyframe import Keyframe
@@ -24,12 +26,53 @@ GUESSED = 2.0
 
 
 @dataclass(frozen=True, slots=True)
+class Candidate:
+    """Why two views are compared.
+
+    Attributes:
+        search: how they were found.
+        shift: columns by which the older view is shifted against the newer one.
+        figures: of the search.
+    """
+
+    search: Search
+    shift: int = 0
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class Verification:
-    """Outcome: a relative pose of the target in the source's frame, or None with the reason of refusal."""
+    """Outcome: the pose of the target in the source's frame and the record of how it was found.
+
+    Attributes:
+        relative: the pose; None where a check failed, or something was lacking.
+        method: what it was measured by.
+        checks: in the order in which they were asked.
+        lack: what there was too little of; None: nothing.
+        figures: further figures.
+    """
 
     relative: RelativePose | None
-    reason: str
-    scores: Mapping[str, float]
+    method: Method
+    checks: tuple[Check, ...] = ()
+    lack: Lack | None = None
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+    def proposed(self, source: int, target: int, key: int, candidate: Candidate, lack: Lack | None = None) -> Edge:
+        """The loop that it stands for, with what it lacks where it passed."""
+        return Edge.decided(
+            source,
+            target,
+            EdgeKind.LOOP,
+            self.relative,
+            self.checks,
+            lack if self.relative is not None else self.lack,
+            method=self.method,
+            search=candidate.search,
+            shift=candidate.shift,
+            figures={**candidate.figures, **self.figures},
+            key=key,
+        )
 
 
 class Verifier:
@@ -54,25 +97,25 @@ class Verifier:
     def verify(self, source: Keyframe, target: Keyframe) -> Verification:
         """Measure the target's pose in the source's frame, or say why not."""
         pairs = match(source.features, target.features, self._ratio)
-        scores: dict[str, float] = {"matches": float(len(pairs.first))}
-        if len(pairs.first) < self._pnp.min_inliers:
-            return Verification(None, f"only {len(pairs.first)} features match", scores)
+        asked = checks.of_matches(len(pairs.first), self._pnp)
+        if not passed(asked):
+            return Verification(None, Method.FEATURES, asked)
         forward = self.solver.solve(target.features, source.features, pairs.second, pairs.first)
-        scores["inliers"] = float(len(forward.inliers)) if forward else 0.0
-        if forward is None or len(forward.inliers) < self._pnp.min_inliers:
-            return Verification(None, f"only {scores['inliers']:.0f} features agree on a pose", scores)
+        asked += checks.of_pose(len(forward.inliers) if forward else 0, self._pnp)
+        if forward is None or not passed(asked):
+            return Verification(None, Method.FEATURES, asked)
         backward = self.solver.solve(source.features, target.features, pairs.first, pairs.second)
-        scores["inliers_reverse"] = float(len(backward.inliers)) if backward else 0.0
-        if backward is None or len(backward.inliers) < self._pnp.min_inliers:
-            return Verification(None, f"only {scores['inliers_reverse']:.0f} features agree in reverse", scores)
+        asked += checks.of_reverse_pose(len(backward.inliers) if backward else 0, self._pnp)
+        if backward is None or not passed(asked):
+            return Verification(None, Method.FEATURES, asked)
         T = _between_bases(forward.T_image_points, source, target)
         T_reverse = _between_bases(inverse_rigid(backward.T_image_points), source, target)
         flat, reverse = _flat(T, source, target), _flat(T_reverse, source, target)
-        refusal = self._implausible(flat, reverse, source.held or target.held, scores)
-        if refusal is not None:
-            return Verification(None, refusal, scores)
+        asked += self._plane(flat, reverse, source.held or target.held)
+        if not passed(asked):
+            return Verification(None, Method.FEATURES, asked)
         both = np.intersect1d(forward.inliers, backward.inliers)
-        return self._refined(source, target, flat, pairs.first[both], pairs.second[both], scores)
+        return self._refined(source, target, flat, pairs.first[both], pairs.second[both], asked)
 
     def verify_on_map(self, source: Keyframe, target: Keyframe, guess: RelativePose) -> Verification:
         """Measure by depth alone, from where the map has the target (for views that share surfaces but no features).
@@ -83,16 +126,11 @@ class Verifier:
         """
         fit = register(source.surface, target.surface, from_planar(guess.delta), guess, self._registration)
         if fit is None:
-            return Verification(None, "too little depth in common view", {})
-        scores = {"depth_inliers": fit.inliers, "overlap": fit.overlap, "points": float(fit.points), "slack_m": fit.slack_m}
-        if fit.inliers < self._pnp.map_inliers:
-            return Verification(None, f"only {fit.inliers:.0%} of the depth in common view fits", scores)
-        if fit.overlap < self._pnp.map_overlap or fit.points < self._pnp.map_points:
-            return Verification(None, f"only {fit.points} points of depth in common", scores)
-        if fit.slack_m > self._pnp.map_sigma_m:
-            direction = round(np.degrees(loosest_direction(fit.relative.covariance)[1]))
-            return Verification(None, f"depth slides: free along {direction} deg ({fit.slack_m:.2f} m)", scores)
-        return Verification(self._calibrated(fit.relative, source, target), "depth agrees with the map", scores)
+            return Verification(None, Method.DEPTH, lack=Lack.NO_DEPTH)
+        asked = checks.of_depth_alone(fit.inliers, fit.overlap, fit.points, fit.slack_m, self._pnp)
+        if not passed(asked):
+            return Verification(None, Method.DEPTH, asked)
+        return Verification(self._calibrated(fit.relative, source, target), Method.DEPTH, asked)
 
     def verify_near(self, source: Keyframe, target: Keyframe, guess: RelativePose) -> Verification:
         """Measure from where the map has the target: by depth and the features that the guess brings together, else by depth.
@@ -114,25 +152,22 @@ class Verifier:
         if close is None or len(close) < self._pnp.min_inliers:
             return self.verify_on_map(source, target, guess)
         fit = register(source.surface, target.surface, start, guess, self._registration, close)
-        agreeing = 0 if fit is None else close.agreeing(fit.T_fixed_moving)
-        if fit is None or agreeing < self._pnp.min_inliers or fit.inliers < self._registration.min_inliers:
+        if fit is None:
             return self.verify_on_map(source, target, guess)
-        scores = {"inliers": float(agreeing), "depth_inliers": fit.inliers, "overlap": fit.overlap, "points": float(fit.points)}
-        return Verification(self._calibrated(fit.relative, source, target), "features and depth agree with the map", scores)
+        asked = checks.of_pose(close.agreeing(fit.T_fixed_moving), self._pnp)
+        asked += checks.of_depth(fit.inliers, self._registration)
+        if not passed(asked):
+            return self.verify_on_map(source, target, guess)
+        figures = {"overlap": fit.overlap, "points": float(fit.points)}
+        relative = self._calibrated(fit.relative, source, target)
+        return Verification(relative, Method.FEATURES_AND_DEPTH, asked, figures=figures)
 
-    def _implausible(self, flat: FloorPose, reverse: FloorPose, held: bool, scores: dict[str, float]) -> str | None:
-        """Why the two poses cannot be right, or None."""
+    def _plane(self, flat: FloorPose, reverse: FloorPose, held: bool) -> tuple[Check, ...]:
+        """What the poses of both ways round are held against."""
         gap = between(flat.delta, reverse.delta)
         apart_m, apart_deg = float(np.hypot(gap[0], gap[1])), float(np.rad2deg(abs(gap[2])))
         tilt_deg = float(np.rad2deg(flat.tilt_rad))
-        scores |= {"height_m": flat.height_m, "tilt_deg": tilt_deg, "reverse_m": apart_m, "reverse_deg": apart_deg}
-        if abs(flat.height_m) > self._pnp.max_height_m * (3.0 if held else 1.0):
-            return f"off the floor by {abs(flat.height_m):.2f} m"
-        if tilt_deg > self._pnp.max_tilt_deg * (2.0 if held else 1.0):
-            return f"tilted by {tilt_deg:.1f} deg"
-        if apart_m > self._pnp.agree_m or apart_deg > self._pnp.agree_deg:
-            return f"the two directions differ by {apart_m:.2f} m, {apart_deg:.1f} deg"
-        return None
+        return checks.of_plane(abs(flat.height_m), tilt_deg, apart_m, apart_deg, held, self._pnp)
 
     def _refined(
         self,
@@ -141,7 +176,7 @@ class Verifier:
         flat: FloorPose,
         first: NDArray[np.int64],
         second: NDArray[np.int64],
-        scores: dict[str, float],
+        asked: tuple[Check, ...],
     ) -> Verification:
         pairs = point_pairs(source, target, Correspondences(first, second), self._focal_px, self._registration.depth_sigma)
         rough = RelativePose(flat.delta, np.diag([0.1, 0.1, np.deg2rad(3.0)]) ** 2)
@@ -150,24 +185,22 @@ class Verifier:
             start = from_planar(flat.delta)
             fit = register(source.surface, target.surface, start, rough, self._registration, pairs)
         if fit is None:
-            return self._features_alone(flat, len(first), scores)
+            return self._features_alone(flat, len(first), asked)
         gap = between(flat.delta, fit.relative.delta)
-        scores |= {"depth_inliers": fit.inliers, "depth_residual_m": fit.residual_m, "overlap": fit.overlap}
-        if np.hypot(gap[0], gap[1]) > 3.0 * self._pnp.agree_m or abs(wrap_angle(gap[2])) > np.deg2rad(
-            3.0 * self._pnp.agree_deg
-        ):
-            return Verification(None, "depth leads away from the features' pose", scores)
-        if fit.inliers < self._registration.min_inliers:
-            return Verification(None, f"only {fit.inliers:.0%} of the depth in common view fits", scores)
-        return Verification(self._calibrated(fit.relative, source, target), "features and depth agree", scores)
+        off_m, off_deg = float(np.hypot(gap[0], gap[1])), float(np.rad2deg(abs(wrap_angle(gap[2]))))
+        asked += checks.of_refinement(off_m, off_deg, fit.inliers, self._pnp, self._registration)
+        relative = self._calibrated(fit.relative, source, target) if passed(asked) else None
+        figures = {"depth_residual_m": fit.residual_m, "overlap": fit.overlap}
+        return Verification(relative, Method.FEATURES_AND_DEPTH, asked, figures=figures)
 
-    def _features_alone(self, flat: FloorPose, inliers: int, scores: dict[str, float]) -> Verification:
+    def _features_alone(self, flat: FloorPose, inliers: int, asked: tuple[Check, ...]) -> Verification:
         """No depth to refine on or to object: many features must agree, and the edge is looser."""
-        if inliers < self._pnp.min_inliers_alone:
-            return Verification(None, f"only {inliers} features, and too little depth in common view", scores)
+        asked += checks.of_features_alone(inliers, self._pnp)
+        if not passed(asked):
+            return Verification(None, Method.FEATURES, asked)
         sigma = 0.1 * np.sqrt(self._pnp.min_inliers_alone / inliers)
         loose = RelativePose(flat.delta, np.diag([sigma, sigma, np.deg2rad(1.5)]) ** 2)
-        return Verification(loose, "features agree", scores)
+        return Verification(loose, Method.FEATURES, asked)
 
     def _calibrated(self, relative: RelativePose, source: Keyframe, target: Keyframe) -> RelativePose:
         return self._level.applied(relative, *self._pnp.floors(source.held or target.held))

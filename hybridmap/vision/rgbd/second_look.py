@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from hybridmap.geometry import Array, RelativePose, between, log
-from hybridmap.vision.base import Belief, Doubted
+from hybridmap.graph.edges import Edge, passed
+from hybridmap.vision.base import Belief
+from hybridmap.vision.rgbd import checks
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp import Verification, Verifier
-
-PLAUSIBLE = 16.3
-"""Squared error over its covariance that a map as sure as it says exceeds once in a thousand (3 degrees of freedom)."""
 
 
 class SecondLook:
@@ -30,7 +29,7 @@ class SecondLook:
         self._verifier = verifier
         self._map_covariance = map_covariance
 
-    def measure(self, doubted: Doubted, belief: Belief) -> Verification:
+    def measure(self, doubted: Edge, belief: Belief) -> Verification:
         """Measure one loop again; `belief` is that of the map without the loops that are doubted."""
         source, target = self._keyframes[doubted.source], self._keyframes[doubted.target]
         on_map = between(belief.poses_map_node[doubted.source], belief.poses_map_node[doubted.target])
@@ -39,7 +38,8 @@ class SecondLook:
             return there
         elsewhere = self._verifier.verify(source, target)
         if elsewhere.relative is None:
-            return replace(there, reason=f"{there.reason}; {elsewhere.reason}", scores={**there.scores, **elsewhere.scores})
+            figures = {**there.figures, **elsewhere.figures}
+            return replace(elsewhere, checks=there.checks + elsewhere.checks, lack=there.lack, figures=figures)
         spread = belief.covariance_from(doubted.source)[doubted.target] + self._map_covariance
         return _weighed(elsewhere, elsewhere.relative, on_map, spread)
 
@@ -51,8 +51,6 @@ def _weighed(found: Verification, relative: RelativePose, on_map: Array, spread:
     squared = 0.0
     if np.isfinite(spread).all():
         squared = float(error @ np.linalg.solve(spread + relative.covariance, error))
-    scores = {**found.scores, "off_m": off_m, "off_deg": off_deg, "map_sigma": float(np.sqrt(squared))}
-    reason = f"{found.reason} on {off_m:.2f} m, {off_deg:.1f} deg from the map, {np.sqrt(squared):.1f} sigma of it"
-    if squared > PLAUSIBLE:
-        return Verification(None, reason, scores)
-    return Verification(relative, f"{reason}, which it may be off by", scores)
+    asked = found.checks + checks.of_map(float(np.sqrt(squared)))
+    figures = {**found.figures, "off_m": off_m, "off_deg": off_deg}
+    return replace(found, relative=relative if passed(asked) else None, checks=asked, figures=figures)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from hybridmap.config.rgbd import RgbdClosingConfig
 from hybridmap.geometry import RelativePose, between, compose
-from hybridmap.graph.edges import Edge, Status
+from hybridmap.graph.edges import Edge, Lack, Status, passed
 from hybridmap.vision.base import Belief
+from hybridmap.vision.rgbd import checks
 
 
 @dataclass(slots=True)
@@ -20,12 +21,10 @@ class Hypothesis:
     Attributes:
         proposal: as it stands.
         relative: what was measured.
-        finding: how.
     """
 
     proposal: Edge
     relative: RelativePose
-    finding: str
 
     @property
     def source(self) -> int:
@@ -64,15 +63,16 @@ class Support:
         near = self._beside(new)
         friends = [h for h in near if h.proposal.status is Status.PENDING and self._agrees(new, h, belief)]
         accepted = (h for h in near if h.proposal.status is Status.ACCEPTED)
-        supported = bool(friends) or self._config.support_nodes == 0 or any(self._agrees(new, h, belief) for h in accepted)
+        supporting = len(friends) or int(any(self._agrees(new, h, belief) for h in accepted))
+        asked = checks.of_support(supporting, self._config)
         self._of_source[new.source].append(new)
         self._pending.append(new)
         self._filed.add((new.source, new.target))
-        if not supported:
+        if not passed(asked):
             return [new.proposal]
         changed = [new, *friends]
         for h in changed:
-            h.proposal = replace(h.proposal, status=Status.ACCEPTED, reason=f"{h.finding}; supported")
+            h.proposal = h.proposal.settled(*(asked if h is new else checks.of_support(1, self._config)))
         return [h.proposal for h in changed]
 
     def replace(self, proposal: Edge) -> None:
@@ -80,7 +80,7 @@ class Support:
         of_source = self._of_source[proposal.source]
         kept = [h for h in of_source if h.proposal.key != proposal.key]
         if proposal.relative is not None and len(kept) < len(of_source):
-            kept.append(Hypothesis(proposal, proposal.relative, proposal.reason))
+            kept.append(Hypothesis(proposal, proposal.relative))
         self._of_source[proposal.source] = kept
 
     def give_up(self, before: int) -> list[Edge]:
@@ -89,7 +89,7 @@ class Support:
         late = [h for h in self._pending if h.source < before]
         for h in late:
             self._filed.discard((h.source, h.target))
-            h.proposal = replace(h.proposal, status=Status.REJECTED, reason="no other edge supports it")
+            h.proposal = h.proposal.settled(lack=Lack.UNSUPPORTED)
         return [h.proposal for h in late]
 
     def _beside(self, new: Hypothesis) -> list[Hypothesis]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from hybridmap.config.rgbd import RgbdConfig
 from hybridmap.geometry import Array, RelativePose, between, compose, compose_relative, log, loosest_direction
-from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status, passed
 from hybridmap.streams.rgbd import Camera
+from hybridmap.vision.rgbd import checks
 from hybridmap.vision.rgbd.depth_grid import place
 from hybridmap.vision.rgbd.depth_registration import Registration, register
 from hybridmap.vision.rgbd.features import match
@@ -19,9 +21,6 @@ from hybridmap.vision.rgbd.noise_level import NoiseLevel
 from hybridmap.vision.rgbd.pairs import PointPairs, point_pairs
 from hybridmap.vision.rgbd.stance import Stance, from_planar
 
-SURE_INLIERS = 0.8
-SURE_SLACK_M = 0.03
-"""A registration may overrule odometry only when it fits this well and is this sure in every direction."""
 STRAIGHTENED_RAD = float(np.deg2rad(0.4))
 STRAIGHTENED_M = 0.01
 """What a registration adds to the uncertainty of a posture that it hands on."""
@@ -90,52 +89,34 @@ class Tracker:
         return None if pairs is None else pairs.near(guess, self._config.keypoint_reach_m)
 
     def _judge(self, source: int, target: int, fit: Registration | None, prior: RelativePose) -> Edge:
-        key = self._new_key()
+        registered: dict[str, Any] = {"method": Method.DEPTH, "search": Search.CHAIN, "key": self._new_key()}
         if fit is None:
-            reason = "too little depth in common view"
-            return Edge(source, target, EdgeKind.REGISTRATION, Status.REJECTED, reason, None, key=key)
+            return Edge.decided(source, target, EdgeKind.REGISTRATION, None, lack=Lack.NO_DEPTH, **registered)
         held = self._keyframes[source].held or self._keyframes[target].held
         relative = self._level.applied(fit.relative, *self._config.floors(held))
         error = log(between(prior.delta, relative.delta))
         distance = float(np.sqrt(error @ np.linalg.solve(prior.covariance + relative.covariance, error)))
-        scores = {
+        asked = checks.of_step(fit.inliers, fit.slack_m, distance, self._config)
+        far = passed(asked) and distance > self._config.contradiction_sigma
+        figures = {
             "points": float(fit.points),
-            "inliers": fit.inliers,
-            "residual_m": fit.residual_m,
+            "depth_residual_m": fit.residual_m,
             "overlap": fit.overlap,
             "slack_m": fit.slack_m,
-            "sigma_m": loosest_direction(relative.covariance)[0],
             "odometry_sigma": distance,
+            **_what_slides(relative, prior),
         }
-        far = distance > self._config.contradiction_sigma
-        sure = fit.inliers > SURE_INLIERS and fit.slack_m < SURE_SLACK_M
-        if fit.inliers < self._config.min_inliers:
-            status, reason = Status.REJECTED, f"only {fit.inliers:.0%} of the depth in common view fits"
-        elif far and not sure:
-            status, reason = Status.REJECTED, f"{distance:.1f} sigma from odometry without being sure"
-        else:
-            status, reason = Status.ACCEPTED, "depth overrules odometry" if far else "depth registered"
-            reason += _what_slides(relative, prior)
-        return Edge(
-            source,
-            target,
-            EdgeKind.REGISTRATION,
-            status,
-            reason,
-            relative,
-            scores,
-            key=key,
-            contradicts_odometry=far and sure and status is Status.ACCEPTED,
-        )
+        registered |= {"figures": figures, "contradicts_odometry": far}
+        return Edge.decided(source, target, EdgeKind.REGISTRATION, relative, asked, **registered)
 
 
-def _what_slides(relative: RelativePose, odometry: RelativePose) -> str:
-    """Which direction, seen from the new node, odometry knows better than depth and features do; empty if none."""
-    sigma_m, direction = loosest_direction(relative.covariance)
+def _what_slides(relative: RelativePose, odometry: RelativePose) -> dict[str, float]:
+    """How loose a registration is, and the direction, seen from the new node, that odometry knows better, if there is one."""
+    loosest_m, direction = loosest_direction(relative.covariance)
     along = np.array([np.cos(direction), np.sin(direction)])
-    if sigma_m**2 < along @ odometry.covariance[:2, :2] @ along:
-        return ""
-    return f"; free along {round(np.degrees(direction))} deg ({sigma_m:.2f} m), where odometry holds it"
+    if loosest_m**2 < along @ odometry.covariance[:2, :2] @ along:
+        return {"loosest_m": loosest_m}
+    return {"loosest_m": loosest_m, "free_deg": float(np.degrees(direction))}
 
 
 def _straightened(fixed: Keyframe, moving: Keyframe, fit: Registration) -> Keyframe:

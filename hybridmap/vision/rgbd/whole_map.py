@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.vision import RelocalisingConfig
-from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.geometry import loosest_direction
+from hybridmap.graph.edges import Edge, Lack, Search, Status
 from hybridmap.vision.gating import Chain
 from hybridmap.vision.rgbd.keyframe import Keyframe
-from hybridmap.vision.rgbd.pnp import Verifier
+from hybridmap.vision.rgbd.pnp import Candidate, Verifier
 from hybridmap.vision.templates import Matcher
 
 Indices = NDArray[np.int64]
@@ -40,32 +40,29 @@ class WholeMap:
 
     def search(self, node: int, elsewhere: Indices) -> list[Edge]:
         """Compare a node, the source, with older nodes (n,), ascending; what is verified waits."""
-        return [self._measured(node, target, scores) for target, scores in self._candidates(node, elsewhere).items()]
+        return [self._measured(node, target, candidate) for target, candidate in self._candidates(node, elsewhere).items()]
 
-    def _candidates(self, node: int, targets: Indices) -> dict[int, dict[str, float]]:
-        """The best by profile, some nodes apart, with their scores."""
+    def _candidates(self, node: int, targets: Indices) -> dict[int, Candidate]:
+        """The best by profile, some nodes apart, with their figures."""
         most = self._config.candidates
         match = self._matcher.best(self._keyframes[node].profile, RANKED * most, targets, ending_at=node)
-        chosen: dict[int, dict[str, float]] = {}
+        chosen: dict[int, Candidate] = {}
         for target, score, shift in zip(match.indices.tolist(), match.score, match.shift, strict=True):
             if len(chosen) < most and all(abs(target - other) >= self._config.separation for other in chosen):
-                chosen[target] = {"profile_G": float(score), "shift": float(shift), "whole_map": 1.0}
+                chosen[target] = Candidate(Search.WHOLE_MAP, int(shift), {"profile_G": float(score)})
         return chosen
 
-    def _measured(self, node: int, target: int, scores: dict[str, float]) -> Edge:
+    def _measured(self, node: int, target: int, candidate: Candidate) -> Edge:
         found = self._verifier.verify(self._keyframes[node], self._keyframes[target])
-        scores = {**scores, **found.scores}
-        proposal = Edge(node, target, EdgeKind.LOOP, Status.REJECTED, found.reason, found.relative, scores, key=self._new_key())
-        if found.relative is None:
-            return proposal
-        return replace(proposal, status=Status.PENDING, reason="lost: waits for others that put the robot there")
+        return found.proposed(node, target, self._new_key(), candidate, Lack.WAITING)
 
 
 def chain_of(steps: Sequence[Edge], config: RelocalisingConfig) -> Chain:
     """How a node hangs on those before it, by the registrations that were tried; where none was, it does by the odometry."""
     if not steps or config.candidates == 0:
         return Chain.HOLDS
-    sigmas_m = [step.scores.get("sigma_m", 0.0) for step in steps if step.status is Status.ACCEPTED]
-    if not sigmas_m:
+    accepted = [step.relative for step in steps if step.status is Status.ACCEPTED and step.relative is not None]
+    if not accepted:
         return Chain.BROKEN
-    return Chain.DOUBTFUL if min(sigmas_m) > config.doubtful_m else Chain.HOLDS
+    loosest_m = min(loosest_direction(relative.covariance)[0] for relative in accepted)
+    return Chain.DOUBTFUL if loosest_m > config.doubtful_m else Chain.HOLDS

@@ -5,6 +5,7 @@ import pytest
 
 from hybridmap.config.laser import CommitmentConfig
 from hybridmap.geometry import RelativePose, between, compose
+from hybridmap.graph.edges import Lack, Search
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.clusters import Commitment
 from hybridmap.vision.laser.hypotheses import Hypothesis
@@ -27,7 +28,7 @@ def hypothesis(probe, anchor, where=(2.0, 5.0, 0.3), quality=0.7, sigma_m=5.0):
     """A probe that lies at `CHAIN[anchor] * where + way since node 200` in the old map: all with one `where` agree."""
     at = compose(compose(CHAIN[20], np.array(where)), between(CHAIN[200], CHAIN[probe]))
     relative = RelativePose(between(at, CHAIN[anchor]), np.diag([0.03, 0.03, 0.01]) ** 2)
-    return Hypothesis(probe, anchor, relative, quality, sigma_m, {}, "")
+    return Hypothesis(probe, anchor, relative, quality, sigma_m, Search.GATE, (), {}, True, 0.0)
 
 
 @pytest.fixture
@@ -45,7 +46,7 @@ def test_waits_until_enough_probes_over_enough_travel_agree(commitment):
     settled = commitment.settle(TRAVEL[210], BELIEF)
     assert [s.key for s in settled] == [0, 1, 2, 3]
     assert all(s.accepted for s in settled)
-    assert "4 probes over 5.0 m" in settled[0].reason
+    assert [(check.figure, check.value) for check in settled[0].checks] == [("probes", 4), ("span_m", 5.0), ("rival", 0.0)]
 
 
 def test_a_wider_gate_asks_for_more_travel():
@@ -85,7 +86,7 @@ def test_an_equal_rival_blocks_and_a_weak_one_is_refused(commitment):
     settled = commitment.settle(TRAVEL[228], BELIEF)
     assert {s.key for s in settled if s.accepted} == {0, 2, 4, 6, 10, 11}
     assert {s.key for s in settled if not s.accepted} == {1, 3, 5, 7}
-    assert "contradicts" in next(s.reason for s in settled if not s.accepted)
+    assert all(s.lack is Lack.CONTRADICTED for s in settled if not s.accepted)
 
 
 def test_single_hypotheses_that_agree_with_nothing_are_given_up(commitment):
@@ -94,7 +95,7 @@ def test_single_hypotheses_that_agree_with_nothing_are_given_up(commitment):
     assert commitment.settle(TRAVEL[220], BELIEF) == []
     late = commitment.settle(TRAVEL[200] + 33.0, BELIEF)
     assert [(s.key, s.accepted) for s in late] == [(0, False)]
-    assert "32 m" in late[0].reason
+    assert late[0].lack is Lack.UNSUPPORTED
     assert [(s.key, s.accepted) for s in commitment.flush(BELIEF)] == [(1, False), (2, False), (3, False)]
     assert commitment.flush(BELIEF) == []
 

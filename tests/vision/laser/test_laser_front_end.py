@@ -1,5 +1,7 @@
 """The laser front-end as the mapper drives it."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from laser_worlds import LASER, Run, cast, corridor, drifting, ring, ring_drive, room
@@ -8,10 +10,10 @@ from hybridmap.config.laser import LaserConfig, ScanConfig
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, between, compose, log
-from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.graph.edges import EdgeKind, Search, Status
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
-from hybridmap.vision.base import Doubted, RetracingFrontEnd, VerifyingFrontEnd
+from hybridmap.vision.base import RetracingFrontEnd, VerifyingFrontEnd
 from hybridmap.vision.laser.front_end import LaserFrontEnd
 
 
@@ -47,10 +49,17 @@ def test_a_closure_waits_before_it_is_accepted(two_laps):
     assert all(v == [Status.PENDING, Status.ACCEPTED] for v in accepted)
 
 
-def test_every_decision_has_its_figures_and_reason(two_laps):
-    loops = [p for p in two_laps.proposals if p.kind is EdgeKind.LOOP]
-    assert all(p.reason for p in loops)
-    assert all({"near", "fit", "gate_sigma_m"} <= set(p.scores) for p in loops)
+def test_an_edge_is_explained_by_a_failed_check_or_a_named_lack_unless_it_was_accepted(two_laps):
+    assert all((p.status is Status.ACCEPTED) != bool(p.failed or p.lack) for p in two_laps.proposals)
+
+
+def test_an_accepted_loop_has_passed_every_check(two_laps):
+    every = ["near", "fit", "off_m", "off_deg", "loosest_m", "ambiguity", "violation", "probes", "span_m", "rival"]
+    driving = [p for p in two_laps.loops(Status.ACCEPTED) if p.search is Search.GATE]
+    assert driving
+    assert all([check.figure for check in p.checks] == every for p in driving)
+    steps = [p for p in two_laps.proposals if p.search is Search.CHAIN and p.status is Status.ACCEPTED]
+    assert all(p.checks[0].figure == "inliers" for p in steps)
 
 
 def test_re_proposal_on_the_right_map_is_right_and_ends(two_laps):
@@ -59,6 +68,8 @@ def test_re_proposal_on_the_right_map_is_right_and_ends(two_laps):
     proposals = two_laps.front_end.finish(two_laps.belief(final))
     near = [p for p in proposals if p.status is Status.ACCEPTED]
     assert len(near) >= 10
+    every = ["near", "fit", "off_m", "off_deg", "violation"]
+    assert all([check.figure for check in p.checks] == every for p in near if p.search is Search.NEAR)
     errors = np.array([two_laps.error(p) for p in near])
     assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.15
     for _ in range(VisionConfig().laser.revisits.rounds):
@@ -81,7 +92,7 @@ def test_a_doubted_loop_is_measured_again_and_one_of_two_places_is_not_found(two
     final = between(two_laps.truth[0], two_laps.truth[two_laps.node_at])
     loop = two_laps.loops(Status.ACCEPTED)[0]
     other_side = int(np.argmax(np.hypot(*(final[: loop.source, :2] - final[loop.source, :2]).T)))
-    doubted = [Doubted(loop.key, loop.source, loop.target), Doubted(4711, loop.source, other_side)]
+    doubted = [loop, dataclasses.replace(loop, target=other_side, key=4711)]
     found, lost = two_laps.front_end.verify(doubted, two_laps.belief(final))
     assert (found.key, found.source, found.target, found.status) == (loop.key, loop.source, loop.target, Status.ACCEPTED)
     assert np.hypot(*two_laps.error(found)[:2]) < 0.05

@@ -22,7 +22,7 @@ from hybridmap.vision.laser.likelihood import (
     square,
     survivors,
 )
-from hybridmap.vision.laser.registration import Prior, align, second_mode
+from hybridmap.vision.laser.registration import Prior, align, ambiguity_of
 from hybridmap.vision.laser.submap import Atlas, Field
 
 SETTINGS = RegistrationConfig()
@@ -91,7 +91,7 @@ def test_a_bare_corridor_is_loose_along_itself_and_ambiguous():
     along = np.array([np.cos(0.4), -np.sin(0.4)])
     assert abs(vector[:, 1] @ along) > 0.99
     assert abs(alignment.weakest_direction(0) @ along) > 0.99
-    assert second_mode(target.fine, cloud, alignment) > 0.95
+    assert ambiguity_of(target.fine, cloud, alignment) > 0.95
     assert abs(alignment.poses[0, 1] - 0.2) < 0.02
 
 
@@ -100,7 +100,7 @@ def test_a_furnished_room_is_neither():
     target = target_of(room(), np.zeros((1, 3)), rng)
     cloud = cloud_of_scan(cast(room(), np.array([0.3, 0.2, 0.4]), rng), LASER, ScanConfig())
     alignment = align(target.fine, cloud, np.array([[0.35, 0.2, 0.4]]), SETTINGS)
-    assert second_mode(target.fine, cloud, alignment) < 0.8
+    assert ambiguity_of(target.fine, cloud, alignment) < 0.8
     assert np.sqrt(np.linalg.eigvalsh(alignment.covariance(0, SETTINGS, 0.01, 0.003)[:2, :2])[1]) < 0.05
     assert alignment.inliers[0] > 0.9
 

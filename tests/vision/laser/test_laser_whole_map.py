@@ -6,7 +6,7 @@ from laser_worlds import LASER, Run, drifting, ring, ring_drive
 
 from hybridmap.config.laser import LaserConfig, LaserRelocalisingConfig
 from hybridmap.geometry import between, compose
-from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.graph.edges import EdgeKind, Lack, Method, Search, Status
 from hybridmap.vision.laser.whole_map import WholeMap
 
 EVERY = 5
@@ -41,10 +41,11 @@ def test_the_break_is_noticed_and_the_chain_is_joined_anew(found):
     run, down = found
     into = [p for p in last_words(run) if p.kind is EdgeKind.REGISTRATION and p.target == down]
     seen = next(p for p in run.proposals if p.target == down and p.kind is EdgeKind.REGISTRATION)
-    assert "may have been carried" in seen.reason
+    assert seen.broken_by
+    assert not any(check.passed for check in seen.broken_by)
     rejected = next(p for p in into if p.key == seen.key)
     assert rejected.status is Status.REJECTED
-    assert f"carried between nodes {down - 1} and {down}" in rejected.reason
+    assert rejected.lack is Lack.KIDNAPPED
     rehung = next(p for p in into if p.status is Status.ACCEPTED)
     assert (rehung.source, rehung.target, rehung.contradicts_odometry) == (down - 1, down, True)
     error = run.error(rehung)
@@ -55,7 +56,7 @@ def test_the_break_is_noticed_and_the_chain_is_joined_anew(found):
 def test_it_is_found_within_five_metres_by_loops_that_are_right(found):
     run, down = found
     way = np.hypot(*np.diff(run.truth[run.node_at[down] :, :2], axis=0).T).cumsum()
-    loops = [p for p in across(run, down) if "lost;" in p.reason]
+    loops = [p for p in across(run, down) if p.search is Search.WHOLE_MAP]
     assert len({p.source for p in loops}) >= LaserRelocalisingConfig().support
     newest = max(p.source for p in loops)
     assert way[run.node_at[newest] - run.node_at[down] - 1] < 5.0
@@ -66,23 +67,25 @@ def test_it_is_found_within_five_metres_by_loops_that_are_right(found):
 
 def test_what_was_sought_on_the_whole_map_stays_with_its_figures(found):
     run, down = found
-    sought = [p for p in last_words(run) if p.kind is EdgeKind.LOOP and "whole_map" in p.scores]
+    sought = [p for p in last_words(run) if p.search is Search.WHOLE_MAP and p.kind is EdgeKind.LOOP]
     assert all(p.source >= down > p.target and p.status is not Status.PENDING for p in sought)
-    assert all(p.reason and {"near", "fit"} <= set(p.scores) and "gate_sigma_m" not in p.scores for p in sought)
+    assert all({"near", "fit"} < {check.figure for check in p.checks} for p in sought)
+    assert all("off_m" not in {check.figure for check in p.checks} and "gate_sigma_m" not in p.figures for p in sought)
 
 
 def test_mismatch_is_held_against_how_well_the_scans_of_the_drive_fit(found):
     run, down = found
-    steps = {p.target: 1.0 - p.scores["fit"] for p in run.proposals if p.kind is EdgeKind.REGISTRATION and "fit" in p.scores}
+    steps = {p.target: 1.0 - p.figures["fit"] for p in run.proposals if p.method is Method.SCANS and p.search is Search.CHAIN}
     usual = LaserRelocalisingConfig().misfit
-    sightings = [p for p in last_words(run) if "mismatch" in p.scores]
+    sightings = [p for p in last_words(run) if "mismatch" in p.figures]
     assert len(sightings) >= 4
     for p in sightings:
         before = [misfit for node, misfit in steps.items() if node <= p.source and node != down]
         mean = (sum(before) + 10 * usual) / (len(before) + 10)
         assert mean < usual
-        badly = 1.0 - p.scores["fit"] + p.scores["violation"]
-        assert p.scores["mismatch"] == pytest.approx(badly * usual / mean)
+        value = {check.figure: check.value for check in p.checks}
+        badly = 1.0 - value["fit"] + value["violation"]
+        assert p.figures["mismatch"] == pytest.approx(badly * usual / mean)
 
 
 def test_submaps_of_either_side_are_not_mixed(found):
@@ -122,7 +125,7 @@ def test_of_many_submaps_those_with_the_likeliest_views_are_searched(found):
 
 def test_in_a_place_that_it_does_not_know_it_is_not_found():
     run, down = carried(up=200, down=420, stop=600)
-    assert [p.target for p in run.proposals if "may have been carried" in p.reason] == [down]
+    assert [p.target for p in run.proposals if p.broken_by] == [down]
     assert across(run, down) == []
     on_top = np.array(run.poses)
     on_top[down:] = compose(on_top[0], between(on_top[down], on_top[down:]))
@@ -130,7 +133,7 @@ def test_in_a_place_that_it_does_not_know_it_is_not_found():
     assert run.front_end.lost_since == down
     assert len(at_the_end) > 0
     assert [p for p in at_the_end if p.source >= down > p.target and p.status is not Status.REJECTED] == []
-    assert [p for p in at_the_end if p.source >= down > p.target and "whole_map" not in p.scores] == []
+    assert [p for p in at_the_end if p.source >= down > p.target and p.search is not Search.WHOLE_MAP] == []
 
 
 def test_a_glimpse_of_something_else_is_no_carry():
@@ -139,9 +142,9 @@ def test_a_glimpse_of_something_else_is_no_carry():
     truth = way.copy()
     truth[658:663] = ring_drive(2.1)[1000:1005]
     run = Run(ring(), truth, drifting(way, np.random.default_rng(2)), EVERY)
-    assert [p.target for p in run.proposals if "may have been carried" in p.reason] == [660 // EVERY]
-    assert not [p for p in run.proposals if p.reason.startswith("carried:")]
-    assert len([p for p in run.loops(Status.ACCEPTED) if "whole_map" in p.scores]) >= 4
+    assert [p.target for p in run.proposals if p.broken_by] == [660 // EVERY]
+    assert not [p for p in run.proposals if p.carried_m is not None]
+    assert len([p for p in run.loops(Status.ACCEPTED) if p.search is Search.WHOLE_MAP]) >= 4
     assert len(run.front_end._atlas.pieces) == 1
     assert run.front_end.lost_since is None
     assert run.front_end._whole_map.since == 0

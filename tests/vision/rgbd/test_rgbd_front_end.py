@@ -8,7 +8,7 @@ from hybridmap.config.rgbd import RegistrationConfig, RgbdClosingConfig, RgbdCon
 from hybridmap.config.vision import RelocalisingConfig, VisionConfig
 from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import RelativePose, between, compose
-from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.graph.edges import EdgeKind, Method, Search, Status
 from hybridmap.streams.base import Rig
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
@@ -102,19 +102,22 @@ def test_the_second_lap_closes_on_the_first_and_only_rightly(driven, poses):
     found = errors(accepted, poses)
     assert found[:, 0].max() < 0.05
     assert found[:, 1].max() < 1.0
-    assert {"profile_G", "inliers", "inliers_reverse", "depth_inliers"} <= set(accepted[0].scores)
+    by_features = ["matches", "feature_inliers", "feature_inliers_reverse", "height_m", "tilt_deg", "reverse_m", "reverse_deg"]
+    every = [*by_features, "off_features_m", "off_features_deg", "depth_inliers", "supporting"]
+    asked = [[check.figure for check in p.checks] for p in accepted if p.method is Method.FEATURES_AND_DEPTH]
+    assert len(asked) > 10
+    assert all(figures == every for figures in asked)
 
 
 def test_every_refusal_has_a_reason(driven):
-    rejected = [p for p in driven[1].values() if p.status is not Status.ACCEPTED]
-    assert all(p.reason for p in rejected)
+    assert all((p.status is Status.ACCEPTED) != bool(p.failed or p.lack) for p in driven[1].values())
 
 
 def test_same_input_same_proposals(driven, poses, frames):
     _, again, _ = drive(VisionConfig(), poses, np.deg2rad(0.5), frames)
     assert again.keys() == driven[1].keys()
     for key, proposal in driven[1].items():
-        assert again[key].reason == proposal.reason
+        assert again[key].checks == proposal.checks
         if proposal.relative is not None:
             assert np.array_equal(again[key].relative.delta, proposal.relative.delta)
             assert np.array_equal(again[key].relative.covariance, proposal.relative.covariance)
@@ -157,7 +160,9 @@ def test_the_end_joins_by_depth_what_features_cannot(poses):
     assert not any(p.status is Status.ACCEPTED for p in proposals.values() if p.kind is EdgeKind.LOOP)
     found = [p for p in front_end.finish(belief_of(odometry)) if p.status is Status.ACCEPTED and p.target < PER_LAP <= p.source]
     assert len({p.source for p in found}) > 4
-    assert all("depth agrees with the map" in p.reason for p in found)
+    assert all((p.method, p.search) == (Method.DEPTH, Search.NEAR) for p in found)
+    every = ["depth_inliers", "overlap", "points", "slack_m", "supporting"]
+    assert all([check.figure for check in p.checks] == every for p in found)
     assert np.median(errors(found, poses)[:, 0]) < 0.005
     assert max(sigmas_off(p, poses) for p in found) < 3.0
 
@@ -178,9 +183,9 @@ def test_a_bare_wall_leaves_the_way_along_it_to_odometry_and_says_so(poses, fram
     sideways = np.array([[0.0, 0.1 * k, 0.0] for k in range(3)])
     _, proposals, _ = drive(VisionConfig(), sideways, 0.0, walls)
     free = [p for p in proposals.values() if p.kind is EdgeKind.REGISTRATION]
-    assert all("free along" in p.reason and "90 deg" in p.reason and "odometry holds it" in p.reason for p in free)
+    assert all(abs(p.figures["free_deg"]) == pytest.approx(90.0, abs=0.5) for p in free)
     _, proposals, _ = drive(VisionConfig(), poses[:3], 0.0, frames[:3])
-    assert not any("free along" in p.reason for p in proposals.values())
+    assert not any("free_deg" in p.figures for p in proposals.values())
 
 
 def test_a_wrong_map_is_not_confirmed_by_depth(poses, frames):
@@ -192,7 +197,7 @@ def test_a_wrong_map_is_not_confirmed_by_depth(poses, frames):
     wrong = RelativePose(true + np.array([0.0, 1.0, 0.6]), np.diag([0.15, 0.15, 0.05]) ** 2)
     refused = front_end._verifier.verify_on_map(keyframes[5], keyframes[6], wrong)
     assert refused.relative is None
-    assert refused.reason
+    assert refused.lack or not all(check.passed for check in refused.checks)
 
 
 def test_frames_without_depth_make_nodes_and_no_edges():

@@ -10,12 +10,14 @@ from rgbd_room import camera, render
 
 from hybridmap.backends import create
 from hybridmap.config import Config
+from hybridmap.config.rgbd import PnpConfig
 from hybridmap.config.vision import RelocalisingConfig
 from hybridmap.geometry import RelativePose, align, between, compose
-from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import Rig
 from hybridmap.vision.gating import Chain
+from hybridmap.vision.rgbd import checks
 from hybridmap.vision.rgbd.pnp import Verification
 from hybridmap.vision.rgbd.whole_map import WholeMap, chain_of
 from hybridmap.vision.templates import Matcher
@@ -76,12 +78,11 @@ def test_it_is_found_again_and_the_chain_is_joined_where_it_broke(carried, found
     assert travel[found_at - UP - 2] < 2.5
     into = [mapper.map.edge(n) for n in mapper.map.edges_into(UP + 1) if mapper.map.edge(n).source == UP]
     wheels = next(edge for edge in into if edge.kind is EdgeKind.ODOMETRY)
-    assert wheels.status is Status.REJECTED
-    assert "carried" in wheels.reason
+    assert (wheels.status, wheels.lack) == (Status.RETRACTED, Lack.OVERRULED)
     joined = next(edge for edge in into if edge.kind is EdgeKind.REGISTRATION and edge.status is Status.ACCEPTED)
     gap = between(joined.relative.delta, between(truth[UP], truth[UP + 1]))
     assert np.hypot(gap[0], gap[1]) < 0.1
-    assert sum("lost" in edge.reason for edge in mapper.map.edges if edge.status is Status.ACCEPTED) >= 4
+    assert sum(edge.search is Search.WHOLE_MAP for edge in mapper.map.edges if edge.status is Status.ACCEPTED) >= 5
     assert off_m(mapper.poses(), truth).max() < 0.05
     assert mapper.lost_since is None
 
@@ -113,7 +114,7 @@ def test_a_view_of_nothing_is_no_carry(carried):
     blank.depth_m[:] = 0.0
     whole = (truth[: UP + 1], wheels[: UP + 1], [*frames[: UP - 1], blank, frames[UP]])
     mapper, _ = mapped(whole)
-    assert not [edge for edge in mapper.map.edges if edge.kind is EdgeKind.ODOMETRY and edge.status is Status.REJECTED]
+    assert not [edge for edge in mapper.map.edges if edge.kind is EdgeKind.ODOMETRY and edge.status is not Status.ACCEPTED]
     assert off_m(mapper.poses(), truth[: UP + 1]).max() < 0.05
 
 
@@ -126,7 +127,7 @@ class FakeVerifier:
     def verify(self, source, target):
         delta = self.found.get((source.number, target.number))
         relative = None if delta is None else RelativePose(np.array(delta, float), np.eye(3) * 1e-4)
-        return Verification(relative, "" if delta is None else "agrees", {"inliers": 20.0})
+        return Verification(relative, Method.FEATURES, checks.of_pose(0 if delta is None else 20, PnpConfig()))
 
 
 def test_the_likeliest_views_some_nodes_apart_are_verified():
@@ -143,13 +144,14 @@ def test_the_likeliest_views_some_nodes_apart_are_verified():
     found = WholeMap(keyframes, matcher, verifier, config, iter(range(99)).__next__).search(30, np.arange(25))
     assert len(found) == 3
     assert (found[0].target, found[0].status) == (12, Status.PENDING)
-    assert "lost" in found[0].reason
+    assert (found[0].search, found[0].lack) == (Search.WHOLE_MAP, Lack.WAITING)
     assert [p.status for p in found[1:]] == [Status.REJECTED] * 2
     assert all(abs(a.target - b.target) >= 4 for a in found for b in found if a is not b)
 
 
 def step(status, sigma_m=0.01):
-    return Edge(39, 40, EdgeKind.REGISTRATION, status, "", None, {"sigma_m": sigma_m})
+    relative = RelativePose(np.zeros(3), np.diag([sigma_m, 0.5 * sigma_m, 0.01]) ** 2)
+    return Edge(39, 40, EdgeKind.REGISTRATION, status, relative)
 
 
 @pytest.mark.parametrize(

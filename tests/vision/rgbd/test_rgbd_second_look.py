@@ -11,10 +11,10 @@ from hybridmap.config import Config
 from hybridmap.config.rgbd import RgbdClosingConfig, RgbdConfig
 from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import RelativePose, between, compose
-from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import Rig
-from hybridmap.vision.base import Doubted, VerifyingFrontEnd
+from hybridmap.vision.base import VerifyingFrontEnd
 from hybridmap.vision.rgbd.front_end import RgbdFrontEnd
 from hybridmap.vision.rgbd.pnp import Verification, Verifier
 from hybridmap.vision.rgbd.revisits import Revisits
@@ -41,7 +41,7 @@ def driven(poses, frames):
 
 
 def again(front_end, loop, poses, sigma=SURE):
-    [found] = front_end.verify([Doubted(loop.key, loop.source, loop.target)], belief_of(poses, sigma))
+    [found] = front_end.verify([loop], belief_of(poses, sigma))
     assert (found.key, found.source, found.target, found.kind) == (loop.key, loop.source, loop.target, EdgeKind.LOOP)
     return found
 
@@ -62,7 +62,7 @@ def test_a_true_loop_is_found_again_from_where_the_map_has_it(driven, poses, by)
     front_end, loops = driven
     found = again(front_end, loops[0], moved(poses, loops[0].source, np.array(by)))
     assert found.status is Status.ACCEPTED
-    assert "agree" in found.reason
+    assert found.search is Search.AGAIN
     assert errors([found], poses)[0] == pytest.approx([0.0, 0.0], abs=0.3)
     assert errors([found], poses)[0, 0] < 0.01
 
@@ -72,12 +72,12 @@ def test_a_loop_between_views_of_different_walls_goes(driven, poses):
     back_to_back = next(
         (i, j) for i in range(PER_LAP, len(poses)) for j in range(i) if abs(np.cos(poses[i, 2] - poses[j, 2]) + 1.0) < 0.05
     )
-    wrong = Edge(*back_to_back, EdgeKind.LOOP, Status.ACCEPTED, "made up", RelativePose(np.zeros(3), 1e-4 * np.eye(3)), key=900)
+    wrong = Edge(*back_to_back, EdgeKind.LOOP, Status.ACCEPTED, RelativePose(np.zeros(3), 1e-4 * np.eye(3)), key=900)
     found = again(front_end, wrong, poses)
     assert found.status is Status.REJECTED
     assert found.relative is None
-    assert "common view" in found.reason or "fits" in found.reason
-    assert "features" in found.reason
+    assert found.lack is Lack.NO_DEPTH or found.failed[0].figure in ("depth_inliers", "overlap", "points")
+    assert found.failed[-1].figure in ("matches", "feature_inliers")
 
 
 @pytest.mark.parametrize(("sigma", "verdict"), [(SURE, Status.REJECTED), (UNSURE, Status.ACCEPTED)])
@@ -87,8 +87,8 @@ def test_where_views_and_map_contradict_each_other_it_depends_on_how_sure_the_ma
     loop = loops[0]
     found = again(front_end, loop, moved(poses, loop.source, np.array([0.3, 1.5, 0.6])), sigma)
     assert found.status is verdict
-    assert "from the map" in found.reason
-    assert found.scores["off_m"] > 1.0
+    assert found.checks[-1].figure == "map_sigma"
+    assert found.figures["off_m"] > 1.0
     if verdict is Status.ACCEPTED:
         assert errors([found], poses)[0, 0] < 0.01
 
@@ -102,16 +102,17 @@ def test_before_a_wall_features_hold_what_depth_alone_lets_slide():
     off = np.array([0.02, 0.08, 0.01])
     guess = RelativePose(between(poses[1], poses[0]) + off, np.diag([0.15, 0.15, 0.05]) ** 2)
     keyframes, verifier = front_end._keyframes, front_end._verifier
-    assert "slides" in verifier.verify_on_map(keyframes[1], keyframes[0], guess).reason
+    refused = verifier.verify_on_map(keyframes[1], keyframes[0], guess)
+    assert [check.figure for check in refused.checks if not check.passed] == ["slack_m"]
     found = verifier.verify_near(keyframes[1], keyframes[0], guess)
-    assert found.scores["inliers"] >= 12
+    assert found.method is Method.FEATURES_AND_DEPTH
     assert found.relative.delta == pytest.approx(between(poses[1], poses[0]), abs=0.01)
 
 
 def test_a_view_that_depth_cannot_confirm_stays_where_features_have_it_near_the_map(driven, poses, monkeypatch):
     """However sure the map says it is: a few centimetres are no contradiction."""
     front_end, loops = driven
-    nothing = Verification(None, "too little depth in common view", {})
+    nothing = Verification(None, Method.DEPTH, lack=Lack.NO_DEPTH)
     monkeypatch.setattr(Verifier, "verify_near", lambda *_: nothing)
     found = again(front_end, loops[0], moved(poses, loops[0].source, np.array([0.05, 0.05, 0.01])), sigma=1e-3)
     assert found.status is Status.ACCEPTED
@@ -122,7 +123,7 @@ def test_without_verification_nothing_is_measured_again(poses, frames):
     config = VisionConfig(rgbd=RgbdConfig(verify="none"))
     front_end, proposals, _ = drive(config, poses, 0.0, frames)
     loop = next(p for p in proposals.values() if p.kind is EdgeKind.LOOP)
-    assert front_end.verify([Doubted(loop.key, loop.source, loop.target)], belief_of(poses)) == []
+    assert front_end.verify([loop], belief_of(poses)) == []
 
 
 def test_a_retracted_loop_no_longer_supports_others(poses, frames):
@@ -148,8 +149,8 @@ def test_a_mapper_mends_one_loop_and_retracts_another(poses, frames, monkeypatch
     tight = 1e-5 * np.eye(3)
     spoilt, false = mapper.book.enter(
         [
-            Edge(true.source, true.target, EdgeKind.LOOP, Status.ACCEPTED, "spoilt", RelativePose(np.ones(3), tight), key=9000),
-            Edge(PER_LAP // 2, 0, EdgeKind.LOOP, Status.ACCEPTED, "made up", RelativePose(np.zeros(3), tight), key=9001),
+            Edge(true.source, true.target, EdgeKind.LOOP, Status.ACCEPTED, RelativePose(np.ones(3), tight), key=9000),
+            Edge(PER_LAP // 2, 0, EdgeKind.LOOP, Status.ACCEPTED, RelativePose(np.zeros(3), tight), key=9001),
         ]
     )
     held, verify = [mapper.belief().covariance_from(PER_LAP // 2)[0]], mapper.vision.verify
@@ -164,10 +165,9 @@ def test_a_mapper_mends_one_loop_and_retracts_another(poses, frames, monkeypatch
     edges = mapper.map.edges
     assert {spoilt, false} <= set(mapper.book.tried_again)
     assert edges[spoilt].status is Status.ACCEPTED
-    assert edges[spoilt].reason.startswith("measured again, as gtsam-gnc had given it no weight")
+    assert edges[spoilt].search is Search.AGAIN
     assert edges[spoilt].relative.delta == pytest.approx(between(poses[true.source], poses[true.target]), abs=0.01)
-    assert edges[false].status is Status.REJECTED
-    assert edges[false].reason.startswith("given no weight by gtsam-gnc and not found again")
+    assert (edges[false].status, edges[false].search) == (Status.RETRACTED, Search.AGAIN)
     assert spoilt not in mapper.backends.solutions["gtsam-gnc"].report.rejected_edge_ids
     relative = between(poses[0], poses)
     assert mapper.poses()[:, :2] == pytest.approx(relative[:, :2], abs=0.02)

@@ -20,7 +20,7 @@ def lap():
 
 
 def scores_of(proposals):
-    return {(p.source, p.target): p.scores["profile_G"] for p in proposals.values() if "profile_G" in p.scores}
+    return {(p.source, p.target): p.figures["profile_G"] for p in proposals.values() if "profile_G" in p.figures}
 
 
 def test_views_in_a_row_decide_where_the_configuration_says_so(lap):
