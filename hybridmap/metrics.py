@@ -44,6 +44,97 @@ class Metric:
         return row
 
 
+FIGURES: dict[str, tuple[str, str]] = {
+    "nodes": ("1", "experiences"),
+    "loops_accepted": ("1", "loop closures in the graph"),
+    "loops_pending": ("1", "loop closures still waiting at the end"),
+    "loops_rejected": ("1", "loop closures refused, each with its reason"),
+    "loops_retracted": ("1", "loop closures that were in the graph and were taken back"),
+    "loops_tried_again": ("1", "loops without weight, measured again on the final map"),
+    "loops_readmitted": ("1", "of those, the ones that now agree with it"),
+    "odometry_dropped": ("1", "odometry edges that a registration contradicted"),
+    "largest_correction": ("m", "largest shift of a node at one closure"),
+    "travel": ("m", "path length by odometry"),
+    "duration": ("s", "length of the recording"),
+    "unobserved": ("m", "{free}"),
+    "cpu_s/": ("s", "process time of {what}"),
+    "cpu_s_per_min": ("s/min", "process time a minute of recording"),
+    # of a solution
+    "chi2_initial/": ("1", "referee's chi2 of the poses to begin with"),
+    "chi2/": ("1", "referee's chi2 at the end, over all edges"),
+    "chi2_odometry/": ("1", "share of chi2 that is not of loops"),
+    "unit_variance/": ("1", "chi2 of the edges kept per degree of freedom; 1 where the stated noise is the true one"),
+    "iterations/": ("1", "iterations, sweeps or updates"),
+    "loops_rejected/": ("1", "accepted loops that it gave no weight"),
+    "rejected_loops/": ("1", "loop edges that the back-end holds for false"),
+    "rejected_together/": ("1", "of those, the ones that agree with each other"),
+    "weak_edges/": ("1", "odometry and registration edges of next to no weight"),
+    "hanging_nodes/": ("1", "nodes that only such edges and rejected loops hold"),
+    "certificate_gap/": (
+        "1",
+        "proved relative gap of the isotropised objective at its optimum beside the map, over the edges kept",
+    ),
+    # of a trajectory, against the truth
+    "ate_rmse/": ("m", "absolute trajectory error after SE(2) alignment, RMSE; {when}"),
+    "ate_median/": ("m", "absolute trajectory error, median; {when}"),
+    "ate_max/": ("m", "absolute trajectory error, largest; {when}"),
+    "ate_poses/": ("1", "poses compared, of {total}; {when}"),
+    "rpe_trans/": ("m", "relative pose error over 1 m, translation, RMSE; {when}"),
+    "rpe_rot/": ("deg", "relative pose error over 1 m, rotation, RMSE; {when}"),
+    "rpe_trans_1s/": ("m", "relative pose error over 1 s, translation, RMSE; {when}"),
+    "rpe_rot_1s/": ("deg", "relative pose error over 1 s, rotation, RMSE; {when}"),
+    "drift/": ("%", "mean translational error over pieces of 5 to 160 m, of travel; {when}"),
+    # of a trajectory, against verified relations
+    "relation_trans_mean/": ("m", "translational relation error, mean, {which}; {when}"),
+    "relation_trans_std/": ("m", "translational relation error, standard deviation, {which}; {when}"),
+    "relation_rot_mean/": ("deg", "rotational relation error, mean, {which}; {when}"),
+    "relation_rot_std/": ("deg", "rotational relation error, standard deviation, {which}; {when}"),
+    "relation_used/": ("1", "relations used of {total}, {which}; {when}"),
+    "relation_loop_trans_mean/": ("m", "translational relation error, mean, {which}; {when}"),
+    "relation_loop_trans_std/": (
+        "m",
+        "translational relation error, standard deviation, {which}; {when}",
+    ),
+    "relation_loop_rot_mean/": ("deg", "rotational relation error, mean, {which}; {when}"),
+    "relation_loop_rot_std/": ("deg", "rotational relation error, standard deviation, {which}; {when}"),
+    "relation_loop_used/": ("1", "relations used of {total}, {which}; {when}"),
+    # of edges, against the truth
+    "loop_precision/": ("1", "share of {judged} within 1 m and 15 deg of truth"),
+    "loop_recall/": ("1", "share of the {revisits} revisits with a right loop edge {kept}"),
+    "loops_right/": ("1", "right ones of {judged}"),
+    "loop_trans_median/": ("m", "translational error of right loop edges, median"),
+    "loop_trans_p95/": ("m", "translational error of right loop edges, 95 %"),
+    "loop_rot_median/": ("deg", "rotational error of right loop edges, median"),
+    "loop_rot_p95/": ("deg", "rotational error of right loop edges, 95 %"),
+    "edge_trans_median/": ("m", "translational error of {which}, median"),
+    "edge_trans_p95/": ("m", "translational error of {which}, 95 %"),
+    "edge_rot_median/": ("deg", "rotational error of {which}, median"),
+    "edge_rot_p95/": ("deg", "rotational error of {which}, 95 %"),
+    "edge_chi2_ratio/": ("1", "normalised squared error of {which}, median, over the expected median"),
+    "edges_wrong/": ("1", "share of {which} that are wrong by more than 1 m"),
+    "edges_wrong_kept/": ("1", "of those, how many the primary back-end gave more than half weight"),
+    # of views, before any verification
+    "pair_auc/": ("1", "chance that a pair of one place scores better than another, {pairs} pairs"),
+    "candidate_top1/": ("1", "share whose best match of all older nodes is the same place, {views}"),
+    "candidate_ap/": ("1", "average precision of the best matches, {views}"),
+    "candidate_recall_full_precision/": ("1", "recall without a false match, {views}"),
+}
+"""Every figure of a session and of a solution: measure -> unit and words, in which `figure` fills in what is in braces.
+
+A measure that ends in `/` is of a back-end or stage, whose name follows.
+"""
+
+ONLINE = "_online"
+"""After a measure: of the trajectory that the robot believed at the time."""
+
+
+def figure(name: str, value: float, **facts: object) -> Metric:
+    """A figure of the list, `<measure>` or `<measure>/<back-end or stage>`, its words filled with `facts`."""
+    measure, slash, _ = name.partition("/")
+    unit, words = FIGURES[measure.removesuffix(ONLINE) + slash]
+    return Metric(name, float(value), unit, words.format(**facts))
+
+
 def to_json(head: dict[str, Any], metrics: Iterable[Metric]) -> str:
     """One JSON object: the head's keys, then the flat list `metrics`."""
     return json.dumps({**head, "metrics": [metric.to_json() for metric in metrics]}, indent=2)

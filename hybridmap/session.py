@@ -21,7 +21,7 @@ from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.io import graph_hash
 from hybridmap.graph.observability import unobserved
 from hybridmap.mapper import Mapper, Update
-from hybridmap.metrics import Metric
+from hybridmap.metrics import Metric, figure
 from hybridmap.store import MapStore
 from hybridmap.store.session_folder import SessionFolder
 from hybridmap.store.track import trajectory_of
@@ -201,7 +201,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
     }
     metrics = _figures(mapper, recorder, float(track.stamps_ns[-1] - track.stamps_ns[0]) / NS_PER_S)
     if free is not None:
-        metrics.append(Metric("unobserved", free.sliding_m + free.blind_m, "m", str(free)))
+        metrics.append(figure("unobserved", free.sliding_m + free.blind_m, free=free))
     folder.write_metrics(head, metrics)
     for key in ("graph_hash", "primary_backend"):
         store.put_info(key, head[key])
@@ -228,8 +228,8 @@ def _weak(name: str, report: SolveReport) -> list[Metric]:
     if not report.weak_edges:
         return []
     return [
-        Metric(f"weak_edges/{name}", len(report.weak_edges), "1", "odometry and registration edges of next to no weight"),
-        Metric(f"hanging_nodes/{name}", report.hanging_nodes, "1", "nodes that only such edges and rejected loops hold"),
+        figure(f"weak_edges/{name}", len(report.weak_edges)),
+        figure(f"hanging_nodes/{name}", report.hanging_nodes),
     ]
 
 
@@ -239,8 +239,8 @@ def _second_look(mapper: Mapper) -> list[Metric]:
     without = set(solution.report.rejected_edge_ids) if solution is not None else set()
     kept = [number for number in tried if edges[number].status is Status.ACCEPTED and number not in without]
     return [
-        Metric("loops_tried_again", len(tried), "1", "loops without weight, measured again on the final map"),
-        Metric("loops_readmitted", len(kept), "1", "of those, the ones that now agree with it"),
+        figure("loops_tried_again", len(tried)),
+        figure("loops_readmitted", len(kept)),
     ]
 
 
@@ -250,37 +250,33 @@ def _figures(mapper: Mapper, recorder: _Recorder, duration_s: float) -> list[Met
     dropped = [edge for edge in edges if edge.kind is EdgeKind.ODOMETRY and edge.status is not Status.ACCEPTED]
     count = {status: float(sum(edge.status is status for edge in loops)) for status in Status}
     rows = [
-        Metric("nodes", len(mapper.map), "1", "experiences"),
-        Metric("loops_accepted", count[Status.ACCEPTED], "1", "loop closures in the graph"),
-        Metric("loops_pending", count[Status.PENDING], "1", "loop closures still waiting at the end"),
-        Metric("loops_rejected", count[Status.REJECTED], "1", "loop closures refused, each with its reason"),
-        Metric("loops_retracted", count[Status.RETRACTED], "1", "loop closures that were in the graph and were taken back"),
+        figure("nodes", len(mapper.map)),
+        figure("loops_accepted", count[Status.ACCEPTED]),
+        figure("loops_pending", count[Status.PENDING]),
+        figure("loops_rejected", count[Status.REJECTED]),
+        figure("loops_retracted", count[Status.RETRACTED]),
         *_second_look(mapper),
-        Metric("odometry_dropped", len(dropped), "1", "odometry edges that a registration contradicted"),
-        Metric("largest_correction", recorder.largest_correction_m, "m", "largest shift of a node at one closure"),
-        Metric("travel", mapper.map.node(len(mapper.map) - 1).travel_m, "m", "path length by odometry"),
-        Metric("duration", duration_s, "s", "length of the recording"),
+        figure("odometry_dropped", len(dropped)),
+        figure("largest_correction", recorder.largest_correction_m),
+        figure("travel", mapper.map.node(len(mapper.map) - 1).travel_m),
+        figure("duration", duration_s),
     ]
     graph = mapper.map.pose_graph()
     chain = objective.chi2(graph, graph.initial)
-    rows += [
-        Metric("chi2_initial/odometry", chain, "1", "referee's chi2 of the odometry chain"),
-        Metric("chi2/odometry", chain, "1", "referee's chi2 of the odometry chain"),
-    ]
+    rows += [figure(f"chi2_initial/{ODOMETRY}", chain), figure(f"chi2/{ODOMETRY}", chain)]
     for name, solution in mapper.backends.solutions.items():
         if name == ODOMETRY:
             continue
         report = solution.report
         rows += [
-            Metric(f"chi2_initial/{name}", chain, "1", "referee's chi2 of the odometry chain"),
-            Metric(f"chi2/{name}", objective.chi2(graph, solution.poses), "1", "referee's chi2 at the end"),
-            Metric(f"loops_rejected/{name}", len(report.rejected_edge_ids), "1", "accepted loops that it gave no weight"),
+            figure(f"chi2_initial/{name}", chain),
+            figure(f"chi2/{name}", objective.chi2(graph, solution.poses)),
+            figure(f"loops_rejected/{name}", len(report.rejected_edge_ids)),
             *_weak(name, report),
         ]
-    for stage, cpu_s in mapper.clock.cpu_s.items():
-        rows.append(Metric(f"cpu_s/{stage}", cpu_s, "s", "process time of the stage"))
+    rows += [figure(f"cpu_s/{stage}", cpu_s, what="the stage") for stage, cpu_s in mapper.clock.cpu_s.items()]
     total = sum(mapper.clock.cpu_s.values())
-    rows.append(Metric("cpu_s/mapping", total, "s", "process time of all stages"))
+    rows.append(figure("cpu_s/mapping", total, what="all stages"))
     if duration_s > 0:
-        rows.append(Metric("cpu_s_per_min", 60.0 * total / duration_s, "s/min", "process time a minute of recording"))
+        rows.append(figure("cpu_s_per_min", 60.0 * total / duration_s))
     return rows

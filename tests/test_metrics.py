@@ -1,8 +1,13 @@
-"""Process time by stage."""
+"""Process time by stage, and the list of figures."""
 
 import time
+from pathlib import Path
 
-from hybridmap.metrics import StageClock
+import pytest
+
+from hybridmap.metrics import FIGURES, StageClock, figure
+
+FORMATS = Path(__file__).parents[1] / "docs" / "formats.md"
 
 
 def busy(seconds):
@@ -38,3 +43,18 @@ def test_a_stage_that_fails_is_counted_too():
         busy(0.01)
     assert clock.cpu_s["inner"] >= 0.01 > clock.cpu_s["outer"]
     assert clock.cpu_s["next"] < 0.03
+
+
+def test_a_figure_has_its_unit_and_words_from_the_list() -> None:
+    found = figure("ate_poses_online/gtsam-gnc", 12, total=20, when="at the time")
+    assert (found.name, found.value, found.unit) == ("ate_poses_online/gtsam-gnc", 12.0, "1")
+    assert found.description == "poses compared, of 20; at the time"
+    assert figure("loops_rejected", 1).description != figure("loops_rejected/gtsam-gnc", 1).description
+    with pytest.raises(KeyError):
+        figure("chi2", 1.0)  # is of a back-end
+
+
+@pytest.mark.parametrize("measure", FIGURES)
+def test_every_figure_of_the_list_is_documented(measure: str) -> None:
+    text = FORMATS.read_text(encoding="utf-8")
+    assert f"`{measure.rstrip('/')}" in text

@@ -19,7 +19,7 @@ from hybridmap.config.backends import BackendsConfig, ConsistencyConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
-from hybridmap.metrics import Metric
+from hybridmap.metrics import Metric, figure
 
 Progress = Callable[[int, int], None]
 
@@ -193,27 +193,21 @@ def metrics_of(rows: Sequence[Row]) -> list[Metric]:
         if row.solution is None:
             continue
         report = row.solution.report
-        figures: list[tuple[str, float, str, str]] = [
-            ("chi2_initial", report.chi2_initial, "1", "sum of squared Mahalanobis residuals before"),
-            ("chi2", report.chi2, "1", "sum of squared Mahalanobis residuals after, over all edges"),
-            ("iterations", float(report.iterations), "1", "iterations, sweeps or updates"),
-            ("cpu_s", report.cpu_s, "s", "process time"),
-            ("rejected_loops", float(len(report.rejected_edge_ids)), "1", "loop edges that the back-end holds for false"),
-        ]
-        if report.rejected_clusters:
-            together = float(sum(map(len, report.rejected_clusters)))
-            figures.append(("rejected_together", together, "1", "of those, the ones that agree with each other"))
-        if report.chi2_odometry is not None:
-            figures.append(("chi2_odometry", report.chi2_odometry, "1", "share of chi2 that is not of loops"))
-        if report.unit_variance is not None:
-            figures.append(("unit_variance", report.unit_variance, "1", "chi2 of the edges kept per degree of freedom"))
-        if report.weak_edges:
-            weak, hanging = float(len(report.weak_edges)), float(report.hanging_nodes)
-            figures.append(("weak_edges", weak, "1", "odometry and registration edges of next to no weight"))
-            figures.append(("hanging_nodes", hanging, "1", "nodes that only such edges and rejected loops hold"))
+        figures: dict[str, float | None] = {
+            "chi2_initial": report.chi2_initial,
+            "chi2": report.chi2,
+            "iterations": report.iterations,
+            "cpu_s": report.cpu_s,
+            "rejected_loops": len(report.rejected_edge_ids),
+            "rejected_together": sum(map(len, report.rejected_clusters)) if report.rejected_clusters else None,
+            "chi2_odometry": report.chi2_odometry,
+            "unit_variance": report.unit_variance,
+            "weak_edges": len(report.weak_edges) or None,
+            "hanging_nodes": report.hanging_nodes if report.weak_edges else None,
+        }
         if row.certificate is not None and np.isfinite(row.certificate.gap):
-            what = "proved relative gap of the isotropised objective at its optimum beside the map, over the edges kept"
-            figures.append(("certificate_gap", row.certificate.gap, "1", what))
+            figures["certificate_gap"] = row.certificate.gap
+        known = {measure: value for measure, value in figures.items() if value is not None}
         title = row.title or row.backend
-        metrics += [Metric(f"{measure}/{title}", value, unit, text) for measure, value, unit, text in figures]
+        metrics += [figure(f"{measure}/{title}", value, what="the solution") for measure, value in known.items()]
     return metrics

@@ -22,7 +22,7 @@ from hybridmap.evaluate.candidates import (
     judge_pairs,
     score_matrix,
 )
-from hybridmap.metrics import Metric
+from hybridmap.metrics import Metric, figure
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.trajectory import Trajectory, read_tum
 from hybridmap.vision.profile import Profile, sees_all_around
@@ -127,12 +127,12 @@ def candidate_metrics(mode: str, errors: CandidateErrors) -> list[Metric]:
     """The figures of one mode."""
     views = f"of {errors.revisits} revisits among {errors.queries} views"
     rows = [
-        ("pair_auc", errors.pair_auc, f"chance that a pair of one place scores better than another, {errors.pairs} pairs"),
-        ("candidate_top1", errors.top1, f"share whose best match of all older nodes is the same place, {views}"),
-        ("candidate_ap", errors.average_precision, f"average precision of the best matches, {views}"),
-        ("candidate_recall_full_precision", errors.recall_full_precision, f"recall without a false match, {views}"),
+        ("pair_auc", errors.pair_auc),
+        ("candidate_top1", errors.top1),
+        ("candidate_ap", errors.average_precision),
+        ("candidate_recall_full_precision", errors.recall_full_precision),
     ]
-    return [Metric(f"{measure}/{mode}", value, "1", text) for measure, value, text in rows]
+    return [figure(f"{measure}/{mode}", value, pairs=errors.pairs, views=views) for measure, value in rows]
 
 
 def truth_of(folder: Path, reference: Path | None) -> Trajectory:

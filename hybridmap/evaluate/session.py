@@ -11,16 +11,14 @@ from hybridmap.evaluate.association import associate
 from hybridmap.evaluate.closures import ClosureErrors, closure_errors
 from hybridmap.evaluate.edges import EdgeErrors, edge_errors
 from hybridmap.evaluate.loops import evaluate_loops
-from hybridmap.evaluate.relations import ErrorStatistics, Relations, relation_errors, relations_of
+from hybridmap.evaluate.relations import Relations, relation_errors, relations_of
 from hybridmap.evaluate.trajectory import absolute_error_of, drift_percent, relative_error_of
 from hybridmap.graph.carries import grounded
-from hybridmap.metrics import Metric
+from hybridmap.metrics import ONLINE, Metric, figure
 from hybridmap.store import MapStore, SessionFolder, trajectory_of
 from hybridmap.trajectory import Trajectory, read_tum
 
 log = logging.getLogger(__name__)
-
-_ONLINE = "_online"
 
 
 def evaluate_session(
@@ -86,10 +84,10 @@ def session_trajectories(session: SessionFolder, store: MapStore) -> dict[str, T
             estimates[name] = written[name]
         elif name in solutions:
             estimates[name] = trajectory_of(store.track(), solutions[name].poses)
-        if name + _ONLINE in written:
-            estimates[name + _ONLINE] = written[name + _ONLINE]
+        if name + ONLINE in written:
+            estimates[name + ONLINE] = written[name + ONLINE]
         elif name in followed:
-            estimates[name + _ONLINE] = store.online(name)
+            estimates[name + ONLINE] = store.online(name)
     experiences = store.map()
     return {name: grounded(estimate, experiences) for name, estimate in estimates.items()}
 
@@ -114,8 +112,8 @@ def _judge_edges(store: MapStore, truth: Trajectory) -> list[Metric]:
 
 def _names(estimate: str) -> tuple[str, str, str]:
     """Suffix of the measure, back-end, and words for people."""
-    if estimate.endswith(_ONLINE):
-        return "_online", estimate.removesuffix(_ONLINE), "as the robot believed it at the time"
+    if estimate.endswith(ONLINE):
+        return ONLINE, estimate.removesuffix(ONLINE), "as the robot believed it at the time"
     return "", estimate, "over the whole recording"
 
 
@@ -132,18 +130,18 @@ def against_truth(estimate: str, trajectory: Trajectory, truth: Trajectory) -> l
         raise EvaluationError(f"{estimate}: {error}") from None
     ate = absolute_error_of(pairs)
     metre, second = relative_error_of(pairs, 1.0, "m"), relative_error_of(pairs, 1.0, "s")
-    rows = [
-        ("ate_rmse", ate.rmse_m, "m", "absolute trajectory error after SE(2) alignment, RMSE"),
-        ("ate_median", ate.median_m, "m", "absolute trajectory error, median"),
-        ("ate_max", ate.max_m, "m", "absolute trajectory error, largest"),
-        ("ate_poses", float(ate.used), "1", f"poses compared, of {ate.total}"),
-        ("rpe_trans", metre.trans_rmse_m, "m", "relative pose error over 1 m, translation, RMSE"),
-        ("rpe_rot", metre.rot_rmse_deg, "deg", "relative pose error over 1 m, rotation, RMSE"),
-        ("rpe_trans_1s", second.trans_rmse_m, "m", "relative pose error over 1 s, translation, RMSE"),
-        ("rpe_rot_1s", second.rot_rmse_deg, "deg", "relative pose error over 1 s, rotation, RMSE"),
-        ("drift", drift_percent(pairs), "%", "mean translational error over pieces of 5 to 160 m, of travel"),
-    ]
-    return [Metric(f"{name}{suffix}/{backend}", value, unit, f"{text}; {when}") for name, value, unit, text in rows]
+    values = {
+        "ate_rmse": ate.rmse_m,
+        "ate_median": ate.median_m,
+        "ate_max": ate.max_m,
+        "ate_poses": ate.used,
+        "rpe_trans": metre.trans_rmse_m,
+        "rpe_rot": metre.rot_rmse_deg,
+        "rpe_trans_1s": second.trans_rmse_m,
+        "rpe_rot_1s": second.rot_rmse_deg,
+        "drift": drift_percent(pairs),
+    }
+    return [figure(f"{name}{suffix}/{backend}", value, when=when, total=ate.total) for name, value in values.items()]
 
 
 def against_relations(estimate: str, trajectory: Trajectory, relations: Relations) -> list[Metric]:
@@ -154,61 +152,46 @@ def against_relations(estimate: str, trajectory: Trajectory, relations: Relation
         log.warning(
             "only %d of %d relations lie within the session; are they of this recording?", errors.all.used, errors.all.total
         )
-    rows = [
-        *_relation_rows("relation", errors.all, "all relations"),
-        *_relation_rows("relation_loop", errors.loops, "relations over more than 60 s"),
-    ]
-    return [Metric(f"{name}{suffix}/{backend}", value, unit, f"{text}; {when}") for name, value, unit, text in rows]
-
-
-def _relation_rows(prefix: str, errors: ErrorStatistics, which: str) -> list[tuple[str, float, str, str]]:
-    return [
-        (f"{prefix}_trans_mean", errors.trans_mean_m, "m", f"translational relation error, mean, {which}"),
-        (f"{prefix}_trans_std", errors.trans_std_m, "m", f"translational relation error, standard deviation, {which}"),
-        (f"{prefix}_rot_mean", errors.rot_mean_deg, "deg", f"rotational relation error, mean, {which}"),
-        (f"{prefix}_rot_std", errors.rot_std_deg, "deg", f"rotational relation error, standard deviation, {which}"),
-        (f"{prefix}_used", float(errors.used), "1", f"relations used of {errors.total}, {which}"),
-    ]
+    metrics = []
+    judged = (("relation", errors.all, "all relations"), ("relation_loop", errors.loops, "relations over more than 60 s"))
+    for prefix, found, which in judged:
+        values = {
+            "trans_mean": found.trans_mean_m,
+            "trans_std": found.trans_std_m,
+            "rot_mean": found.rot_mean_deg,
+            "rot_std": found.rot_std_deg,
+            "used": found.used,
+        }
+        facts = {"when": when, "which": which, "total": found.total}
+        metrics += [figure(f"{prefix}_{name}{suffix}/{backend}", value, **facts) for name, value in values.items()]
+    return metrics
 
 
 def _closure_metrics(name: str, errors: ClosureErrors) -> list[Metric]:
     of_graph = name == "graph"  # back-ends share a line of the page, and its words; how many each kept is its own affair
     kept = "accepted by the front-end" if of_graph else "that the back-end kept"
     judged = f"the {errors.judged} loop edges {kept}" if of_graph else f"the loop edges {kept}"
-    rows = [
-        (
-            "loop_precision",
-            errors.precision,
-            "1",
-            f"share of {judged} within 1 m and 15 deg of truth",
-        ),
-        ("loop_recall", errors.recall, "1", f"share of the {errors.revisits} revisits with a right loop edge {kept}"),
-        ("loops_right", float(errors.right), "1", f"right ones of {judged}"),
-    ]
+    values = {"loop_precision": errors.precision, "loop_recall": errors.recall, "loops_right": errors.right}
     if of_graph:
-        rows += [
-            ("loop_trans_median", errors.trans_median_m, "m", "translational error of right loop edges, median"),
-            ("loop_trans_p95", errors.trans_p95_m, "m", "translational error of right loop edges, 95 %"),
-            ("loop_rot_median", errors.rot_median_deg, "deg", "rotational error of right loop edges, median"),
-            ("loop_rot_p95", errors.rot_p95_deg, "deg", "rotational error of right loop edges, 95 %"),
-        ]
-    return [Metric(f"{measure}/{name}", value, unit, text) for measure, value, unit, text in rows]
+        values |= {
+            "loop_trans_median": errors.trans_median_m,
+            "loop_trans_p95": errors.trans_p95_m,
+            "loop_rot_median": errors.rot_median_deg,
+            "loop_rot_p95": errors.rot_p95_deg,
+        }
+    facts = {"judged": judged, "kept": kept, "revisits": errors.revisits}
+    return [figure(f"{measure}/{name}", value, **facts) for measure, value in values.items()]
 
 
 def _edge_metrics(kind: str, errors: EdgeErrors) -> list[Metric]:
     which = f"the {errors.count} {kind} edges"
-    rows = [
-        ("edge_trans_median", errors.trans_median_m, "m", f"translational error of {which}, median"),
-        ("edge_trans_p95", errors.trans_p95_m, "m", f"translational error of {which}, 95 %"),
-        ("edge_rot_median", errors.rot_median_deg, "deg", f"rotational error of {which}, median"),
-        ("edge_rot_p95", errors.rot_p95_deg, "deg", f"rotational error of {which}, 95 %"),
-        ("edge_chi2_ratio", errors.chi2_ratio, "1", f"normalised squared error of {which}, median, over the expected median"),
-        ("edges_wrong", errors.wrong_share, "1", f"share of {which} that are wrong by more than 1 m"),
-        (
-            "edges_wrong_kept",
-            float(errors.wrong_kept),
-            "1",
-            "of those, how many the primary back-end gave more than half weight",
-        ),
-    ]
-    return [Metric(f"{measure}/{kind}", value, unit, text) for measure, value, unit, text in rows]
+    values = {
+        "edge_trans_median": errors.trans_median_m,
+        "edge_trans_p95": errors.trans_p95_m,
+        "edge_rot_median": errors.rot_median_deg,
+        "edge_rot_p95": errors.rot_p95_deg,
+        "edge_chi2_ratio": errors.chi2_ratio,
+        "edges_wrong": errors.wrong_share,
+        "edges_wrong_kept": errors.wrong_kept,
+    }
+    return [figure(f"{measure}/{kind}", value, which=which) for measure, value in values.items()]

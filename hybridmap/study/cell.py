@@ -21,6 +21,7 @@ from hybridmap.errors import BackendError, HybridMapError
 from hybridmap.geometry import Array, align, between, compose
 from hybridmap.graph.connectivity import chain
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.metrics import FIGURES
 from hybridmap.study import provenance
 from hybridmap.study.disturb import Kind, with_drift, with_false_loops
 from hybridmap.study.model import BackendVariant, DriftConfig
@@ -41,8 +42,8 @@ MEASURES = {
     "false_kept": ("1", f"false loops of weight above {KEPT}"),
     "own_lost": ("1", "of the graph's own loops, those that the back-end holds for false"),
     "chi2_odometry": ("1", "share of chi2 that is not of loops; large where true loops were dropped"),
-    "unit_variance": ("1", "chi2 of the edges kept per degree of freedom; 1 where the stated noise is the true one"),
-    "iterations": ("1", "iterations, sweeps or updates"),
+    "unit_variance": FIGURES["unit_variance/"],
+    "iterations": FIGURES["iterations/"],
 }
 """Figure of merit -> unit and meaning, in the order of the tables."""
 
