@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridmap.backends.base import Backend
 from hybridmap.backends.ensemble import Ensemble
-from hybridmap.calibration.gains import Gains
 from hybridmap.calibration.online import OnlineCalibration
 from hybridmap.config import Config
 from hybridmap.edge_book import EdgeBook
@@ -21,6 +20,7 @@ from hybridmap.graph.experience_map import ExperienceMap, Node, Novelty
 from hybridmap.graph.uncertainty import odometry_covariance, relative_covariances
 from hybridmap.metrics import StageClock
 from hybridmap.neural.path_integrator import PathIntegrator, Reanchoring
+from hybridmap.odometry_model import Gains
 from hybridmap.streams.base import Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
@@ -232,7 +232,7 @@ class Mapper:
         change = self.calibration.follow(self._stamp_ns, self.map.pose_graph, self.poses)
         if change is None:
             return ""
-        self.integrator.use_gains(*change.gains.to_array().tolist())
+        self.integrator.gains = change.gains
         return f"; {change}"
 
     def _path_integrate(self, ready: Ready) -> Array:

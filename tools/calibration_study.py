@@ -21,7 +21,6 @@ import numpy as np
 
 from hybridmap import session
 from hybridmap.calibration.estimate import Estimate
-from hybridmap.calibration.gains import NEUTRAL, Gains
 from hybridmap.calibration.legs import Motion
 from hybridmap.calibration.sessions import Drive, estimate_of, read_drive
 from hybridmap.cli.choose import choose
@@ -29,6 +28,7 @@ from hybridmap.evaluate.association import Pairs, known_at, travel
 from hybridmap.evaluate.trajectory import motion_errors
 from hybridmap.geometry import Array
 from hybridmap.metrics import Metric, to_json
+from hybridmap.odometry_model import NEUTRAL, Gains
 from hybridmap.streams.base import SelfMotion, Velocity
 from hybridmap.streams.synchronise import Synchroniser
 from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum

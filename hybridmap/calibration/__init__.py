@@ -1,8 +1,8 @@
 """Calibration of odometry: linear gain, turn gain and heading bias per metre, from closed loops or from a reference."""
 
 from hybridmap.calibration.estimate import Estimate
-from hybridmap.calibration.gains import NEUTRAL, Gains
 from hybridmap.calibration.legs import Legs, Motion
 from hybridmap.calibration.regression import Sighting, regress
+from hybridmap.odometry_model import NEUTRAL, Gains
 
 __all__ = ["NEUTRAL", "Estimate", "Gains", "Legs", "Motion", "Sighting", "regress"]

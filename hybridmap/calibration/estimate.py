@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.calibration.gains import NEUTRAL, Gains
 from hybridmap.geometry import Array
+from hybridmap.odometry_model import NEUTRAL, Gains
 
 SIGNIFICANT_SIGMAS = 3.0
 """An estimate differs from a value where it lies further off than this many standard deviations."""

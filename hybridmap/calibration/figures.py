@@ -8,9 +8,9 @@ import numpy as np
 import yaml
 
 from hybridmap.calibration.estimate import SIGNIFICANT_SIGMAS, Estimate
-from hybridmap.calibration.gains import GAIN_KEYS, Gains
 from hybridmap.config import Config
 from hybridmap.metrics import Metric
+from hybridmap.odometry_model import GAIN_KEYS, Gains
 
 _NAMED = (
     ("gain", "1", "k_m, metres a metre of odometry"),

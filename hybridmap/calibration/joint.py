@@ -22,16 +22,16 @@ from hybridmap import backends
 from hybridmap.backends.gtsam.factors import NoiseModels, anchor, factors, poses_of
 from hybridmap.backends.registry import RELAXATION
 from hybridmap.calibration.estimate import Estimate
-from hybridmap.calibration.gains import NEUTRAL, Gains
 from hybridmap.calibration.legs import Motion
 from hybridmap.calibration.observability import NotToldError, require_delay
-from hybridmap.calibration.odometry_terms import OdometryTerms, own_edges, terms_of
+from hybridmap.calibration.odometry_terms import OdometryTerms, terms_of
 from hybridmap.calibration.regression import CAUCHY, Sighting, require_told_by
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, between, compose, inverse
-from hybridmap.graph.connectivity import chain
+from hybridmap.graph.connectivity import chain, own_odometry
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.odometry_model import NEUTRAL, Gains
 
 BIAS_STARTS_RAD_M = (0.0, -0.02, 0.02, -0.06, 0.06, -0.12, 0.12)
 """Starts of the heading bias, rad/m; the drift of wheels seldom exceeds 3 deg/m."""
@@ -129,7 +129,7 @@ class Problem:
     def __init__(self, graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config: BackendsConfig) -> None:
         self.graph, self.config = graph, config
         self.motion, self.stamps_ns = motion, stamps_ns
-        self.own = own_edges(graph)
+        self.own = own_odometry(graph)
         self.key = graph.n_nodes
         self.terms = terms_of(graph, motion, stamps_ns, NEUTRAL)
         self._evaluated: tuple[bytes, Array, Array] | None = None

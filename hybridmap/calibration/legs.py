@@ -8,8 +8,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.calibration.gains import Gains, apply, mid_chords
 from hybridmap.geometry import Array, between, log
+from hybridmap.odometry_model import Gains, apply, chord_of_arc, twists
 from hybridmap.trajectory import NS_PER_S
 
 _Number = TypeVar("_Number", np.float64, np.complex128)
@@ -90,13 +90,12 @@ class Legs:
         """Derivative (L, 3, 4) of `predict` by (gain, turn gain, bias, delay), as a right perturbation.
 
         The heading of step k is the sum of the calibrated turns before it and half of its own; its derivatives are the same
-        sums of raw turn and of raw way forward. The derivative by the delay is a central difference.
+        sums of raw turn and of raw way forward. The chord of step k shortens as its own turn grows. The derivative by the delay
+        is a central difference.
         """
-        steps = self.motion.steps
-        turned, forward = steps[:, 2], steps[:, 0]
+        forward, left, turned = twists(self.motion.steps).T
         turn = gains.turn_gain * turned + gains.heading_bias_rad_m * forward
-        mid = mid_chords(steps)
-        z = (mid[:, 0] + 1j * mid[:, 1]) * np.exp(1j * (np.cumsum(turn) - 0.5 * turn))
+        z = (forward + 1j * left) * chord_of_arc(turn) * np.exp(1j * (np.cumsum(turn) - 0.5 * turn))
         to_end = np.exp(-1j * self._at(_running(turn), self.last_ns, delay_s))
         way = self._difference(_running(z), delay_s)
         out = np.zeros((len(self), 3, 4))
@@ -104,7 +103,8 @@ class Legs:
         for column, raw in ((1, turned), (2, forward)):
             before = np.cumsum(raw) - 0.5 * raw
             start = self._at(_running(raw), self.first_ns, delay_s)
-            bent = 1j * gains.gain * (self._difference(_running(z * before), delay_s) - start * way) * to_end
+            bent = self._difference(_running(z * (1j * before + _shortening(turn) * raw)), delay_s) - 1j * start * way
+            bent *= gains.gain * to_end
             out[:, 0, column], out[:, 1, column] = bent.real, bent.imag
             out[:, 2, column] = self._difference(_running(raw), delay_s)
         later, earlier = (self.predict(gains, delay_s + h) for h in (_DELAY_STEP_S, -_DELAY_STEP_S))
@@ -130,6 +130,13 @@ def chain(steps: Array) -> Array:
     z = (steps[:, 0] + 1j * steps[:, 1]) * np.exp(1j * heading[:-1])
     position = _running(z)
     return np.column_stack([position.real, position.imag, heading])
+
+
+def _shortening(turn: Array) -> Array:
+    """Derivative of the logarithm of `chord_of_arc` by the turn, 1/rad."""
+    small = np.abs(turn) < 1e-3
+    safe = np.where(small, 1.0, turn)
+    return np.where(small, -turn / 12.0, 0.5 / np.tan(0.5 * safe) - 1.0 / safe)
 
 
 def _running(values: NDArray[_Number]) -> NDArray[_Number]:

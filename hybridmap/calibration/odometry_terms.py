@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.calibration.gains import Gains
 from hybridmap.calibration.legs import Legs, Motion
 from hybridmap.calibration.regression import leg_length, leg_sigmas
 from hybridmap.geometry import Array
+from hybridmap.graph.connectivity import own_odometry
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.odometry_model import Gains
 
 _OVERLAP = 4
 
@@ -45,11 +46,6 @@ class OdometryTerms:
         return replace(self, whiten=self.whiten / scale)
 
 
-def own_edges(graph: PoseGraph) -> NDArray[np.int64]:
-    """Odometry edges between consecutive nodes."""
-    return np.flatnonzero((graph.kinds == EdgeKind.ODOMETRY) & (graph.targets == graph.sources + 1))
-
-
 def terms_of(
     graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], gains: Gains, *, consecutive: bool = False
 ) -> OdometryTerms:
@@ -62,7 +58,7 @@ def terms_of(
         gains: by which the direction of a long leg's chord is taken.
         consecutive: one term for every odometry edge, whatever registrations there are.
     """
-    own = own_edges(graph)
+    own = own_odometry(graph)
     carried = np.zeros(graph.n_nodes, dtype=bool)  # node k: joined to k + 1 by a registration
     if not consecutive:
         near = (graph.kinds == EdgeKind.REGISTRATION) & (np.abs(graph.targets - graph.sources) == 1)

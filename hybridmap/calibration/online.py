@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.calibration.estimate import Estimate
-from hybridmap.calibration.gains import Gains
 from hybridmap.calibration.legs import Motion
 from hybridmap.calibration.regression import Sighting, regress
 from hybridmap.config.mapping import CalibrationConfig
@@ -18,6 +17,7 @@ from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.odometry_model import Gains
 
 FIRST_M, EVERY_M = 50.0, 25.0
 """Travel before the first estimate and between two, m: legs between closures are then long enough to tell gains from noise."""

@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.calibration.estimate import Estimate
-from hybridmap.calibration.gains import NEUTRAL, Gains
 from hybridmap.calibration.legs import Legs, Motion
 from hybridmap.calibration.observability import MAX_SIGMA, NotToldError, require_delay, require_told
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array, between, wrap_angle
+from hybridmap.odometry_model import NEUTRAL, Gains
 
 LEG_M = (1.0, 16.0)
 """Shortest and longest leg, m; the longest is about the window over which dead reckoning is judged."""

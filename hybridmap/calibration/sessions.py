@@ -13,15 +13,16 @@ from numpy.typing import NDArray
 
 from hybridmap.backends.base import ODOMETRY
 from hybridmap.calibration.estimate import Estimate
-from hybridmap.calibration.gains import GAIN_KEYS, Gains, remove
 from hybridmap.calibration.legs import Legs, Motion
 from hybridmap.calibration.regression import Sighting, regress, require_leg
 from hybridmap.config import Config
 from hybridmap.config.gone import without_gone
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array, between
+from hybridmap.graph.connectivity import own_odometry
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.odometry_model import GAIN_KEYS, Gains, remove
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.streams.sensors import words
 from hybridmap.trajectory import NS_PER_S, Trajectory
@@ -239,7 +240,7 @@ def require_closures(drive: Drive) -> None:
 def corrected(drive: Drive, gains: Gains, delay_s: float) -> PoseGraph:
     """The graph with its odometry edges as calibrated odometry would have made them; uncertainties stay."""
     graph = drive.graph
-    own = np.flatnonzero((graph.kinds == EdgeKind.ODOMETRY) & (graph.targets == graph.sources + 1))
+    own = own_odometry(graph)
     deltas = graph.deltas.copy()
     legs = Legs(drive.motion, drive.stamps_ns[graph.sources[own]], drive.stamps_ns[graph.targets[own]])
     deltas[own] = legs.predict(gains, delay_s)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
@@ -59,6 +60,11 @@ def extend(graph: PoseGraph, placed: Array) -> Array:
         else:
             poses[node] = compose(poses[graph.targets[edge]], inverse(graph.deltas[edge]))
     return poses
+
+
+def own_odometry(graph: PoseGraph) -> NDArray[np.int64]:
+    """Indices of the odometry edges from a node to the next."""
+    return np.flatnonzero((graph.kinds == EdgeKind.ODOMETRY) & (graph.targets == graph.sources + 1))
 
 
 def chain(graph: PoseGraph) -> PoseGraph:

@@ -18,6 +18,7 @@ from hybridmap.neural.grid import FOURIER_MODES, Decoded, GridModules, PhaseDeco
 from hybridmap.neural.head_direction import HeadDirectionRing
 from hybridmap.neural.place import PlaceCells, PlaceProjection
 from hybridmap.neural.torus import LowModes, shift_sheets
+from hybridmap.odometry_model import Gains, step_of
 
 log = logging.getLogger(__name__)
 
@@ -44,6 +45,9 @@ class PathIntegrator:
     position and the place attractor's bump say where to start; where the modules do not agree there, the box around it is
     scanned, and then the attractor's other wraps (8 each way). The start picks a repetition and enters nowhere else: other
     activity means another pose.
+
+    Attributes:
+        gains: calibration of the steps to come; may be changed on the way.
     """
 
     def __init__(self, config: NeuralConfig, rng: np.random.Generator | None = None, dtype: DTypeLike = np.float64) -> None:
@@ -58,6 +62,7 @@ class PathIntegrator:
             ConfigError: the grid sheets do not settle with this kernel.
         """
         self.config = config
+        self.gains = Gains.of(config)
         self.spacings_m: NDArray[np.float64] = np.geomspace(config.spacing_min_m, config.spacing_max_m, config.modules)
         turned = np.radians(ORIENTATION_DEG + ORIENTATION_STEP_DEG * np.arange(config.modules))
         self.head_direction = HeadDirectionRing(config.head_direction_cells, dtype)
@@ -82,7 +87,7 @@ class PathIntegrator:
 
         Args:
             delta_robot: (3,) pose of the robot now in the frame of the robot at the last step, m and rad (`geometry.between`
-                of two odometry poses). Its chord is turned to the mid-point heading, so a gain on the turn bends the path.
+                of two odometry poses); the gains calibrate it (`odometry_model`).
             dt_s: seconds since the last step; it sets the theta rhythm. The sheets' time constant is one step, so their
                 dynamics do not need it.
 
@@ -99,20 +104,13 @@ class PathIntegrator:
             )
         if dx == 0.0 and dy == 0.0 and dyaw == 0.0:
             return
-        config = self.config
-        cos, sin = math.cos(0.5 * dyaw), math.sin(0.5 * dyaw)
-        forward, left = config.gain * (cos * dx + sin * dy), config.gain * (cos * dy - sin * dx)
-        c, s = self.head_direction.turn(config.turn_gain * dyaw + config.heading_bias_rad_m * dx)
+        forward, left, turn = step_of(dx, dy, dyaw, self.gains)
+        c, s = self.head_direction.turn(turn)
         translates = dx != 0.0 or dy != 0.0
-        if config.neuron_noise > 0.0:
+        if self.config.neuron_noise > 0.0:
             self._disturb(translates)
         if translates:
             self._translate(c * forward - s * left, s * forward + c * left, dt_s)
-
-    def use_gains(self, gain: float, turn_gain: float, heading_bias_rad_m: float) -> None:
-        """Integrate the steps to come with other gains (their meaning: `config/mapping.py: NeuralConfig`)."""
-        gains = {"gain": gain, "turn_gain": turn_gain, "heading_bias_rad_m": heading_bias_rad_m}
-        self.config = self.config.model_copy(update=gains)
 
     def step_velocity(self, v_m_s: float, omega_rad_s: float, dt_s: float) -> None:
         """Integrate constant speed and turn rate over `dt_s`, by the mid-point heading."""

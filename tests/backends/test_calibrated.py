@@ -6,8 +6,7 @@ from graphs_for_tests import laps
 from test_robust import ate
 
 from hybridmap import backends
-from hybridmap.backends.gtsam.calibrated import with_gains
-from hybridmap.geometry import between, compose, exp
+from hybridmap.geometry import between
 from hybridmap.graph.io import read_graph
 from hybridmap.study.false_loops import bend, inject
 
@@ -18,16 +17,6 @@ BIAS = 0.12
 def bent():
     graph, truth = laps(np.random.default_rng(0), nodes=150, per_lap=30, every=3)
     return bend(graph, BIAS), truth
-
-
-def test_neutral_gains_change_nothing_and_gains_act_on_the_arc():
-    rng = np.random.default_rng(0)
-    deltas = rng.normal(size=(20, 3)) * [1.0, 0.2, 0.5]
-    assert np.allclose(with_gains(deltas, np.array([1.0, 1.0, 0.0])), deltas)
-    twist = np.array([[0.5, 0.0, 0.1]])
-    assert np.allclose(with_gains(exp(twist), np.array([2.0, 3.0, 0.4])), exp(np.array([[1.0, 0.0, 0.3 + 0.2]])))
-    halves = with_gains(exp(0.5 * twist), np.array([1.1, 0.9, 0.2]))
-    assert np.allclose(compose(halves, halves), with_gains(exp(twist), np.array([1.1, 0.9, 0.2])))
 
 
 def test_a_bent_chain_is_straightened_and_no_true_loop_lost(bent):

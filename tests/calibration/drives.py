@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridmap.calibration.gains import Gains, remove
 from hybridmap.calibration.legs import Motion, chain
 from hybridmap.calibration.regression import Sighting
 from hybridmap.geometry import RelativePose, between, compose, exp, interpolate
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node
+from hybridmap.odometry_model import Gains, remove
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.streams.base import Rig
 
@@ -107,7 +107,7 @@ def _seen_again(truth, number, registered):
 def write_session(folder, one, rng, registered=True, gains=None, changes=(), poses=None, sensors="{}", rig=None):
     """A session folder around a drive; the stored odometry is what the given gains make of the raw one."""
     from hybridmap.backends.base import SolveReport, SolveStatus
-    from hybridmap.calibration.gains import NEUTRAL, apply
+    from hybridmap.odometry_model import NEUTRAL, apply
 
     used = gains or NEUTRAL
     experiences, chosen = experience_map(one, rng, registered=registered)

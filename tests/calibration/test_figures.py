@@ -8,9 +8,9 @@ import yaml
 
 from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.figures import calibrated, changes, metrics_of, verdict
-from hybridmap.calibration.gains import NEUTRAL, Gains
 from hybridmap.config import Config
 from hybridmap.errors import ConfigError
+from hybridmap.odometry_model import NEUTRAL, Gains
 
 SIGMAS = np.array([0.01, 0.01, 0.002, 0.02])
 

@@ -8,11 +8,12 @@ import pytest
 from hybridmap import backends
 from hybridmap.calibration import joint
 from hybridmap.calibration.estimate import Estimate
-from hybridmap.calibration.gains import Gains
-from hybridmap.calibration.odometry_terms import own_edges, terms_of
+from hybridmap.calibration.odometry_terms import terms_of
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import align, transform_points
+from hybridmap.graph.connectivity import own_odometry
+from hybridmap.odometry_model import Gains
 from tests.calibration.drives import circle, drive, experience_map
 
 CONFIG = BackendsConfig()
@@ -139,4 +140,4 @@ def test_derivatives_agree_with_differences(bent):
 def test_every_odometry_edge_enters_where_nothing_else_joins_the_chain(bent):
     graph, motion, stamps, _ = bent
     terms = terms_of(graph, motion, stamps, BENT)
-    assert len(terms.legs) == len(own_edges(graph)) == graph.n_nodes - 1
+    assert len(terms.legs) == len(own_odometry(graph)) == graph.n_nodes - 1

@@ -8,7 +8,6 @@ import pytest
 
 from hybridmap.calibration import online
 from hybridmap.calibration.estimate import Estimate
-from hybridmap.calibration.gains import NEUTRAL, Gains, remove
 from hybridmap.calibration.online import OnlineCalibration
 from hybridmap.calibration.regression import regress
 from hybridmap.config import Config
@@ -16,6 +15,7 @@ from hybridmap.config.mapping import CalibrationConfig
 from hybridmap.geometry import compose
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.mapper import Mapper
+from hybridmap.odometry_model import NEUTRAL, Gains, remove
 from tests.calibration.drives import GAINS, STEP_NS, drive, experience_map
 from tests.narrowing import known
 
@@ -107,7 +107,7 @@ def test_the_mapper_changes_its_integrator_and_says_why(monkeypatch):
         reasons += [update.reason for update in mapper.add(_sample(k, pose))]
         pose = compose(pose, remove(np.array([[0.055, 0.0, 0.0]]), NEUTRAL)[0])
     assert sum("odometry gains changed: gain 1.1" in reason for reason in reasons) == 1
-    assert Gains.of(mapper.integrator.config) == wanted
+    assert mapper.integrator.gains == wanted
     assert mapper.pose_map_robot[2] > 0.01
 
 

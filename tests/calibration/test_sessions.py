@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from hybridmap.calibration.estimate import Estimate
-from hybridmap.calibration.gains import NEUTRAL, Gains
 from hybridmap.calibration.sessions import alternating, by_reference, common_tree, corrected, estimate_of, read_drive
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import between
+from hybridmap.odometry_model import NEUTRAL, Gains
 from hybridmap.trajectory import Trajectory
 from tests.calibration.drives import GAINS, drive, experience_map, write_session
 from tests.store.sessions import RIG

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import yaml
 
-from hybridmap.calibration.gains import NEUTRAL
 from hybridmap.cli import main
 from hybridmap.config import Config
+from hybridmap.odometry_model import NEUTRAL
 from hybridmap.trajectory import Trajectory, write_tum
 from tests.calibration.drives import GAINS, drive, write_session
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridmap.backends.base import Outcome
 from hybridmap.backends.driver import Driver
@@ -23,14 +22,15 @@ from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.judging.weak import softened, truncated_cost
 from hybridmap.backends.objective import gate_of, residuals
 from hybridmap.config.backends import BackendsConfig
-from hybridmap.geometry import Array, adjoint, between, exp, log
-from hybridmap.graph.edges import EdgeKind
+from hybridmap.geometry import Array, adjoint, between, log
+from hybridmap.graph.connectivity import own_odometry
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.odometry_model import NEUTRAL, Gains, apply
 
 BIAS_STARTS_RAD_M = (0.0, -0.02, 0.02, -0.06, 0.06)
 """Starts of the heading bias, rad/m; the drift of wheels seldom exceeds 3 deg/m."""
 
-_NEUTRAL = np.array([1.0, 1.0, 0.0])
+_NEUTRAL = NEUTRAL.to_array()
 _PRIOR_SIGMA = np.array([0.02, 0.1, 0.2])  # so wide that it only holds what the drive leaves open, such as its scale
 _ROUNDS = 12
 _SETTLED = 1e-6
@@ -48,15 +48,14 @@ class _Found:
     cost: float
 
 
-def with_gains(deltas: Array, gains: Array) -> Array:
-    """Odometry edges (E, 3) as calibrated wheels would have measured them.
-
-    The robot is taken to have driven an arc: with the twist log(delta) = (x, y, w) the calibrated one is
-    (gain x, gain y, turn_gain w + bias x).
-    """
-    twist = log(deltas)
-    turn = gains[1] * twist[:, 2] + gains[2] * twist[:, 0]
-    return exp(np.column_stack([gains[0] * twist[:, :2], turn]))
+def with_calibrated_odometry(graph: PoseGraph, gains: Gains) -> PoseGraph:
+    """The graph with calibrated odometry; its noise grows with the gains, or a smaller map would always fit better."""
+    own = own_odometry(graph)
+    deltas, information = graph.deltas.copy(), graph.information.copy()
+    deltas[own] = apply(deltas[own], gains)
+    shrink = 1.0 / np.array([gains.gain, gains.gain, gains.turn_gain])
+    information[own] *= shrink[:, None] * shrink
+    return replace(graph, deltas=deltas, information=information)
 
 
 def create(name: str, config: BackendsConfig) -> Driver:
@@ -81,13 +80,12 @@ def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outc
 
 def _from(graph: PoseGraph, config: BackendsConfig, gains: Array, driven: Array | None) -> _Found:
     """Choose loops and calibrate in turn until neither changes."""
-    own = _own_edges(graph)
-    straight = _calibrated(graph, own, gains)
+    straight = with_calibrated_odometry(graph, Gains.from_array(gains))
     outcome = gnc.best(straight, config, driven)
     for _ in range(3):
         before = outcome.rejected
-        gains, poses = _calibrate(graph, own, gains, outcome, config)
-        straight = _calibrated(graph, own, gains)
+        gains, poses = _calibrate(graph, gains, outcome, config)
+        straight = with_calibrated_odometry(graph, Gains.from_array(gains))
         outcome = gnc.best(straight, config, poses)
         if outcome.rejected == before:
             break
@@ -95,14 +93,12 @@ def _from(graph: PoseGraph, config: BackendsConfig, gains: Array, driven: Array 
     return _Found(straight, outcome, gains, cost)
 
 
-def _calibrate(
-    graph: PoseGraph, own: NDArray[np.int64], gains: Array, outcome: Outcome, config: BackendsConfig
-) -> tuple[Array, Array]:
+def _calibrate(graph: PoseGraph, gains: Array, outcome: Outcome, config: BackendsConfig) -> tuple[Array, Array]:
     """Gauss-Newton on the three numbers, each time with the poses that are best for them; both."""
     kept, models = ~np.isin(graph.edge_ids, outcome.rejected), noise_models(config.robust)
     poses = outcome.poses
     for _ in range(_ROUNDS):
-        straight = _calibrated(graph, own, gains).with_edges(kept)
+        straight = with_calibrated_odometry(graph, Gains.from_array(gains)).with_edges(kept)
         poses = run("lm", factor_graph(straight, models), poses, config.max_iterations).poses
         step = _gain_step(graph.with_edges(kept), softened(straight, poses, config.robust), poses, gains)
         if not np.isfinite(step).all():
@@ -113,22 +109,9 @@ def _calibrate(
     return gains, poses
 
 
-def _own_edges(graph: PoseGraph) -> NDArray[np.int64]:
-    return np.flatnonzero((graph.kinds == EdgeKind.ODOMETRY) & (graph.targets == graph.sources + 1))
-
-
-def _calibrated(graph: PoseGraph, own: NDArray[np.int64], gains: Array) -> PoseGraph:
-    """The graph with calibrated odometry; its noise grows with the gains, or a smaller map would always fit better."""
-    deltas, information = graph.deltas.copy(), graph.information.copy()
-    deltas[own] = with_gains(deltas[own], gains)
-    shrink = 1.0 / np.array([gains[0], gains[0], gains[1]])
-    information[own] *= shrink[:, None] * shrink
-    return replace(graph, deltas=deltas, information=information)
-
-
 def _gain_step(raw: PoseGraph, straight: PoseGraph, poses: Array, gains: Array) -> Array:
     """Step (3,) of the calibration with the poses eliminated (a Schur complement)."""
-    own = _own_edges(raw)
+    own = own_odometry(raw)
     slope = np.stack([_slope(raw.deltas[own], straight.deltas[own], gains, k) for k in range(3)], axis=2)  # (O, 3, 3)
     r, information = residuals(straight, poses), straight.information
     slope[:, :2, 0] -= r[own, :2] / gains[0]
@@ -153,4 +136,4 @@ def _slope(raw: Array, straight: Array, gains: Array, number: int) -> Array:
     """Derivative (O, 3) of the residuals of odometry edges by one of the three numbers."""
     moved = gains.copy()
     moved[number] += _STEP
-    return np.asarray(-log(between(straight, with_gains(raw, moved))) / _STEP)
+    return np.asarray(-log(between(straight, apply(raw, Gains.from_array(moved)))) / _STEP)
