@@ -21,6 +21,7 @@ from hybridmap.streams import sensors
 from hybridmap.streams.base import InBag, Observation, Planned, Rig, Seen, SelfMotion, SensorKind, SensorPlan
 from hybridmap.streams.inspection import inspect_source
 from hybridmap.streams.order import sorted_order
+from hybridmap.streams.rosbag import RosbagStream
 from hybridmap.vision.base import View
 from tests.streams.recordings import NS, Recording
 
@@ -60,7 +61,7 @@ class SonarFrontEnd:
 
     def __init__(self, config, rig, seed, clock) -> None:
         self.ring = rig.sensors["ring"]
-        self.kept = []
+        self.kept: list[dict[str, np.ndarray]] = []
 
     lost_since = None
 
@@ -142,7 +143,8 @@ def echoes(pose: np.ndarray) -> np.ndarray:
     """Ranges to the walls of a square room, from a pose of the ring."""
     yaw = pose[2] + BEARINGS
     reach = [(np.sign(d) * HALF_ROOM_M - p) / d for d, p in ((np.cos(yaw), pose[0]), (np.sin(yaw), pose[1]))]
-    return np.minimum(*reach)
+    nearest: np.ndarray = np.minimum(*reach)
+    return nearest
 
 
 @pytest.fixture
@@ -169,6 +171,7 @@ def test_a_bag_is_mapped_stored_exported_and_shown(bag, tmp_path, sensor):
         first = store.map().node(0)
         np.testing.assert_allclose(store.rig.sensors["ring"].pose_base_ring, [0.1, 0.0, 0.0])
         back = SONAR.restore(store.keyframe(0), first.stamp_ns)
+        assert isinstance(back, Echoes)
         np.testing.assert_allclose(back.ranges_m, echoes(np.array([-0.8, 0.0, 0.0])), atol=1e-3)
     export_session(tmp_path / "out", "ply", tmp_path / "cloud.ply")
     points = np.asarray(o3d.io.read_point_cloud(str(tmp_path / "cloud.ply")).points)
@@ -191,7 +194,9 @@ def test_what_a_bag_lacks_is_said_in_the_words_of_the_kind(tmp_path):
     for i in range(3):
         recording.odometry(100 * NS + i * NS // 10, 0.1 * i)
     path = recording.write(tmp_path / "bare.mcap")
-    assert "sonar echoes" in choose(str(path), None, {}).stream.remarks[-1]
+    stream = choose(str(path), None, {}).stream
+    assert isinstance(stream, RosbagStream)
+    assert "sonar echoes" in stream.remarks[-1]
     with pytest.raises(StreamError, match="no sonar"):
         choose(str(path), None, {"vision.sensor": "sonar"})
 

@@ -313,8 +313,12 @@ def killed_at(move, last, done):
 def test_one_run_at_a_time_writes_a_place(user, tmp_path, place, fresh):
     ready = fork.Event()
 
+    def say_and_wait():
+        ready.set()
+        signal.pause()
+
     def other():
-        run(user, place, "of another", midway=lambda: (ready.set(), signal.pause()))
+        run(user, place, "of another", midway=say_and_wait)
 
     run(user, place, "old")
     process = in_another_process(other)

@@ -7,6 +7,7 @@ from hybridmap.config import Config
 from hybridmap.errors import ConfigError
 from hybridmap.mapper import Mapper
 from hybridmap.plugins import Table
+from hybridmap.streams.base import Rig
 
 
 def table():
@@ -40,9 +41,14 @@ def test_an_unknown_front_end_is_told_what_there_is():
 
 
 def test_a_registered_front_end_is_made_by_its_name(monkeypatch):
-    monkeypatch.setattr(vision, "_FRONT_ENDS", Table("front-end", {}, "hybridmap.nothing", ConfigError))
-    made = []
-    vision.register("sonar", lambda *given: made.append(given) or "front-end")
+    monkeypatch.setattr(vision, "FRONT_ENDS", Table("front-end", {}, "hybridmap.nothing", ConfigError))
+    made, front_end = [], object()
+
+    def make(config, rig, seed, clock):
+        made.append((config, rig, seed))
+        return front_end
+
+    vision.register("sonar", make)
     config = Config.load(None, {"vision.sensor": "sonar"}).vision
-    assert vision.create_front_end(config, rig := object(), 7) == "front-end"
-    assert made[0][:3] == (config, rig, 7)
+    assert vision.create_front_end(config, rig := Rig(), 7) is front_end
+    assert made == [(config, rig, 7)]

@@ -35,7 +35,7 @@ Bytes = NDArray[np.uint8]
 def views(count: int, bands: int, rng: np.random.Generator) -> NDArray[np.float32]:
     """Smooth random profiles (count, bands, WIDTH), z-normalised."""
     rough = rng.standard_normal((count, bands, WIDTH + 6), dtype=np.float32)
-    smooth = sum(rough[:, :, at : at + WIDTH] for at in range(7))
+    smooth = np.sum([rough[:, :, at : at + WIDTH] for at in range(7)], axis=0)
     return np.asarray(normalised(smooth.reshape(-1, WIDTH), "z"), dtype=np.float32).reshape(count, bands, WIDTH)
 
 

@@ -17,7 +17,7 @@ from hybridmap.config.mapping import NeuralConfig
 from hybridmap.metrics import Metric, to_json
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.grid import FOURIER_MODES, SOFTPLUS_SHARPNESS, kernel_spectrum
-from hybridmap.verification.path_error import wander
+from hybridmap.verification.drives import wander
 
 ODOMETRY_HZ = 100.0
 STEP_M = 0.005  # 0.5 m/s

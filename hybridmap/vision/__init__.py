@@ -22,9 +22,10 @@ def _none(config: VisionConfig, rig: Rig, seed: int, clock: StageClock) -> None:
     del config, rig, seed, clock
 
 
-_FRONT_ENDS: Table[str | Factory] = Table(
+FRONT_ENDS: Table[str | Factory] = Table(
     "front-end", {**{kind.name: kind.front_end for kind in sensors.kinds()}, "none": _none}, "hybridmap.front_ends", ConfigError
 )
+"""Front-ends by name; `register` adds to it."""
 
 
 def register(name: str, factory: Factory) -> None:
@@ -35,7 +36,7 @@ def register(name: str, factory: Factory) -> None:
     Raises:
         ConfigError: there is one of this name already.
     """
-    _FRONT_ENDS.register(name, factory)
+    FRONT_ENDS.register(name, factory)
 
 
 def create_front_end(config: VisionConfig, rig: Rig, seed: int, clock: StageClock | None = None) -> FrontEnd | None:
@@ -65,4 +66,4 @@ def _named(name: str, rig: Rig) -> str | Factory:
             return kind.front_end
         if kind.name == name:
             raise StreamError(f"vision.sensor is {name}, but the source has no {kind.needs}: choose another sensor or none")
-    return _FRONT_ENDS[name]
+    return FRONT_ENDS[name]
