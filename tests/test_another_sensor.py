@@ -21,7 +21,7 @@ from hybridmap.streams import sensors
 from hybridmap.streams.base import InBag, Observation, Planned, Rig, Seen, SelfMotion, SensorKind, SensorPlan
 from hybridmap.streams.inspection import inspect_source
 from hybridmap.streams.order import sorted_order
-from hybridmap.streams.rosbag import RosbagStream
+from hybridmap.streams.rosbag import BagStream
 from hybridmap.vision.base import View
 from tests.streams.recordings import NS, Recording
 
@@ -195,7 +195,7 @@ def test_what_a_bag_lacks_is_said_in_the_words_of_the_kind(tmp_path):
         recording.odometry(100 * NS + i * NS // 10, 0.1 * i)
     path = recording.write(tmp_path / "bare.mcap")
     stream = choose(str(path), None, {}).stream
-    assert isinstance(stream, RosbagStream)
+    assert isinstance(stream, BagStream)
     assert "sonar echoes" in stream.remarks[-1]
     with pytest.raises(StreamError, match="no sonar"):
         choose(str(path), None, {"vision.sensor": "sonar"})
