@@ -17,8 +17,7 @@ from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.connectivity import extend, require_connected
-from hybridmap.graph.growth import Change, difference, prefix
-from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.graph.pose_graph import Change, PoseGraph, difference, prefix
 
 _ROUNDING = 1e-9  # of chi2: a chain without loops has none, and no solver finds less
 

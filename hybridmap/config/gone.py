@@ -19,7 +19,7 @@ neural neural/band.py band_cells band_width
 neural neural/grid.py decode_box_m
 neural neural/path_integrator.py orientation_deg orientation_step_deg neuron_noise_seed
 neural.place neural/path_integrator.py theta_hz
-neural.place neural/attractor.py attractor_width_cells
+neural.place neural/place.py attractor_width_cells
 neural.place neural/place.py grid_inputs_side recruit_threshold inhibition max_cells
 calibration calibration/online.py first_m every_m
 backends.relaxation backends/relaxation/relaxing.py tolerance_m

@@ -12,11 +12,10 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from hybridmap.config.mapping import NeuralConfig
 from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import Array, compose, inverse
-from hybridmap.neural.attractor import PlaceAttractor
 from hybridmap.neural.band import BandRings
 from hybridmap.neural.grid import FOURIER_MODES, Decoded, GridModules, PhaseDecoder, kernel_spectrum, relu, softplus
 from hybridmap.neural.head_direction import HeadDirectionRing
-from hybridmap.neural.place import PlaceCells, PlaceProjection
+from hybridmap.neural.place import PlaceAttractor, PlaceCells, PlaceProjection
 from hybridmap.neural.torus import LowModes, shift_sheets
 from hybridmap.odometry_model import Gains, step_of
 

@@ -1,4 +1,4 @@
-"""Place cells: competitive Hebbian learning from grid cells, with recruitment."""
+"""Place cells: recruited from the grid, and the sheet of cells that settles on one of them."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import logging
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from hybridmap.config.mapping import PlaceConfig
+from hybridmap.geometry import Array
+from hybridmap.neural.torus import split_shift
 
 GRID_INPUTS_SIDE = 4
 """Grid cells along a side of each sheet that project to place cells; it divides every sheet's side."""
@@ -115,3 +117,125 @@ class PlaceProjection:
     def onto(self, rates: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the input (N * N,) of place cells with rates (cells,), or (N * N, P) of rates (cells, P)."""
         return np.asarray(self._weights[: len(rates)].T @ rates)
+
+
+ATTRACTOR_WIDTH_CELLS = 1.4
+"""Standard deviation of the attractor's bump, cells: wide enough to move smoothly from cell to cell."""
+
+
+class PlaceAttractor:
+    """Sheet of N x N place-attractor cells (paper eq. 10).
+
+    A step moves the activity by whole cells (floor) and by the residual, spreads it with Gaussian weights of the bump's own
+    width, and lets the cells compete: rates are squared and normalised (Deneve, Latham and Pouget 1999). A Gaussian of that
+    width is the fixed point, the largest of several bumps wins, and since all of it is smooth the bump does not stick to cells.
+
+    Attributes:
+        activity: (N, N) rates of sum one, first index x, second y; the whole state.
+    """
+
+    def __init__(
+        self, side: int, cell_m: float, width_cells: float = ATTRACTOR_WIDTH_CELLS, dtype: DTypeLike = np.float64
+    ) -> None:
+        self.cell_m = cell_m
+        self._side = side
+        wave = 2.0 * np.pi * np.arange(side // 2) / side
+        angle = np.outer(wave, np.arange(side))
+        gain = np.exp(-0.5 * (width_cells * wave) ** 2) * np.where(wave == 0, 1.0, 2.0) / side
+        quarter = np.full(len(wave), -0.5 * np.pi)  # the cosine of an angle less a quarter is its sine
+        self._wave = np.stack([np.tile(wave, 2), np.concatenate([0.0 * wave, quarter])]).astype(dtype)
+        self._residuals = np.ones((2, 2), dtype=dtype)
+        kernel = np.concatenate([gain[:, None] * np.cos(angle), gain[:, None] * np.sin(angle)])
+        self._kernel = np.ascontiguousarray(np.tile(kernel, 3)).astype(dtype)
+        self._lines = np.empty((2, 3 * side), dtype=dtype)
+        self._along_x, self._along_y = (_circulants(line, side) for line in self._lines)
+        self._silent = np.zeros((side, side), dtype=dtype)
+        self._phasors = np.exp(1j * angle[1])
+        self._remappings: dict[tuple[int, int], NDArray[np.int64]] = {}
+        offset = (np.arange(side) + side // 2) % side - side // 2
+        line = np.exp(-0.5 * (offset / width_cells) ** 2)
+        self.activity: NDArray[np.floating] = (np.outer(line, line) / line.sum() ** 2).astype(dtype)
+
+    @property
+    def extent_m(self) -> float:
+        """The sheet repeats after this many metres."""
+        return self._side * self.cell_m
+
+    def step(self, displacement_m: NDArray[np.float64]) -> None:
+        """Move the bump by a displacement (2,) in the world, m, and let the cells compete once."""
+        x, y = displacement_m.tolist()
+        whole_x, self._residuals[0, 0] = split_shift(x / self.cell_m)
+        whole_y, self._residuals[1, 0] = split_shift(y / self.cell_m)
+        phase = self._residuals.dot(self._wave)
+        np.cos(phase, out=phase)
+        phase.dot(self._kernel, out=self._lines)
+        side = self._side
+        row, column = -whole_x % side, -whole_y % side
+        along_x, along_y = self._along_x[row : row + side], self._along_y[column : column + side]
+        spread = along_x.dot(self.activity).dot(along_y.T)
+        np.maximum(spread, self._silent, out=spread)
+        total = float(np.vdot(spread, spread))
+        spread *= spread
+        spread *= 1.0 / total
+        self.activity = spread
+
+    def receive(self, place_input: NDArray[np.floating], share: float) -> None:
+        """Mix the input (N * N,) of the place cells into the activity, as a share of its sum; no input changes nothing."""
+        total = float(place_input.sum())
+        if total > 0.0:
+            given = (place_input * (share / total)).reshape(self.activity.shape).astype(self.activity.dtype)
+            self.activity = (1.0 - share) * self.activity + given
+
+    def settle(self, iterations: int = 10) -> None:
+        """Let the cells compete without self-motion, until one bump is left."""
+        for _ in range(iterations):
+            self.step(np.zeros(2))
+
+    def position_m(self) -> Array:
+        """Return the bump's position (2,) by population vector, m in [0, extent)."""
+        return self.position_of(self.activity)
+
+    def position_of(self, activity: NDArray[np.floating]) -> Array:
+        """Return the position (2,) that an activity (N, N) stands for, m in [0, extent)."""
+        z = np.array([self._phasors @ activity.sum(axis=1), self._phasors @ activity.sum(axis=0)])
+        return np.asarray(np.angle(z) / (2.0 * np.pi) % 1.0 * self.extent_m)
+
+    def unwrapped_m(self, near_m: Array) -> Array:
+        """Return the repetition of the bump's position (2,) that is nearest to `near_m`, m."""
+        offset = self.position_m() - near_m
+        return near_m + offset - self.extent_m * np.round(offset / self.extent_m)
+
+    def code(self, near_m: Array) -> NDArray[np.float32]:
+        """Return the rates (N * N,) of unit length, with cells drawn anew (remapped) in each repetition of the sheet.
+
+        Around the origin the code is the sheet itself. A place one wrap away is carried by other cells, as real place cells
+        remap; `near_m` (2,) says which repetition the bump is in.
+        """
+        code = np.zeros(self._side**2)
+        columns = self._repetitions(float(near_m[1]))
+        for tx, rows in self._repetitions(float(near_m[0])):
+            for ty, cols in columns:
+                code[self._remapping(tx, ty)[rows, cols]] += self.activity[rows, cols]
+        return np.asarray(code / math.sqrt(float(code @ code)), dtype=np.float32)
+
+    def _repetitions(self, near_m: float) -> list[tuple[int, slice]]:
+        """The repetitions of the sheet that the cells nearest to a coordinate along an axis are in, each with its cells."""
+        half = self._side // 2
+        first = math.ceil(near_m / self.cell_m) - half
+        tile, cell = divmod(first, self._side)
+        return [(tile, slice(cell, None)), (tile + 1, slice(None, cell))][: 2 if cell else 1]
+
+    def _remapping(self, tx: int, ty: int) -> NDArray[np.int64]:
+        """Which cell stands for each cell (N, N) of the sheet in its repetition (tx, ty); the same in every run."""
+        if (tx, ty) not in self._remappings:
+            size = self._side**2
+            seed = [abs(tx), abs(ty), int(tx < 0), int(ty < 0)]
+            drawn = np.arange(size) if tx == ty == 0 else np.random.default_rng(seed).permutation(size)
+            self._remappings[tx, ty] = drawn.reshape(self._side, self._side)
+        return self._remappings[tx, ty]
+
+
+def _circulants(line: NDArray[np.floating], side: int) -> NDArray[np.floating]:
+    """View (2 N, N) of a line laid end to end three times (3 N,): rows w to w + N are its circulant, moved by -w cells."""
+    stride = line.strides[0]
+    return np.lib.stride_tricks.as_strided(line[side:], shape=(2 * side, side), strides=(stride, -stride))

@@ -18,9 +18,8 @@ from hybridmap.errors import HybridMapError, StudyError
 from hybridmap.geometry import Array, between, compose, exp
 from hybridmap.graph.connectivity import chain
 from hybridmap.graph.edges import EdgeKind
-from hybridmap.graph.growth import prefix
 from hybridmap.graph.io import read_graph
-from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.graph.pose_graph import PoseGraph, prefix
 from hybridmap.study import provenance
 from hybridmap.study.model import SettingConfig, SourceConfig, SyntheticConfig
 from hybridmap.trajectory import Trajectory

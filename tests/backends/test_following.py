@@ -15,7 +15,7 @@ from hybridmap.config.backends import BackendsConfig, Isam2Config
 from hybridmap.errors import BackendError, GraphError
 from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind
-from hybridmap.graph.growth import difference, prefix
+from hybridmap.graph.pose_graph import difference, prefix
 
 FOLLOWERS = ["gtsam-lm", "gtsam-cauchy", "gtsam-gnc", "gtsam-isam2", "relaxation-ratslam", "odometry"]
 

@@ -13,8 +13,8 @@ from hybridmap.backends.gtsam.factors import NoiseModels, poses_of
 from hybridmap.backends.gtsam.smoother import Smoother
 from hybridmap.errors import BackendError
 from hybridmap.geometry import between, log
-from hybridmap.graph.growth import prefix
 from hybridmap.graph.io import read_graph
+from hybridmap.graph.pose_graph import prefix
 from hybridmap.study.false_loops import inject
 
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridmap.neural.attractor import PlaceAttractor
+from hybridmap.neural.place import PlaceAttractor
 
 moves = st.floats(-3.0, 3.0)
 

@@ -10,10 +10,9 @@ import pytest
 
 from hybridmap.config.inputs import CameraConfig, LaserScannerConfig
 from hybridmap.simulation import camera, laser
-from hybridmap.simulation.atlas import build_atlas
 from hybridmap.simulation.camera import CameraModel
 from hybridmap.simulation.laser import LaserModel
-from hybridmap.simulation.scene import Scene
+from hybridmap.simulation.scene import Scene, build_atlas
 from hybridmap.simulation.worlds import build_world
 
 CAMERA = CameraConfig(width_px=160, height_px=120)

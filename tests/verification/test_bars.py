@@ -7,7 +7,7 @@ import pytest
 
 from hybridmap.config.mapping import NeuralConfig
 from hybridmap.neural import PathIntegrator
-from hybridmap.neural.attractor import PlaceAttractor
+from hybridmap.neural.place import PlaceAttractor
 from hybridmap.verification import path_error, rate_maps, rows_of, shadow
 from tests.verification.cells_for_tests import TINY
 

@@ -15,8 +15,7 @@ from hybridmap.backends.gtsam.factors import NoiseModels, anchor, collected, fac
 from hybridmap.backends.gtsam.initial import best_start
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
-from hybridmap.graph.growth import difference
-from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.graph.pose_graph import PoseGraph, difference
 
 _MAKE: dict[str, tuple[Callable[[], Any], Callable[..., Any]]] = {
     "lm": (gtsam.LevenbergMarquardtParams, gtsam.LevenbergMarquardtOptimizer),

@@ -27,8 +27,7 @@ from hybridmap.backends.objective import SLACK, gate_of, squared_norms, unit_var
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.connectivity import extend
-from hybridmap.graph.growth import prefix
-from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.graph.pose_graph import PoseGraph, prefix
 
 CHUNK_NODES = 500
 """`grow`: nodes a chunk. Odometry drifts little over so many, and a large graph takes few chunks."""

@@ -14,8 +14,7 @@ from hybridmap.backends.judging.weak import truncated_cost
 from hybridmap.backends.objective import gate_of, squared_norms, total
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
-from hybridmap.graph.growth import Change, prefix
-from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.graph.pose_graph import Change, PoseGraph, prefix
 
 PATIENCE = 0.5
 """Closures wait while together they could move no pose by more than this many of its standard deviations: not to be seen."""

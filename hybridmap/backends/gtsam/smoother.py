@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from hybridmap.backends.gtsam.factors import NoiseModels, anchor, collected, factors, poses_of, values
 from hybridmap.geometry import Array, compose, exp
-from hybridmap.graph.growth import Change, difference
-from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.graph.pose_graph import Change, PoseGraph, difference
 
 RELINEARIZE_M, RELINEARIZE_RAD = 0.1, 0.01
 """Largest steps of a variable before it is linearised anew: edges bend with headings, not with positions."""

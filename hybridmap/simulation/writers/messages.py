@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from hybridmap.geometry import Array, between, log
 from hybridmap.output import Kind
-from hybridmap.simulation.writers.mounting import quaternion_of_rotation
-from hybridmap.simulation.writers.quaternions import quaternion_of
+from hybridmap.simulation.writers.mounting import quaternion_of, quaternion_of_rotation
 from hybridmap.streams.base import SelfMotion
 from hybridmap.streams.laser import Laser, LaserScan
 from hybridmap.streams.rgbd import Camera, RgbdFrame
