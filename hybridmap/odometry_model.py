@@ -28,6 +28,8 @@ from hybridmap.geometry import Array, wrap_angle
 GAIN_KEYS = ("gain", "turn_gain", "heading_bias_rad_m")
 """Their names in the section `neural` of a configuration."""
 
+_STRAIGHT_RAD = 1e-9  # turn up to which chord and arc are the same number
+
 
 @dataclass(frozen=True, slots=True)
 class Gains:
@@ -82,11 +84,11 @@ def step_of(dx_m: float, dy_m: float, dyaw_rad: float, gains: Gains) -> tuple[fl
     """One raw step calibrated, quickly: its chord (forward, left; m) seen from the heading half-way, and its turn, rad."""
     cos, sin = math.cos(0.5 * dyaw_rad), math.sin(0.5 * dyaw_rad)
     forward, left = cos * dx_m + sin * dy_m, cos * dy_m - sin * dx_m
-    shorter = 2.0 * sin / dyaw_rad if dyaw_rad else 1.0
+    shorter = 2.0 * sin / dyaw_rad if abs(dyaw_rad) > _STRAIGHT_RAD else 1.0
     turn = gains.turn_gain * dyaw_rad + gains.heading_bias_rad_m * (forward / shorter)
     scale = gains.gain
     if turn != dyaw_rad:
-        scale *= (2.0 * math.sin(0.5 * turn) / turn if turn else 1.0) / shorter
+        scale *= (2.0 * math.sin(0.5 * turn) / turn if abs(turn) > _STRAIGHT_RAD else 1.0) / shorter
     return scale * forward, scale * left, turn
 
 

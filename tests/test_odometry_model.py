@@ -12,10 +12,10 @@ from hybridmap.calibration import Legs, Motion
 from hybridmap.geometry import compose, exp, log, wrap_angle
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
-from hybridmap.odometry_model import NEUTRAL, Gains, apply, remove, step_of
+from hybridmap.odometry_model import NEUTRAL, Gains, apply, remove, step_of, steps_of, twists
 
 gains_of = st.builds(Gains, st.floats(0.5, 1.5), st.floats(0.5, 1.5), st.floats(-0.3, 0.3))
-steps_of = st.tuples(st.floats(-2.0, 2.0), st.floats(-1.0, 1.0), st.floats(-1.5, 1.5)).map(np.array)
+raw_steps = st.tuples(st.floats(-2.0, 2.0), st.floats(-1.0, 1.0), st.floats(-1.5, 1.5)).map(np.array)
 
 
 def by_the_integrator(step, gains):
@@ -38,28 +38,29 @@ def by_the_graph(step, gains):
     return with_calibrated_odometry(graph, gains).deltas[0]
 
 
-@settings(max_examples=200, deadline=None)
-@given(steps_of, gains_of)
+@settings(max_examples=100, deadline=None)
+@given(raw_steps, gains_of)
 def test_integrator_regression_and_graph_have_one_model(step, gains):
     x, y, turn = log(step)
     exact = exp([gains.gain * x, gains.gain * y, gains.turn_gain * turn + gains.heading_bias_rad_m * x])
-    for calibrated in (by_the_integrator, by_the_regression, by_the_graph):
-        apart = calibrated(step, gains) - exact
+    one = by_the_integrator(step, gains)
+    for other, tolerance in ((by_the_regression(step, gains), 1e-12), (by_the_graph(step, gains), 1e-12), (exact, 1e-10)):
+        apart = other - one
         apart[2] = wrap_angle(apart[2])
-        np.testing.assert_allclose(apart, 0.0, atol=1e-12)
+        np.testing.assert_allclose(apart, 0.0, atol=tolerance)  # `exp` loses digits where the turn is small
 
 
 @settings(max_examples=100, deadline=None)
-@given(steps_of, gains_of)
+@given(raw_steps, gains_of)
 def test_remove_undoes_apply(step, gains):
     gains = replace(gains, heading_bias_rad_m=0.3 * gains.heading_bias_rad_m)
     np.testing.assert_allclose(remove(apply(step[None], gains), gains)[0], step, atol=1e-12)
 
 
 @settings(max_examples=100, deadline=None)
-@given(steps_of, gains_of, st.integers(2, 7))
+@given(raw_steps, gains_of, st.integers(2, 7))
 def test_an_arc_in_parts_is_the_whole_arc(step, gains, parts):
-    part = apply(exp(log(step) / parts)[None], gains)[0]
+    part = apply(steps_of(twists(step[None]) / parts), gains)[0]
     pose = np.zeros(3)
     for _ in range(parts):
         pose = compose(pose, part)
@@ -68,7 +69,7 @@ def test_an_arc_in_parts_is_the_whole_arc(step, gains, parts):
     np.testing.assert_allclose(apart, 0.0, atol=1e-12)
 
 
-@given(steps_of)
+@given(raw_steps)
 def test_neutral_gains_change_nothing(step):
     np.testing.assert_allclose(apply(step[None], NEUTRAL)[0], step, atol=1e-14)
     forward, left, turn = step_of(*step.tolist(), NEUTRAL)
