@@ -149,10 +149,10 @@ def staged(*targets: Path, kind: Kind | None = None, overwrite: bool = False) ->
     Raises:
         OutputError: a target is there and may not be replaced, another run is writing it, or it cannot be written.
     """
-    work = targets[0].absolute()
-    work = work.with_name(f".{work.name}.new")
     with _named(targets[0]), ExitStack() as stack:
         _refuse(targets, kind, overwrite=overwrite)
+        work = targets[0].absolute()
+        work = work.with_name(f".{work.name}.new")
         stack.enter_context(_locked(work, targets[0]))
         _clear(work, targets[0])
         stack.callback(_put_away, work, targets[0])
@@ -255,13 +255,8 @@ def _take_place(new: Path, target: Path) -> None:
     if not (target.is_dir() or (new.is_dir() and target.exists())):
         new.replace(target)
         return
-    old = new.with_name(PREVIOUS)
-    target.rename(old)
-    try:
-        new.rename(target)
-    except BaseException:
-        old.rename(target)
-        raise
+    target.rename(new.with_name(PREVIOUS))
+    new.rename(target)
 
 
 def _remove(path: Path) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -64,7 +66,7 @@ def recorded_folder(path, text, midway, overwrite):
 
 
 def exported(path, text, midway, overwrite):
-    other = path.with_suffix(".pgm")
+    other = path.parent / f"{path.stem}.pgm"
     with staged(path, other, overwrite=overwrite) as work:
         write_text(work / other.name, text)
         midway()
@@ -335,11 +337,58 @@ def test_one_run_at_a_time_writes_a_place(user, tmp_path, place, fresh):
 
 
 def test_a_look_at_a_folder_does_not_keep_a_run_from_starting(tmp_path):
-    assert not is_held(tmp_path)
+    looking = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(looking, fcntl.LOCK_SH)  # as `is_held` does for an instant
+    look = threading.Timer(0.05, os.close, [looking])
+    look.start()
     with SessionFolder(tmp_path).writing():
         assert is_held(tmp_path)
         write_text(tmp_path / "map.db", "new")
     assert not is_held(tmp_path)
+    look.join()
+
+
+def test_a_folder_that_the_run_before_takes_away_is_made_anew(tmp_path, monkeypatch):
+    lock, folder = fcntl.flock, tmp_path / "out"
+
+    def taken_away_first(handle, how):
+        monkeypatch.setattr(fcntl, "flock", lock)
+        folder.rmdir()
+        lock(handle, how)
+
+    monkeypatch.setattr(fcntl, "flock", taken_away_first)
+    with held(folder, COMPARISON):
+        assert is_held(folder)
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused_before_anything_runs(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write to any folder
+    with pytest.raises(OutputError, match="cannot be written: Permission denied"):
+        run(USERS["comparison"], tmp_path, "new", midway=lambda: pytest.fail("it ran"))
+
+
+def test_a_hidden_folder_of_somebody_else_is_not_taken_for_an_old_output(tmp_path):
+    run(USERS["session"], tmp_path, "old")
+    write_text(tmp_path / ".previous" / "notes.txt", "mine")
+    before = contents(tmp_path)
+    with pytest.raises(OutputError, match="not empty"):
+        run(USERS["session"], tmp_path, "new")
+    assert contents(tmp_path) == before
+
+
+def test_a_recording_that_a_killed_run_had_set_aside_comes_back_and_is_not_overwritten_by_chance(tmp_path):
+    run(USERS["recorded folder"], tmp_path / "out", "old")
+    before = contents(tmp_path)
+    (tmp_path / ".out.new").mkdir()
+    (tmp_path / "out").rename(tmp_path / ".out.new" / ".previous")
+    with pytest.raises(OutputError, match="holds a recording already"):
+        run(USERS["recorded folder"], tmp_path / "out", "new", overwrite=False)
+    assert contents(tmp_path) == before
+
+
+def test_the_root_is_no_file():
+    with pytest.raises(OutputError, match="is a folder"):
+        run(USERS["exported files"], Path("/"), "new")
 
 
 def test_what_ended_just_before_a_kill_is_not_replaced_by_the_old(tmp_path, monkeypatch):
