@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
     from hybridmap.study.pools import Pool
+    from hybridmap.study.statistics import Summary
     from hybridmap.study.study import Study
 
-_HEADLINES = ("ate_m", "false_kept", "own_lost")
+_ERRORS = {"ate_m": "ATE", "relation_m": "relation error"}
+_COLUMNS = {"false_kept": "false kept", "own_lost": "own lost", "loop_recall": "recall", "found_m": "found after (m)"}
 
 
 def study(
@@ -25,10 +27,10 @@ def study(
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. seeds=3.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
-    """Run a study: ATE (m) against the truth or the clean optimum, chi2, false loops kept, true loops lost, with paired
-    statistics over the seeds; tables and a page.
+    """Run a study: errors against the truth, verified relations or the clean optimum, chi2, false loops kept, true loops
+    lost, with paired statistics over the seeds; tables and a page.
 
-    Killed at any time, it goes on where it was. A cell that fails is a row that says so.
+    Killed at any time, it goes on where it was. A cell that fails is a row that says so. Exit code 1 where a bar is missed.
     """
     _one_thread()
     from hybridmap.cli.choose import parse_settings
@@ -43,9 +45,11 @@ def study(
     page = write_study_page(done)
     if as_json:
         emit(done.head, done.metrics, as_json=True)
-        return
-    _show(done)
-    typer.echo(f"page: {page}")
+    else:
+        _show(done)
+        typer.echo(f"page: {page}")
+    if done.missed:
+        raise typer.Exit(1)
 
 
 def _one_thread() -> None:
@@ -68,7 +72,7 @@ def _show(done: Study) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from hybridmap.report.study_page import remarks
+    from hybridmap.report.study_page import error_of, remarks
     from hybridmap.study.model import quoted
 
     console = Console()
@@ -79,30 +83,42 @@ def _show(done: Study) -> None:
     table = Table(
         title=f"{done.head['study']}: {done.head['cells']} cells ({counts}); {known} known before", title_justify="left"
     )
+    measure, others = error_of(done), [name for name in _COLUMNS if _known(done, name)]
     table.add_column("source / setting / false loops")
     table.add_column("back-end")
-    for column in ("solved", "median ATE (m)", f"mean minus {quoted(done.head['baseline'])} (m)", "false kept", "own lost"):
+    for column in ("solved", f"median {_ERRORS[measure]} (m)", f"mean minus {quoted(done.head['baseline'])} (m)"):
         table.add_column(column, justify="right")
-    for line in _lines(done):
+    for name in others:
+        table.add_column(_COLUMNS[name], justify="right")
+    for line in _lines(done, measure, others):
         table.add_row(*line)
     console.print(table)
+    for verdict in done.missed:
+        unit = "" if verdict.unit == "1" else f" {verdict.unit}"
+        missed = f"missed: {verdict.label}: {verdict.bar.figure} {verdict.value:.4g}{unit}, {verdict.said}"
+        console.print(missed, soft_wrap=True, markup=False, highlight=False)
+    if done.verdicts:
+        console.print(f"bars: {len(done.verdicts) - len(done.missed)} of {len(done.verdicts)} kept", highlight=False)
     for remark in remarks(done):
         where = f"{remark.count} cells {remark.status}: {remark.where}, {remark.backend}"
         console.print(f"note: {where}: {remark.message}", soft_wrap=True, markup=False, highlight=False)
 
 
-def _lines(done: Study) -> list[list[str]]:
+def _known(done: Study, measure: str) -> bool:
+    return any(one.measure == measure and one.solved for one in done.summaries)
+
+
+def _lines(done: Study, measure: str, others: list[str]) -> list[list[str]]:
     from hybridmap.report.tables import interval, number
 
-    by_row: dict[tuple[str, str], dict[str, Any]] = {}
+    by_row: dict[tuple[str, str], dict[str, Summary]] = {}
     for one in done.summaries:
-        if one.measure in _HEADLINES:
-            by_row.setdefault((one.label, one.backend), {})[one.measure] = one
+        by_row.setdefault((one.label, one.backend), {})[one.measure] = one
     lines = []
     for (label, backend), found in by_row.items():
-        ate, kept, lost = (found[name] for name in _HEADLINES)
-        apart = ate.difference
+        error = found[measure]
+        apart = error.difference
         paired = "" if apart is None or not apart.count else interval(apart)
-        figures = [number(one.median) if one.solved else "" for one in (ate, kept, lost)]
-        lines.append([label, backend, f"{ate.solved}/{ate.cells}", figures[0], paired, figures[1], figures[2]])
+        median, *figures = (number(one.median) if one.solved else "" for one in (found[name] for name in (measure, *others)))
+        lines.append([label, backend, f"{error.solved}/{error.cells}", median, paired, *figures])
     return lines

@@ -129,17 +129,17 @@ def merit_figure(study: Study, plan: Layout, label: str, figure: Figure, *, loga
         return style.svg_uri(picture)
 
 
-def paired_groups(summaries: Sequence[Summary]) -> dict[str, list[Summary]]:
-    """Group -> the differences of ATE to the baseline that are of several seeds; only groups that have some."""
+def paired_groups(summaries: Sequence[Summary], measure: str) -> dict[str, list[Summary]]:
+    """Group -> the differences of an error to the baseline that are of several seeds; only groups that have some."""
     groups: dict[str, list[Summary]] = {}
     for one in summaries:
-        if one.measure == "ate_m" and one.difference is not None and one.difference.count > 1:
+        if one.measure == measure and one.difference is not None and one.difference.count > 1:
             groups.setdefault(one.label, []).append(one)
     return groups
 
 
 def difference_figure(groups: Mapping[str, Sequence[Summary]]) -> str:
-    """Mean paired difference of ATE to the baseline with its interval, a panel a group; a `data:` URI, empty without any.
+    """Mean paired difference of an error to the baseline with its interval, a panel a group; a `data:` URI, empty without any.
 
     A difference without an interval is a dot alone.
     """

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -13,19 +14,26 @@ from hybridmap.output import write_text
 from hybridmap.report import study_figures, tables
 from hybridmap.report.study_figures import FLOOR_M, MOST_PANELS
 from hybridmap.report.template import rendered
-from hybridmap.study.cell import MEASURES, CellResult
+from hybridmap.study.bars import Verdict
+from hybridmap.study.cell import CellResult
 from hybridmap.study.folder import PAGE
 from hybridmap.study.grid import Cell
+from hybridmap.study.measures import TIMINGS, measures_of
 from hybridmap.study.model import quoted
 from hybridmap.study.statistics import LEAST, Interval, Summary
 from hybridmap.study.study import Study
 
 _TEMPLATE = "study.html.j2"
-_SOLVED = ("converged", "waiting", "max-iterations")
+_SOLVED = ("converged", "waiting", "max-iterations", "mapped")
+_HEADS = {"ate_m": "ATE", "relation_m": "relation error", "chi2_own": "χ² own"}
 SHOWN_M = 5e-7
 """Differences below it are shown as 0."""
 _NAMED = 4  # places or back-ends that a remark names
-_SUMMED = ("chi2_own", "false_kept", "own_lost", "iterations")
+_ERRORS = ("ate_m", "relation_m")
+_SUMMED = (
+    *("relation_m", "relation_loop_m", "chi2_own", "loop_recall", "false_kept", "wrong_loops", "own_lost", "iterations"),
+    *("loop_chi2_ratio", "found_m"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +66,18 @@ class Group:
 
 
 @dataclass(frozen=True, slots=True)
+class Bar:
+    """A line of the table of bars: texts."""
+
+    what: str
+    where: str
+    median: str
+    worst: str
+    bar: str
+    passed: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Remark:
     """Cells that did not come to a good end and say the same."""
 
@@ -82,10 +102,13 @@ def write_study_page(study: Study) -> Path:
 def _render(study: Study) -> str:
     config = study.grid.study
     plan = study_figures.layout(study)
-    of_error = study_figures.having(plan, _error)
+    measure = error_of(study)
+    error = partial(_error, measure)
+    of_error = study_figures.having(plan, error)
+    others = _others(study)
     kept = [_kept(result) for _, result in study.rows]
-    pairs = study_figures.paired_groups(study.summaries)
-    groups = groups_of(study.summaries)
+    pairs = study_figures.paired_groups(study.summaries, measure)
+    groups = groups_of(study)
     shown = [group for group in groups if group.lines]
     return rendered(
         _TEMPLATE,
@@ -98,7 +121,12 @@ def _render(study: Study) -> str:
         left_out=max(0, len(of_error.panels) - MOST_PANELS),
         floor=tables.length(FLOOR_M),
         of_truth=_reference(study),
-        ate=study_figures.merit_figure(study, plan, "ATE (m)", _error, logarithmic=True),
+        measure=_HEADS.get(measure, measure),
+        relations=measure == "relation_m",
+        others=[_HEADS.get(name, name.replace("_", " ")) for name in others],
+        bars=[_bar(verdict) for verdict in study.verdicts],
+        missed=len(study.missed),
+        ate=study_figures.merit_figure(study, plan, f"{_HEADS[measure]} (m)", error, logarithmic=True),
         by_false_loops=any(share is not None for share in kept),
         kept=_shares(study, plan, "false loops kept (%)", _kept) if any(share not in (None, 100.0) for share in kept) else "",
         lost=_shares(study, plan, "own loops lost (%)", _lost) if any(_lost(result) for _, result in study.rows) else "",
@@ -109,7 +137,7 @@ def _render(study: Study) -> str:
         least=LEAST[config.statistics.method],
         groups=shown,
         groups_without=len(groups) - len(shown),
-        measures=[(name, unit, text) for name, (unit, text) in MEASURES.items()],
+        measures=[(name, unit, text) for name, (unit, text) in (measures_of(config) | TIMINGS).items()],
         remarks=remarks(study),
         study_yaml=config.to_yaml(),
         version=version("hybridmap"),
@@ -122,7 +150,7 @@ def _shares(study: Study, plan: study_figures.Layout, label: str, figure: study_
 
 def _tiles(study: Study) -> list[tuple[str, str]]:
     config = study.grid.study
-    solved = sum("chi2" in result.figures for _, result in study.rows)
+    solved = sum(result.status in _SOLVED or "chi2" in result.figures for _, result in study.rows)
     counts = [
         (len(study.grid.cells), "cells"),
         (solved, "cells with a map"),
@@ -137,11 +165,38 @@ def _tiles(study: Study) -> list[tuple[str, str]]:
 
 def _reference(study: Study) -> bool:
     """Whether every source knows the truth."""
-    return all(source.world or source.synthetic for source in study.grid.study.sources)
+    return all(source.knows_truth for source in study.grid.study.sources)
 
 
-def _error(result: CellResult) -> float | None:
-    value = result.figures.get("ate_m")
+def error_of(study: Study) -> str:
+    """The figure that a study's errors are told by: ATE, or that of relations where nothing else is known."""
+    return next((name for name in _ERRORS if any(result.figures.get(name) is not None for _, result in study.rows)), _ERRORS[0])
+
+
+def _others(study: Study) -> list[str]:
+    """Further figures of the tables: those that some cell has."""
+    measure = error_of(study)
+    return [
+        name for name in _SUMMED if name != measure and any(result.figures.get(name) is not None for _, result in study.rows)
+    ]
+
+
+def _bar(verdict: Verdict) -> Bar:
+    unit = "" if verdict.unit == "1" else f" {verdict.unit}"
+    limit = f"{verdict.bar.side} {tables.number(verdict.limit)}{unit}"
+    beside = f" ({verdict.bar.at_most})" if isinstance(verdict.bar.at_most, str) else ""
+    return Bar(
+        what=f"{verdict.bar.figure}, {verdict.bar.statistic}",
+        where=verdict.label,
+        median=tables.number(verdict.median),
+        worst=tables.number(verdict.worst),
+        bar=limit + beside,
+        passed=verdict.passed,
+    )
+
+
+def _error(measure: str, result: CellResult) -> float | None:
+    value = result.figures.get(measure)
     return None if value is None else max(value, FLOOR_M)
 
 
@@ -158,22 +213,23 @@ def _share(result: CellResult, part: str, whole: str) -> float | None:
     return None if some is None or not every else 100.0 * some / every
 
 
-def groups_of(summaries: Sequence[Summary]) -> list[Group]:
+def groups_of(study: Study) -> list[Group]:
     """Every group; a line a back-end that has a map there."""
+    measure, others = error_of(study), _others(study)
     found: dict[str, dict[str, dict[str, Summary]]] = {}
-    for one in summaries:
+    for one in study.summaries:
         found.setdefault(one.label, {}).setdefault(one.backend, {})[one.measure] = one
-    return [_group(label, by_backend) for label, by_backend in found.items()]
+    return [_group(label, by_backend, measure, others) for label, by_backend in found.items()]
 
 
-def _group(label: str, by_backend: dict[str, dict[str, Summary]]) -> Group:
-    solved = {backend: by_measure["chi2"].solved for backend, by_measure in by_backend.items()}
-    lines = tuple(_line(by_measure) for backend, by_measure in by_backend.items() if solved[backend])
+def _group(label: str, by_backend: dict[str, dict[str, Summary]], measure: str, others: Sequence[str]) -> Group:
+    solved = {backend: any(one.solved for one in by_measure.values()) for backend, by_measure in by_backend.items()}
+    lines = tuple(_line(by_measure, measure, others) for backend, by_measure in by_backend.items() if solved[backend])
     return Group(label, lines, tuple(quoted(backend) for backend in by_backend if not solved[backend]))
 
 
-def _line(by_measure: dict[str, Summary]) -> Line:
-    ate = by_measure["ate_m"]
+def _line(by_measure: dict[str, Summary], measure: str, others: Sequence[str]) -> Line:
+    ate = by_measure[measure]
     apart = ate.difference
     verdict = ""
     if apart is not None and apart.excludes_zero and abs(apart.value) >= SHOWN_M:
@@ -186,7 +242,7 @@ def _line(by_measure: dict[str, Summary]) -> Line:
         difference="" if apart is None else _mean(apart, ate.cells),
         verdict=verdict,
         better="" if math.isnan(ate.better) else f"{100.0 * ate.better:.0f} %",
-        others=tuple(tables.number(by_measure[name].median) for name in _SUMMED),
+        others=tuple(tables.number(by_measure[name].median) for name in others),
     )
 
 
@@ -206,17 +262,13 @@ def remarks(study: Study) -> list[Remark]:
     return [
         Remark(
             status,
-            _several([_where(cell) for cell, _ in cells]),
+            _several([cell.label for cell, _ in cells]),
             _several([quoted(cell.backend) for cell, _ in cells], len(every)),
             len(cells),
             cells[0][1],
         )
         for (status, _), cells in found.items()
     ]
-
-
-def _where(cell: Cell) -> str:
-    return f"{cell.source}/{cell.setting}" + (f"/{cell.kind} {100 * cell.rate:g} %" if cell.kind else "")
 
 
 def _several(names: Sequence[str], of: int = 0) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,31 +21,14 @@ from hybridmap.errors import BackendError, HybridMapError
 from hybridmap.geometry import Array, align, between, compose
 from hybridmap.graph.connectivity import chain
 from hybridmap.graph.pose_graph import PoseGraph
-from hybridmap.metrics import FIGURES
 from hybridmap.study import provenance
-from hybridmap.study.disturb import Kind, with_drift, with_false_loops
-from hybridmap.study.model import BackendVariant, DriftConfig
-from hybridmap.study.sources import Frozen
+from hybridmap.study.drift import Kind, with_drift, with_false_loops
+from hybridmap.study.frozen import Frozen
+from hybridmap.study.measures import KEPT, NEAR_M
+from hybridmap.study.model import BackendVariant, DriftConfig, Start, Way
 
-KEPT = 0.5
-"""A loop whose final weight is above this counts as kept."""
-
-UNMAPPED = "unmapped"
-"""Status of a cell whose source gave no graph."""
-
-MEASURES = {
-    "ate_m": ("m", "RMSE of position against the reference after SE(2) alignment, over the nodes"),
-    "yaw_deg": ("deg", "RMSE of heading against the reference after that alignment"),
-    "chi2_initial": ("1", "referee's chi2 of the poses to begin with, false loops included"),
-    "chi2": ("1", "referee's chi2 at the end, false loops included"),
-    "chi2_own": ("1", "referee's chi2 at the end over the graph's own edges, without the false loops put into it"),
-    "false_kept": ("1", f"false loops of weight above {KEPT}"),
-    "own_lost": ("1", "of the graph's own loops, those that the back-end holds for false"),
-    "chi2_odometry": ("1", "share of chi2 that is not of loops; large where true loops were dropped"),
-    "unit_variance": FIGURES["unit_variance/"],
-    "iterations": FIGURES["iterations/"],
-}
-"""Figure of merit -> unit and meaning, in the order of the tables."""
+UNMAPPED, MAPPED = "unmapped", "mapped"
+"""Status of a cell whose source gave no graph, and of one that is judged as its drive was mapped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +50,8 @@ class CellTask:
     seed: int
     backend: str
     settings: BackendsConfig
-    start: Literal["graph", "odometry", "chain", "angular", "reference"]
-    way: Literal["solve", "replay", "drive"]
+    start: Start
+    way: Way
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +62,8 @@ class CellResult:
         key: of the task.
         status: the back-end's word, `failed` for a typed error, `unmapped` where there was no graph.
         message: one line for people.
-        figures: `MEASURES` and counts of the graph; None where there is no such figure (a map that is none has no error).
-        cpu_s: process time of the back-end; apart from all results.
+        figures: of `measures`, and counts of the graph; None where there is no such figure (no map, no error).
+        timings: `measures.TIMINGS`; apart from all results.
         code: digest of the code that computed it.
     """
 
@@ -88,8 +71,12 @@ class CellResult:
     status: str
     message: str
     figures: dict[str, float | None]
-    cpu_s: float
+    timings: dict[str, float]
     code: str
+
+    def figure(self, name: str) -> float | None:
+        """Any figure or timing; None where there is none."""
+        return self.figures.get(name, self.timings.get(name))
 
 
 def key_of(
@@ -122,7 +109,9 @@ def run(task: CellTask) -> CellResult:
     """Disturb the graph, solve it, judge it. A typed error is a result; anything else is a mistake of ours and raised."""
     frozen = Frozen.unpack(task.frozen)
     if frozen.graph is None:
-        return CellResult(task.key, UNMAPPED, frozen.failure, {}, 0.0, provenance.solving())
+        return CellResult(task.key, UNMAPPED, frozen.failure, {}, {}, provenance.solving())
+    if task.way == "mapped":
+        return _as_mapped(task, frozen)
     started = time.process_time()
     counts: dict[str, float | None] = {}
     try:
@@ -133,15 +122,26 @@ def run(task: CellTask) -> CellResult:
         solution = _solve(task, _begun(graph, task.start, frozen.reference))
     except HybridMapError as error:
         message = " ".join(str(error).split())
-        return CellResult(
-            task.key, str(SolveStatus.FAILED), message, counts, time.process_time() - started, provenance.solving()
-        )
-    cpu_s = time.process_time() - started
+        spent = {"cpu_s": time.process_time() - started}
+        return CellResult(task.key, str(SolveStatus.FAILED), message, counts, spent, provenance.solving())
+    spent = {"cpu_s": time.process_time() - started}
     report = solution.report
     figures = counts | {"iterations": float(report.iterations), "chi2_initial": _finite(report.chi2_initial)}
     if report.status not in (SolveStatus.FAILED, SolveStatus.DIVERGED):
         figures |= judge(drifted, graph, solution, frozen.reference)
-    return CellResult(task.key, str(report.status), report.message, figures, cpu_s, provenance.solving())
+    return CellResult(task.key, str(report.status), report.message, figures, spent, provenance.solving())
+
+
+def _as_mapped(task: CellTask, frozen: Frozen) -> CellResult:
+    """What the drive itself came to; the time of mapping is that of the back-end that drove."""
+    assert frozen.mapped is not None
+    name = frozen.mapped.primary if task.backend == "primary" else task.backend
+    if name not in frozen.mapped.figures:
+        known = ", ".join(frozen.mapped.figures)
+        message = f"{name}: did not follow the drive; there are {known} (`backends.names` of its configuration)"
+        return CellResult(task.key, str(SolveStatus.FAILED), message, {}, {}, provenance.solving())
+    timings = dict(frozen.mapped.timings) if name == frozen.mapped.primary else {}
+    return CellResult(task.key, MAPPED, "", dict(frozen.mapped.figures[name]), timings, provenance.solving())
 
 
 def judge(own: PoseGraph, graph: PoseGraph, solution: Solution, reference: Array) -> dict[str, float | None]:
@@ -149,15 +149,18 @@ def judge(own: PoseGraph, graph: PoseGraph, solution: Solution, reference: Array
     false = np.arange(graph.n_edges) >= own.n_edges
     kept, rejected = _fates(graph, solution)
     ate_m, yaw_deg = errors(solution.poses, reference)
+    lost, own_loops = int(np.count_nonzero(~false & rejected)), int(np.count_nonzero(own.is_loop))
     return {
         "ate_m": _finite(ate_m),
+        "within_5_cm": float(ate_m <= NEAR_M) if math.isfinite(ate_m) else None,
         "yaw_deg": _finite(yaw_deg),
         "chi2": _finite(solution.report.chi2),
         "chi2_own": _finite(chi2(own, solution.poses)),
         "chi2_odometry": _finite(solution.report.chi2_odometry),
         "unit_variance": _finite(solution.report.unit_variance),
         "false_kept": float(np.count_nonzero(false & kept)),
-        "own_lost": float(np.count_nonzero(~false & rejected)),
+        "own_lost": float(lost),
+        "own_lost_percent": 100.0 * lost / own_loops if own_loops else None,
     }
 
 

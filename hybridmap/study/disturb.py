@@ -1,72 +1,317 @@
-"""What is done to a frozen graph before a back-end gets it: drift of its odometry, false loops."""
+"""What is done to the samples of a drive before it is mapped: worse scans, frames, wheels and clocks, and kidnapping.
+
+A disturbance is a small function in `TABLE`; a study names it with its strength. Strength 0 changes nothing, and the same
+seed gives the same bits.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Literal
+import math
+import zlib
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from hybridmap.geometry import Array, between, compose, exp
-from hybridmap.graph.edges import EdgeKind
-from hybridmap.graph.pose_graph import PoseGraph
-from hybridmap.study.false_loops import drop_out, inject
-from hybridmap.study.model import DriftConfig
+from hybridmap.errors import ConfigError
+from hybridmap.geometry import IDENTITY, Array, between, compose, wrap_angle
+from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion
+from hybridmap.streams.laser import LaserScan
+from hybridmap.streams.rgbd import RgbdFrame
+from hybridmap.trajectory import NS_PER_S
 
-Kind = Literal["random", "aliased"]
-_STREAMS = ("drift", "random", "aliased", "dropouts")  # each draws from a stream of its own
+Ranges = NDArray[np.float32]
+Samples = Iterable[Sample]
+KIDNAPPED = "kidnapped_s"
+
+_NEAR_DEPTH_M = 1.0  # at this depth its noise is as strong as it is told; it grows with the square of the depth
+_SLIP = (0.3, 0.05, math.radians(15.0))  # standard deviations of a slip: ahead, sideways (m), and turn (rad)
 
 
-def with_drift(graph: PoseGraph, drift: DriftConfig, seed: int) -> PoseGraph:
-    """The graph with wrong odometry edges; `initial` moves along with them.
+@dataclass(frozen=True, slots=True)
+class Disturbance:
+    """An entry of the table.
 
-    A step of length s turns by a further bias * s, half of it before the step, and is (1 + scale) s long.
+    Attributes:
+        apply: the samples, its strength (a number, or as many as `count`), its own generator and the rig to worse samples.
+        by_chance: whether the seed plays a part.
+        most: the greatest strength.
+        count: how many numbers its strength is of.
     """
-    if drift.idle:
-        return graph
-    odometry = np.flatnonzero(graph.kinds == EdgeKind.ODOMETRY)
-    deltas = graph.deltas.copy()
-    deltas[odometry] = _drifted(deltas[odometry], drift)
-    if drift.noise > 0.0:
-        covariance = np.linalg.inv(graph.information[odometry])
-        white = generator("drift", 0.0, seed).standard_normal((len(odometry), 3, 1))
-        twist = drift.noise * (np.linalg.cholesky(covariance) @ white)[:, :, 0]
-        deltas[odometry] = compose(deltas[odometry], exp(twist))
-    if drift.dropouts > 0.0:
-        deltas = drop_out(replace(graph, deltas=deltas), drift.dropouts, generator("dropouts", drift.dropouts, seed)).deltas
-    return replace(graph, deltas=deltas, initial=_moved(graph, deltas))
+
+    apply: Callable[[Samples, Any, np.random.Generator, Rig], Iterator[Sample]]
+    by_chance: bool = False
+    most: float = math.inf
+    count: int = 1
 
 
-def with_false_loops(graph: PoseGraph, kind: Kind, rate: float, seed: int) -> PoseGraph:
-    """The graph with false loops appended (`study.false_loops.inject`); the same for every back-end.
+def disturbed(samples: Samples, rig: Rig, disturbances: Mapping[str, float | tuple[float, ...]], seed: int) -> Iterator[Sample]:
+    """The samples made worse, in the order of `TABLE`.
+
+    Args:
+        samples: of a stream, in order of stamp.
+        rig: its sensors.
+        disturbances: name -> strength.
+        seed: of those that are left to chance; each draws from a stream of its own.
+    """
+    for name, one in TABLE.items():
+        strength = disturbances.get(name, 0.0)
+        if np.any(strength):
+            samples = one.apply(samples, strength, np.random.default_rng([seed, zlib.crc32(name.encode())]), rig)
+    return iter(samples)
+
+
+def by_chance(disturbances: Mapping[str, float | tuple[float, ...]]) -> bool:
+    """Whether another seed gives other samples."""
+    return any(TABLE[name].by_chance and np.any(strength) for name, strength in disturbances.items())
+
+
+def check(name: str, strength: float | tuple[float, ...], origin: str) -> None:
+    """Check an entry of a study.
 
     Raises:
-        GraphError: no loop to copy.
+        ConfigError: there is no such disturbance, or its strength cannot be.
     """
-    return graph if rate == 0.0 else inject(graph, rate, kind, generator(kind, rate, seed))
+    if name not in TABLE:
+        raise ConfigError(f"{origin}: unknown disturbance {name!r}; there are {', '.join(TABLE)}")
+    numbers = (strength,) if isinstance(strength, float) else strength
+    if np.any(strength) and len(numbers) != TABLE[name].count:
+        raise ConfigError(f"{origin}: disturb: {name}: expected {TABLE[name].count} number(s), found {len(numbers)}")
+    if not all(abs(number) <= TABLE[name].most for number in numbers):
+        raise ConfigError(f"{origin}: disturb: {name}: expected at most {TABLE[name].most:g}, found {max(numbers):g}")
+    if name == KIDNAPPED and np.any(strength) and not 0.0 <= numbers[0] < numbers[1] < numbers[2]:
+        raise ConfigError(f"{origin}: disturb: {name}: expected [picked up, put down, end], seconds from the first stamp")
 
 
-def generator(stream: str, rate: float, seed: int) -> np.random.Generator:
-    """The chance of one disturbance at one rate."""
-    return np.random.default_rng([seed, _STREAMS.index(stream), round(1e6 * rate)])
+def scan_range_m(ranges: Ranges, limit_m: float, rng: np.random.Generator) -> Ranges:
+    """Returns beyond this are lost, m."""
+    del rng
+    return np.where(ranges < limit_m, ranges, np.float32(np.nan))
 
 
-def _drifted(deltas: Array, drift: DriftConfig) -> Array:
-    length = np.hypot(deltas[:, 0], deltas[:, 1])
-    turn = np.deg2rad(drift.heading_bias_deg_per_m) * length
-    half = np.column_stack([np.zeros((len(turn), 2)), 0.5 * turn])
-    longer = deltas * np.array([1.0 + drift.scale_bias, 1.0 + drift.scale_bias, 1.0])
-    return compose(compose(half, longer), half)
+def scan_covered(ranges: Ranges, share: float, rng: np.random.Generator) -> Ranges:
+    """This share of the fan is covered, half of it at either end."""
+    del rng
+    ranges, covered = ranges.copy(), round(0.5 * share * len(ranges))
+    ranges[:covered] = ranges[len(ranges) - covered :] = np.nan
+    return ranges
 
 
-def _moved(graph: PoseGraph, deltas: Array) -> Array:
-    """The graph's initial poses, each step between them changed as the odometry edge of the same two nodes was."""
-    forward = (graph.kinds == EdgeKind.ODOMETRY) & (graph.targets - graph.sources == 1)
-    steps = between(graph.initial[:-1], graph.initial[1:])
-    before, after = graph.deltas[forward], deltas[forward]
-    at = graph.sources[forward]
-    steps[at] = compose(steps[at], between(before, after))
-    poses = graph.initial.copy()
-    for k in range(1, graph.n_nodes):
-        poses[k] = compose(poses[k - 1], steps[k - 1])
-    return poses
+def scan_noise_m(ranges: Ranges, sigma_m: float, rng: np.random.Generator) -> Ranges:
+    """White noise of every range, standard deviation, m."""
+    return ranges + np.float32(sigma_m) * rng.standard_normal(ranges.shape, dtype=np.float32)
+
+
+def beams_lost(ranges: Ranges, share: float, rng: np.random.Generator) -> Ranges:
+    """This share of the beams has no return."""
+    return np.where(rng.random(ranges.shape) < share, np.float32(np.nan), ranges)
+
+
+def beams_short(ranges: Ranges, share: float, rng: np.random.Generator) -> Ranges:
+    """This share of the beams is stopped somewhere on its way."""
+    stopped, where = rng.random((2, *ranges.shape), dtype=np.float32)
+    return np.where(stopped < share, where * ranges, ranges)
+
+
+def blur_s(samples: Samples, exposure_s: float, rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
+    """Pictures are smeared along their rows by what the robot turns within this exposure, s."""
+    del rng
+    newest: SelfMotion | None = None
+    rate_rad_s, camera = 0.0, rig.sensors.get("camera")
+    for sample in samples:
+        if isinstance(sample, SelfMotion):
+            if newest is not None and sample.stamp_ns > newest.stamp_ns:
+                turn = wrap_angle(sample.pose_odom_robot[2] - newest.pose_odom_robot[2])
+                rate_rad_s = abs(float(turn)) * NS_PER_S / (sample.stamp_ns - newest.stamp_ns)
+            newest = sample
+        elif isinstance(sample, RgbdFrame) and camera is not None:
+            width = max(1, round(rate_rad_s * exposure_s * camera.fx_px))
+            sample = replace(sample, color=np.asarray(cv2.blur(sample.color, (width, 1)), dtype=np.uint8))
+        yield sample
+
+
+def darker(frame: RgbdFrame, share: float, rng: np.random.Generator) -> RgbdFrame:
+    """Every colour value is less by this share: 0.9 is dusk, 1 is night."""
+    del rng
+    return replace(frame, color=np.rint(round(1.0 - share, 9) * frame.color).astype(np.uint8))
+
+
+def color_noise(frame: RgbdFrame, sigma: float, rng: np.random.Generator) -> RgbdFrame:
+    """White noise of every colour value, standard deviation, of 255."""
+    grain = np.float32(sigma) * rng.standard_normal(frame.color.shape, dtype=np.float32)
+    return replace(frame, color=np.clip(frame.color + grain + np.float32(0.5), 0, 255).astype(np.uint8))
+
+
+def depth_noise_m(frame: RgbdFrame, sigma_m: float, rng: np.random.Generator) -> RgbdFrame:
+    """White noise of every depth, standard deviation at 1 m, growing with the square of the depth, m."""
+    grain = np.float32(sigma_m) * rng.standard_normal(frame.depth_m.shape, dtype=np.float32)
+    noisy = frame.depth_m + grain * (frame.depth_m / np.float32(_NEAR_DEPTH_M)) ** 2
+    return replace(frame, depth_m=np.where(frame.depth_m > 0.0, np.maximum(noisy, 0.0), frame.depth_m))
+
+
+def depth_range_m(frame: RgbdFrame, limit_m: float, rng: np.random.Generator) -> RgbdFrame:
+    """Depth beyond this is lost, m."""
+    del rng
+    return replace(frame, depth_m=np.where(frame.depth_m > limit_m, np.float32(0.0), frame.depth_m))
+
+
+def depth_lost(frame: RgbdFrame, share: float, rng: np.random.Generator) -> RgbdFrame:
+    """This share of the pixels has no depth."""
+    gone = rng.random(frame.depth_m.shape, dtype=np.float32) < share
+    return replace(frame, depth_m=np.where(gone, np.float32(0.0), frame.depth_m))
+
+
+def wheel_scale(step: Array, share: float, rng: np.random.Generator) -> Array:
+    """Every distance is reported too long by this share."""
+    del rng
+    factors: Array = np.array([1.0 + share, 1.0 + share, 1.0])
+    return step * factors
+
+
+def wheel_turn_scale(step: Array, share: float, rng: np.random.Generator) -> Array:
+    """Every turn is reported too large by this share."""
+    del rng
+    factors: Array = np.array([1.0, 1.0, 1.0 + share])
+    return step * factors
+
+
+def wheel_pull_deg_per_m(step: Array, bias_deg: float, rng: np.random.Generator) -> Array:
+    """A pull to the left, degrees per metre driven."""
+    del rng
+    return _turned(step, math.radians(bias_deg) * math.hypot(step[0], step[1]))
+
+
+def wheel_noise_deg_per_sqrt_m(step: Array, sigma_deg: float, rng: np.random.Generator) -> Array:
+    """The heading walks at random, degrees per square root of a metre."""
+    return _turned(step, rng.normal() * math.radians(sigma_deg) * math.sqrt(math.hypot(step[0], step[1])))
+
+
+def _turned(step: Array, turn_rad: float) -> Array:
+    more: Array = np.array([0.0, 0.0, turn_rad])
+    return step + more
+
+
+def wheel_slips_per_m(step: Array, rate: float, rng: np.random.Generator) -> Array:
+    """So often per metre driven a step is wrong by some 0.3 m and 15 degrees."""
+    hit, slip = rng.random() < rate * math.hypot(step[0], step[1]), rng.normal(size=3) * _SLIP
+    return step + slip if hit else step
+
+
+def views_lost(samples: Samples, share: float, rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
+    """This share of the scans and frames is lost, at regular intervals: a lower rate."""
+    del rng, rig
+    number, kept = 0, 1.0 - share
+    for sample in samples:
+        if isinstance(sample, Observation):
+            number += 1
+            if math.ceil(number * kept - 1e-9) == math.ceil((number - 1) * kept - 1e-9):
+                continue
+        yield sample
+
+
+def views_late_s(samples: Samples, late_s: float, rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
+    """Scans and frames are stamped so much later than they were taken, s."""
+    del rng, rig
+    held: deque[Observation] = deque()
+    for sample in samples:
+        while held and held[0].stamp_ns < sample.stamp_ns:
+            yield held.popleft()
+        if isinstance(sample, Observation):
+            held.append(replace(sample, stamp_ns=sample.stamp_ns + round(late_s * NS_PER_S)))
+        else:
+            yield sample
+    yield from held
+
+
+def kidnapped_s(samples: Samples, times_s: tuple[float, float, float], rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
+    """The robot is picked up at the first time and put down at the second, and the drive ends at the third, s.
+
+    What lies between is left out, and the odometry goes on where it was: the wheels felt nothing.
+    """
+    del rng, rig
+    up_ns = down_ns = end_ns = -1
+    held, onward = IDENTITY, None
+    for sample in samples:
+        if end_ns < 0:
+            up_ns, down_ns, end_ns = (sample.stamp_ns + round(time_s * NS_PER_S) for time_s in times_s)
+        if sample.stamp_ns > end_ns:
+            return
+        before, after = sample.stamp_ns <= up_ns, sample.stamp_ns >= down_ns
+        if isinstance(sample, SelfMotion) and before:
+            held = sample.pose_odom_robot
+        elif isinstance(sample, SelfMotion) and after:
+            onward = sample.pose_odom_robot if onward is None else onward
+            sample = replace(sample, pose_odom_robot=compose(held, between(onward, sample.pose_odom_robot)))
+        if before or (after and onward is not None):
+            yield sample
+
+
+def _scans(
+    change: Callable[[Ranges, float, np.random.Generator], Ranges], *, by_chance: bool = False, most: float = math.inf
+) -> Disturbance:
+    """Of every scan alone."""
+
+    def apply(samples: Samples, strength: float, rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
+        del rig
+        for sample in samples:
+            yield replace(sample, ranges_m=change(sample.ranges_m, strength, rng)) if isinstance(sample, LaserScan) else sample
+
+    return Disturbance(apply, by_chance, most)
+
+
+def _frames(
+    change: Callable[[RgbdFrame, float, np.random.Generator], RgbdFrame], *, by_chance: bool = False, most: float = math.inf
+) -> Disturbance:
+    """Of every frame alone."""
+
+    def apply(samples: Samples, strength: float, rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
+        del rig
+        for sample in samples:
+            yield change(sample, strength, rng) if isinstance(sample, RgbdFrame) else sample
+
+    return Disturbance(apply, by_chance, most)
+
+
+def _wheels(change: Callable[[Array, float, np.random.Generator], Array], *, by_chance: bool = False) -> Disturbance:
+    """Of every step between two odometry messages, in the robot's frame."""
+
+    def apply(samples: Samples, strength: float, rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
+        del rig
+        before: Array | None = None
+        pose = IDENTITY
+        for sample in samples:
+            if isinstance(sample, SelfMotion):
+                given = sample.pose_odom_robot
+                pose = given if before is None else compose(pose, change(between(before, given), strength, rng))
+                before, sample = given, replace(sample, pose_odom_robot=pose)
+            yield sample
+
+    return Disturbance(apply, by_chance)
+
+
+TABLE: dict[str, Disturbance] = {
+    "scan_range_m": _scans(scan_range_m),
+    "scan_covered": _scans(scan_covered, most=1.0),
+    "scan_noise_m": _scans(scan_noise_m, by_chance=True),
+    "beams_short": _scans(beams_short, by_chance=True, most=1.0),
+    "beams_lost": _scans(beams_lost, by_chance=True, most=1.0),
+    "blur_s": Disturbance(blur_s),
+    "darker": _frames(darker, most=1.0),
+    "color_noise": _frames(color_noise, by_chance=True),
+    "depth_noise_m": _frames(depth_noise_m, by_chance=True),
+    "depth_range_m": _frames(depth_range_m),
+    "depth_lost": _frames(depth_lost, by_chance=True, most=1.0),
+    "wheel_scale": _wheels(wheel_scale),
+    "wheel_turn_scale": _wheels(wheel_turn_scale),
+    "wheel_pull_deg_per_m": _wheels(wheel_pull_deg_per_m),
+    "wheel_noise_deg_per_sqrt_m": _wheels(wheel_noise_deg_per_sqrt_m, by_chance=True),
+    "wheel_slips_per_m": _wheels(wheel_slips_per_m, by_chance=True),
+    "views_lost": Disturbance(views_lost, most=1.0),
+    "views_late_s": Disturbance(views_late_s),
+    KIDNAPPED: Disturbance(kidnapped_s, count=3),
+}
+"""Name -> disturbance, in the order in which they are applied."""

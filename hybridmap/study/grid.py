@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import product
 
 from hybridmap.study.cell import CellTask, key_of
-from hybridmap.study.disturb import Kind
+from hybridmap.study.drift import Kind
 from hybridmap.study.model import SettingConfig, SourceConfig, StudyConfig, backend_settings
-from hybridmap.study.sources import Frozen, SourceTask, depends_on_seed, read_source, task_of
+from hybridmap.study.sources import Source, SourceTask, open_source
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +34,11 @@ class Cell:
     backend: str
     source_key: str
     key: str
+
+    @property
+    def label(self) -> str:
+        """The group in words."""
+        return f"{self.source}/{self.setting}" + (f"/{self.kind} {100 * self.rate:g} %" if self.kind else "")
 
     @property
     def group(self) -> tuple[str, str, str, float]:
@@ -77,32 +82,31 @@ class Grid:
 def lay_out(study: StudyConfig) -> Grid:
     """Lay out the cells: sources, settings, kinds and rates, seeds, back-ends, the last one fastest.
 
-    Files and sessions are read, since their content is part of the keys; nothing is mapped.
+    Files, sessions and recordings are read, since their content is part of the keys; nothing is mapped.
 
     Raises:
         GraphError, StoreError, StreamError: a file or session is missing or damaged.
-        ConfigError: the mapping configuration of a world cannot be used.
+        ConfigError: the mapping configuration of a drive cannot be used.
     """
-    read = {source.title: read_source(source) for source in study.sources if source.graph or source.session}
+    opened = {source.title: open_source(source, maps=study.maps) for source in study.sources}
     cells: list[Cell] = []
     tasks: dict[str, SourceTask] = {}
     variants = [(variant, backend_settings(variant)) for variant in study.backends]
     for source, setting in product(study.sources, study.settings):
-        key_at = cache(partial(_enter, tasks, read, source, setting))
+        key_at = cache(partial(_enter, tasks, opened[source.title], setting))
+        drawn = opened[source.title].by_chance(setting)
         for kind, rate in _false_loops(study):
-            for seed in _seeds(study, source, setting, rate):
-                source_key = key_at((seed or 0) if depends_on_seed(source) else 0)
+            for seed in _seeds(study, source, drawn or rate > 0.0 or setting.drift.by_chance):
+                source_key = key_at((seed or 0) if drawn else 0)
                 for variant, settings in variants:
                     key = key_of(source_key, setting.drift, (kind, rate, seed or 0), variant, settings)
                     cells.append(Cell(source.title, setting.name, kind, rate, seed, variant.title, source_key, key))
     return Grid(study, tuple(cells), tasks)
 
 
-def _enter(
-    tasks: dict[str, SourceTask], read: Mapping[str, Frozen], source: SourceConfig, setting: SettingConfig, seed: int
-) -> str:
+def _enter(tasks: dict[str, SourceTask], source: Source, setting: SettingConfig, seed: int) -> str:
     """Note the task for a graph; its key."""
-    task = task_of(source, setting, seed, read)
+    task = source.task(setting, seed)
     tasks[task.key] = task
     return task.key
 
@@ -114,7 +118,6 @@ def _false_loops(study: StudyConfig) -> list[tuple[str, float]]:
     return none + [(kind, rate) for kind in study.false_loops.kinds for rate in rates if rate > 0.0]
 
 
-def _seeds(study: StudyConfig, source: SourceConfig, setting: SettingConfig, rate: float) -> Sequence[int | None]:
+def _seeds(study: StudyConfig, source: SourceConfig, by_chance: bool) -> Sequence[int | None]:
     """Every seed where chance plays a part; a single None where every seed would give the same."""
-    by_chance = rate > 0.0 or setting.drift.by_chance or depends_on_seed(source)
-    return study.seeds if by_chance else (None,)
+    return (source.seeds or study.seeds) if by_chance else (None,)

@@ -1,17 +1,16 @@
-"""What a study varies, as one configuration: sources x front-end settings x back-ends x false loops x seeds."""
+"""A study as one configuration: sources x settings x back-ends x false loops x seeds, and the bars of its figures."""
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.config.section import Section, read_mapping, said
@@ -28,8 +27,21 @@ def _counted(seeds: Any) -> Any:
 
 
 Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1), BeforeValidator(_counted)]
-_OF_WORLDS = ("config", "overrides", "start_s", "end_s")
+KINDS = ("simulated", "recording", "session", "graph", "synthetic")
+"""What a source can be; `study.sources` has what each of them does."""
+DRIVES = ("simulated", "recording")
+"""Kinds of sources that are mapped."""
 Rate = Annotated[float, Field(ge=0, lt=1)]
+Start = Literal["graph", "odometry", "chain", "angular", "reference"]
+Way = Literal["solve", "replay", "drive", "mapped"]
+
+
+def _listed(value: Any) -> Any:
+    """A single value stands for a list of one."""
+    return value if isinstance(value, list | tuple) else (value,)
+
+
+Names = Annotated[tuple[str, ...], BeforeValidator(_listed)]
 
 
 class SyntheticConfig(Section):
@@ -48,20 +60,26 @@ class SyntheticConfig(Section):
 
 
 class SourceConfig(Section):
-    """Where a graph comes from: exactly one of `world`, `session`, `graph` and `synthetic`."""
+    """Where a graph comes from: exactly one of `simulated`, `recording`, `session`, `graph` and `synthetic`."""
 
     name: str | None = None
     """How the tables call it; default: the world's, folder's or file's name."""
-    world: str | None = None
-    """A simulated world, mapped once for each front-end setting and seed."""
+    simulated: str | None = None
+    """A simulated world, mapped once for each setting and seed; its truth is known."""
+    recording: Path | None = None
+    """A recording, mapped once for each setting, and for each seed where a disturbance is left to chance."""
     config: str | None = None
-    """With `world`: the mapping configuration, by name or path; default: the world's own."""
+    """Of a drive: the mapping configuration, by name or path; default: the world's own, or `laser` for a recording."""
     overrides: dict[str, Any] = Field(default_factory=dict)
-    """With `world`: settings on top of it, as sections or dotted keys."""
+    """Of a drive: settings on top of it, as sections or dotted keys."""
     start_s: float | None = None
-    """With `world`: leave out so many seconds at the beginning."""
+    """Of a drive: leave out so many seconds at the beginning."""
     end_s: float | None = None
-    """With `world`: drive only so many seconds."""
+    """Of a drive: end after so many seconds."""
+    reference: Path | None = None
+    """Of a recording: its true trajectory in the TUM format; default: what the recording itself holds."""
+    relations: Path | None = None
+    """Of a recording: verified relative poses, `t1 t2 dx dy dyaw` a line."""
     session: Path | None = None
     """A session folder; its truth is the reference if it has one."""
     graph: Path | None = None
@@ -70,14 +88,33 @@ class SourceConfig(Section):
     """A graph made up from the seed."""
     first_nodes: int | None = Field(default=None, ge=3)
     """Keep only so many nodes of the graph."""
+    seeds: Seeds | None = None
+    """Seeds of this source; default: those of the study."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, given: Any) -> Any:
+        if isinstance(given, Mapping) and "world" in given:
+            raise ValueError("`world` is now called `simulated`")
+        return given
+
+    @property
+    def knows_truth(self) -> bool:
+        """Whether the truth of it is sure to be known."""
+        return self.kind in ("simulated", "synthetic")
+
+    @property
+    def kind(self) -> str:
+        """Which of `KINDS` it is."""
+        return next(kind for kind in KINDS if getattr(self, kind) is not None)
 
     @property
     def title(self) -> str:
         """How the tables call it."""
         if self.name is not None:
             return self.name
-        path = self.session or self.graph
-        return path.name if path is not None else self.world or "synthetic"
+        path = self.recording or self.session or self.graph
+        return path.name if path is not None else self.simulated or "synthetic"
 
 
 class DriftConfig(Section):
@@ -104,14 +141,23 @@ class DriftConfig(Section):
 
 
 class SettingConfig(Section):
-    """One setting of what comes before the back-ends."""
+    """What comes before the back-ends: how it is mapped, and what is made worse."""
 
     name: str
     """How the tables call it."""
     overrides: dict[str, Any] = Field(default_factory=dict)
-    """For worlds: settings on top of the mapping configuration, as sections or dotted keys."""
+    """For drives: settings on top of the mapping configuration, as sections or dotted keys."""
+    vary: dict[str, Annotated[tuple[Any, ...], Field(min_length=1)]] = Field(default_factory=dict)
+    """Dotted key -> values: this entry stands for one setting for each combination, named by its values."""
+    disturb: dict[str, float | tuple[float, ...]] = Field(default_factory=dict)
+    """For drives: disturbance (of `study.disturb.TABLE`) -> its strength; 0 changes nothing."""
     drift: DriftConfig = DriftConfig()
     """For every source: errors put on the frozen graph's odometry edges."""
+
+    @property
+    def title(self) -> str:
+        """How the tables call it."""
+        return self.name
 
 
 class BackendVariant(Section):
@@ -125,11 +171,13 @@ class BackendVariant(Section):
     """Its settings (the section `backends` of a configuration, without `names`), as sections or dotted keys."""
     vary: dict[str, Annotated[tuple[Any, ...], Field(min_length=1)]] = Field(default_factory=dict)
     """Dotted key -> values: this entry stands for one variant for each combination, named by its values."""
-    start: Literal["graph", "odometry", "chain", "angular", "reference"] = "graph"
+    start: Start = "graph"
     """Poses that it begins with: the graph's own, dead reckoning, the chain of the best consecutive edges, the angular
     start, or the reference itself. (`gtsam-lm` and its like also try a start of their own when they solve a whole graph.)"""
-    way: Literal["solve", "replay", "drive"] = "solve"
-    """The whole graph at once, node by node as while driving, or that with the final solution at the end of the drive."""
+    way: Way = "solve"
+    """The whole graph at once, node by node as while driving, or that with the final solution at the end of the drive.
+    `mapped`: nothing is solved again; the figures are those of the drive itself, by this back-end of its configuration
+    (`primary`: the first one, `odometry`: dead reckoning)."""
 
     @property
     def title(self) -> str:
@@ -157,6 +205,41 @@ class StatisticsConfig(Section):
     """Of the bootstrap."""
 
 
+class BarConfig(Section):
+    """What a figure has to keep to, in every group of the study that it is for: give `at_most` or `at_least`."""
+
+    figure: str
+    """A column of `cells.csv` or `timings.csv`."""
+    at_most: float | str | None = None
+    """The largest value, or the title of a back-end whose figure on the same drive must not be exceeded."""
+    at_least: float | None = None
+    """The smallest value."""
+    statistic: Literal["worst", "median", "mean"] = "worst"
+    """What is held against the bar: the worst, the median or the mean over the seeds."""
+    sources: Names = ()
+    """Titles of the sources that it is for; default: all."""
+    settings: Names = ()
+    """Names of the settings that it is for; default: all."""
+    backends: Names = ()
+    """Titles of the back-ends that it is for; default: all but dead reckoning."""
+    kinds: Names = ()
+    """Kinds of false loops that it is for; default: all."""
+    rates: Annotated[tuple[Rate, ...], BeforeValidator(_listed)] = ()
+    """Rates of false loops that it is for; default: all."""
+
+    @property
+    def side(self) -> str:
+        """`at least` or `at most`."""
+        return "at most" if self.at_least is None else "at least"
+
+
+MAPPED = (
+    BackendVariant(backend="odometry", way="mapped"),
+    BackendVariant(name="map", backend="primary", way="mapped"),
+)
+"""Back-ends of a study that names none: each drive as it was mapped, beside dead reckoning."""
+
+
 class StudyConfig(Section):
     """A whole study."""
 
@@ -169,16 +252,23 @@ class StudyConfig(Section):
     sources: Annotated[tuple[SourceConfig, ...], Field(min_length=1)]
     """Graphs, or where they come from."""
     settings: Annotated[tuple[SettingConfig, ...], Field(min_length=1)] = (SettingConfig(name="default"),)
-    """Settings of what comes before the back-ends."""
-    backends: Annotated[tuple[BackendVariant, ...], Field(min_length=1)]
-    """Back-ends; the first one is the baseline of the paired differences."""
+    """What comes before the back-ends."""
+    backends: Annotated[tuple[BackendVariant, ...], Field(min_length=1)] = MAPPED
+    """Back-ends; the first one is the baseline of the paired differences. Default: each drive as it was mapped."""
     false_loops: FalseLoopsConfig = FalseLoopsConfig()
     """False loops."""
     statistics: StatisticsConfig = StatisticsConfig()
     """Summing up."""
+    bars: tuple[BarConfig, ...] = ()
+    """What the figures have to keep to."""
+
+    @property
+    def maps(self) -> bool:
+        """Whether a drive is judged as it was mapped."""
+        return any(variant.way == "mapped" for variant in self.backends)
 
     @classmethod
-    def load(cls, source: str | Path, overrides: Mapping[str, Any] | None = None) -> Self:
+    def load(cls, source: str | Path, overrides: Mapping[str, Any] | None = None) -> StudyConfig:
         """Read a study by path, or by name if it comes with the package, with `overrides` (`{"seeds": 3}`) on top.
 
         Raises:
@@ -196,21 +286,19 @@ class StudyConfig(Section):
             raise
 
     @classmethod
-    def from_tree(cls, tree: Mapping[str, Any], origin: str, folder: Path) -> Self:
+    def from_tree(cls, tree: Mapping[str, Any], origin: str, folder: Path) -> StudyConfig:
         """Validate a nested mapping; `origin` names it in errors, relative paths begin in `folder`.
 
         Raises:
             ConfigError: as `load`.
         """
+        from hybridmap.study.resolve import resolved
+
         try:
             study = cls.model_validate(_spelt_out(tree))
         except ValidationError as error:
             raise ConfigError(f"{origin}: {said(error)}") from None
-        sources = tuple(_located(source, origin, folder) for source in study.sources)
-        variants = tuple(single for entry in study.backends for single in _expanded(entry, origin))
-        study = study.model_copy(update={"sources": sources, "backends": variants})
-        _check(study, origin)
-        return study
+        return resolved(study, origin, folder)
 
     def to_yaml(self) -> str:
         """The resolved study as YAML that `load` reads back to an equal one."""
@@ -275,79 +363,7 @@ def _find(source: str | Path) -> Path:
 def _spelt_out(tree: Mapping[str, Any]) -> dict[str, Any]:
     """Short forms made long: a back-end or source may be just its name."""
     out = dict(tree)
-    for key, field in (("backends", "backend"), ("sources", "world")):
+    for key, field in (("backends", "backend"), ("sources", "simulated")):
         if isinstance(out.get(key), Sequence) and not isinstance(out[key], str):
             out[key] = [{field: entry} if isinstance(entry, str) else entry for entry in out[key]]
     return out
-
-
-def _located(source: SourceConfig, origin: str, folder: Path) -> SourceConfig:
-    """The source with absolute paths; `$NAME` in a path is the environment's."""
-    given = [key for key in ("world", "session", "graph", "synthetic") if getattr(source, key) is not None]
-    if len(given) != 1:
-        found = " and ".join(given) or "none"
-        raise ConfigError(f"{origin}: sources: {source.title}: found {found}, expected one of world, session, graph, synthetic")
-    return source.model_copy(
-        update={key: _absolute(getattr(source, key), origin, folder) for key in ("session", "graph") if key in given}
-    )
-
-
-def _absolute(path: Path, origin: str, folder: Path) -> Path:
-    expanded = os.path.expandvars(str(path))
-    unset = re.search(r"\$\{?(\w+)", expanded)
-    if unset:
-        raise ConfigError(
-            f"{origin}: {path}: the environment variable {unset[1]} is not set; set it to the folder it stands for"
-        )
-    return (folder / expanded).resolve()
-
-
-def _expanded(entry: BackendVariant, origin: str) -> list[BackendVariant]:
-    """One variant for each combination of `vary`."""
-    if clash := sorted(set(entry.vary) & set(entry.settings)):
-        raise ConfigError(f"{origin}: backends: {entry.title}: {clash[0]} is in both settings and vary")
-    variants = [entry.model_copy(update={"vary": {}})]
-    for key, values in entry.vary.items():
-        variants = [
-            one.model_copy(
-                update={"name": f"{one.title} {key.rpartition('.')[2]}={value}", "settings": {**one.settings, key: value}}
-            )
-            for one in variants
-            for value in values
-        ]
-    return variants
-
-
-def _check(study: StudyConfig, origin: str) -> None:
-    """What pydantic cannot see: names given twice, back-ends and worlds that there are not, settings that cannot act."""
-    from hybridmap.backends.registry import names
-    from hybridmap.simulation import world_names
-
-    lists: dict[str, list[str]] = {
-        "sources": [source.title for source in study.sources],
-        "settings": [setting.name for setting in study.settings],
-        "backends": [variant.title for variant in study.backends],
-        "seeds": [str(seed) for seed in study.seeds],
-        "false_loops.rates": [str(rate) for rate in study.false_loops.rates],
-        "false_loops.kinds": list(study.false_loops.kinds),
-    }
-    for key, titles in lists.items():
-        twice = next((title for title in titles if titles.count(title) > 1), None)
-        if twice is not None:
-            raise ConfigError(f"{origin}: {key}: {twice!r} is there twice; give each its own name")
-    for variant in study.backends:
-        if variant.backend not in names():
-            raise ConfigError(f"{origin}: backends: unknown back-end {variant.backend!r}; there are {', '.join(names())}")
-        backend_settings(variant)
-    for source in study.sources:
-        if source.world is not None and source.world not in world_names():
-            known = ", ".join(world_names())
-            raise ConfigError(f"{origin}: sources: no world called {source.world!r}; there are {known}")
-        if source.world is None and any(getattr(source, key) for key in _OF_WORLDS):
-            raise ConfigError(f"{origin}: sources: {source.title}: {', '.join(_OF_WORLDS)} are for worlds only")
-        overriding = next((setting.name for setting in study.settings if setting.overrides), None)
-        if source.world is None and overriding is not None:
-            raise ConfigError(
-                f"{origin}: settings: {overriding}: overrides need a world to map, and {source.title} is a graph already; "
-                f"use drift, or a study of its own"
-            )

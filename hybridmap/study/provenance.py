@@ -18,17 +18,18 @@ SCHEMA = 1
 """Raised when the meaning of a figure changes."""
 
 _LIBRARIES = ("gtsam", "numba", "numpy", "scipy", "opencv-python-headless")
-_SHOWING = ("cli", "evaluate", "export", "report", "session.py", "study")
+_SHOWING = ("cli", "export", "report", "session.py", "study")
 _SOLVING = (
     "backends",
     "config/backends.py",
     "geometry.py",
     "graph",
     "study/cell.py",
-    "study/disturb.py",
+    "study/drift.py",
     "study/false_loops.py",
     "study/sources.py",
 )
+_JUDGING = ("study/disturb.py", "study/drive.py")
 
 
 def digest(tree: Mapping[str, Any]) -> str:
@@ -45,7 +46,7 @@ def solving() -> str:
 
 @cache
 def mapping() -> str:
-    """The same of all that turns a simulated world into a graph."""
+    """The same of all that turns a drive into a graph and its figures."""
     return digest({"code": _digest_of(solving_only=False), **_surroundings()})
 
 
@@ -71,7 +72,9 @@ def _digest_of(*, solving_only: bool) -> str:
     total = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         name = path.relative_to(package).as_posix()
-        wanted = name.startswith(_SOLVING) or not (solving_only or name.startswith(_SHOWING))
+        wanted = name.startswith(_SOLVING) or (
+            not solving_only and (name.startswith(_JUDGING) or not name.startswith(_SHOWING))
+        )
         if wanted:
             total.update(f"{name}\0".encode() + path.read_bytes() + b"\0")
     return total.hexdigest()

@@ -1,90 +1,55 @@
-"""From a source to a frozen graph with a reference: simulated worlds, sessions, graph files, made-up laps."""
+"""From a source to a frozen graph with a reference. A kind of source is a class in `KINDS`."""
 
 from __future__ import annotations
 
 import hashlib
-import io
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
 from hybridmap.backends.base import SolveStatus
 from hybridmap.backends.registry import LEAST_SQUARES, create
 from hybridmap.config import Config
-from hybridmap.errors import HybridMapError, StudyError
+from hybridmap.errors import HybridMapError, StreamError
 from hybridmap.geometry import Array, between, compose, exp
 from hybridmap.graph.connectivity import chain
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import PoseGraph, prefix
-from hybridmap.study import provenance
+from hybridmap.study import disturb, provenance
+from hybridmap.study.drive import Drive, truth_at
+from hybridmap.study.frozen import Frozen
 from hybridmap.study.model import SettingConfig, SourceConfig, SyntheticConfig
-from hybridmap.trajectory import Trajectory
 
-_ARRAYS = tuple(field.name for field in fields(PoseGraph) if field.name != "file")
+_BLOCK = 1 << 20
 
 
-@dataclass(frozen=True, slots=True)
-class Frozen:
-    """A graph that will not change any more, and what its nodes are compared with.
+class Maker(Protocol):
+    """Comes to a graph; it may be sent to another machine."""
 
-    Attributes:
-        graph: without false loops or drift; None where there was none to be had.
-        reference: (N, 3) m and rad, NaN where unknown.
-        of_truth: whether the reference is the truth; else the optimum of the clean graph by `gtsam-lm`.
-        failure: why there is no graph; empty otherwise.
-    """
-
-    graph: PoseGraph | None
-    reference: Array
-    of_truth: bool = False
-    failure: str = ""
-
-    def pack(self) -> bytes:
-        """As bytes that `unpack` reads; the same content gives the same bytes."""
-        arrays: dict[str, Any] = {"reference": self.reference, "of_truth": self.of_truth, "failure": self.failure}
-        if self.graph is not None:
-            given = {name: getattr(self.graph, name) for name in _ARRAYS}
-            arrays |= {name: array for name, array in given.items() if array is not None}
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **arrays)
-        return buffer.getvalue()
-
-    @classmethod
-    def unpack(cls, data: bytes) -> Frozen:
-        """Read what `pack` gave.
+    def make(self) -> Frozen:
+        """The graph, with its truth where that is known.
 
         Raises:
-            ValueError, OSError, KeyError, zipfile.BadZipFile: it is damaged.
+            HybridMapError: there is none to be had.
         """
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            given = {name: arrays[name] for name in _ARRAYS if name in arrays}
-            graph = PoseGraph(**given) if given else None
-            return cls(graph, arrays["reference"], bool(arrays["of_truth"]), str(arrays["failure"]))
 
 
 @dataclass(frozen=True, slots=True)
 class SourceTask:
-    """How to come to a frozen graph; it may be sent to another machine, needs no file there and no other task.
+    """How to come to a frozen graph with a reference.
 
     Attributes:
         key: digest of all that determines the graph and its reference.
-        world: of the simulator, with `config`, `start_s` and `end_s`; None for a graph.
-        clean: a frozen graph, packed, whose reference is still missing unless it is of truth.
-        synthetic: of a made-up graph, with `seed`.
+        maker: comes to the graph.
+        first_nodes: keep only so many of its nodes.
     """
 
     key: str
-    world: str | None = None
-    config: Mapping[str, Any] | None = None
-    start_s: float | None = None
-    end_s: float | None = None
-    clean: bytes | None = None
-    synthetic: SyntheticConfig | None = None
-    seed: int = 0
+    maker: Maker
     first_nodes: int | None = None
 
 
@@ -96,56 +61,174 @@ class SourceResult:
     code: str
 
 
-def depends_on_seed(source: SourceConfig) -> bool:
-    """Whether another seed gives another graph."""
-    return source.world is not None or source.synthetic is not None
+class Source(Protocol):
+    """A source of a study, opened: what is read from files is read once."""
+
+    def by_chance(self, setting: SettingConfig) -> bool:
+        """Whether another seed gives another graph."""
+
+    def task(self, setting: SettingConfig, seed: int) -> SourceTask:
+        """The task for its graph at a setting and seed.
+
+        Raises:
+            ConfigError: the configuration of a drive cannot be used.
+        """
 
 
-def task_of(source: SourceConfig, setting: SettingConfig, seed: int, read: Mapping[str, Frozen]) -> SourceTask:
-    """The task for a source at a setting and seed; `read` holds the graphs of files and sessions, by title.
-
-    Raises:
-        ConfigError: the world's configuration cannot be used.
-    """
-    if source.world is not None:
-        return _world_task(source, setting, seed)
-    if source.synthetic is not None:
-        identity = {"synthetic": source.synthetic.model_dump(), "seed": seed, "first": source.first_nodes}
-        key = provenance.digest({**identity, "code": provenance.solving()})
-        return SourceTask(key, synthetic=source.synthetic, seed=seed, first_nodes=source.first_nodes)
-    clean = read[source.title].pack()
-    content = {"content": hashlib.sha256(clean).hexdigest(), "first": source.first_nodes, "code": provenance.solving()}
-    return SourceTask(provenance.digest(content), clean=clean, first_nodes=source.first_nodes)
-
-
-def _world_task(source: SourceConfig, setting: SettingConfig, seed: int) -> SourceTask:
-    overrides = {**source.overrides, **setting.overrides, "seed": seed}
-    config = Config.load(source.config or source.world, overrides, overridden_by=f"{source.title}: overrides")
-    backends = config.backends.model_copy(update={"names": config.backends.names[:1]})  # the others leave no trace in a graph
-    tree = config.model_copy(update={"backends": backends}).model_dump(mode="json")
-    identity = {"world": source.world, "config": tree, "window": [source.start_s, source.end_s], "first": source.first_nodes}
-    key = provenance.digest({**identity, "code": [provenance.mapping(), provenance.solving()]})
-    return SourceTask(key, source.world, tree, source.start_s, source.end_s, first_nodes=source.first_nodes)
-
-
-def read_source(source: SourceConfig) -> Frozen:
-    """Read a graph file or the graph of a session; its reference is the session's truth, where there is one.
+def open_source(source: SourceConfig, *, maps: bool = False) -> Source:
+    """Open a source of a study; `maps`: its drive is judged as it was mapped.
 
     Raises:
-        GraphError, StoreError, StreamError: the file or folder is missing or damaged.
+        GraphError, StoreError, StreamError: a file or folder is missing or damaged.
     """
-    if source.graph is not None:
-        graph = read_graph(source.graph)
-        graph.validate()
-        return Frozen(graph, _unknown(graph))
-    assert source.session is not None
-    return _read_session(source.session)
+    return KINDS[source.kind](source, maps)
 
 
-def _read_session(path: Path) -> Frozen:
+def prepare(task: SourceTask) -> SourceResult:
+    """Do what a task says: make the graph, and find its reference. A typed error is a frozen failure."""
+    try:
+        frozen = _with_reference(_cut(task.maker.make(), task.first_nodes))
+    except HybridMapError as error:
+        frozen = Frozen(None, np.zeros((0, 3)), failure=" ".join(str(error).split()))
+    return SourceResult(frozen.pack(), provenance.solving())
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """A graph that is there already."""
+
+    clean: bytes
+
+    def make(self) -> Frozen:
+        """Unpack it."""
+        return Frozen.unpack(self.clean)
+
+
+@dataclass(frozen=True, slots=True)
+class Laps:
+    """A graph made up from the seed."""
+
+    config: SyntheticConfig
+    seed: int
+
+    def make(self) -> Frozen:
+        """Draw it."""
+        return laps(self.config, np.random.default_rng(self.seed))
+
+
+class _Synthetic:
+    def __init__(self, source: SourceConfig, maps: bool) -> None:
+        del maps
+        assert source.synthetic is not None
+        self._config, self._first = source.synthetic, source.first_nodes
+
+    def by_chance(self, setting: SettingConfig) -> bool:
+        del setting
+        return True
+
+    def task(self, setting: SettingConfig, seed: int) -> SourceTask:
+        del setting
+        identity = {"synthetic": self._config.model_dump(), "seed": seed, "first": self._first}
+        return SourceTask(provenance.digest({**identity, "code": provenance.solving()}), Laps(self._config, seed), self._first)
+
+
+class _Known:
+    """A graph file, or the graph of a session: it enters by its content, not by its place."""
+
+    def __init__(self, source: SourceConfig, maps: bool) -> None:
+        del maps
+        clean = (_read_graph(source.graph) if source.graph is not None else _read_session(source.session)).pack()
+        content = {"content": hashlib.sha256(clean).hexdigest(), "first": source.first_nodes, "code": provenance.solving()}
+        self._task = SourceTask(provenance.digest(content), Given(clean), source.first_nodes)
+
+    def by_chance(self, setting: SettingConfig) -> bool:
+        del setting
+        return False
+
+    def task(self, setting: SettingConfig, seed: int) -> SourceTask:
+        del setting, seed
+        return self._task
+
+
+class _Drive:
+    """A simulated world or a recording."""
+
+    def __init__(self, source: SourceConfig, maps: bool) -> None:
+        self._source, self._maps = source, maps
+        paths = [path for path in (source.recording, source.reference, source.relations) if path is not None]
+        self._content = [_content(path) for path in paths]
+
+    def by_chance(self, setting: SettingConfig) -> bool:
+        return self._source.simulated is not None or disturb.by_chance(setting.disturb)
+
+    def task(self, setting: SettingConfig, seed: int) -> SourceTask:
+        source = self._source
+        overrides = {**source.overrides, **setting.overrides}
+        if source.simulated is not None:
+            overrides["seed"] = seed
+        config = Config.load(
+            source.config or source.simulated or "laser", overrides, overridden_by=f"{source.title}: overrides"
+        )
+        if not self._maps:  # the other back-ends leave no trace in a graph
+            backends = config.backends.model_copy(update={"names": config.backends.names[:1]})
+            config = config.model_copy(update={"backends": backends})
+        drive = Drive(
+            source=str(source.recording or source.simulated),
+            config=config.model_dump(mode="json"),
+            start_s=source.start_s,
+            end_s=source.end_s,
+            disturb={name: strength for name, strength in setting.disturb.items() if np.any(strength)},
+            seed=seed if disturb.by_chance(setting.disturb) else 0,
+            reference=str(source.reference or ""),
+            relations=str(source.relations or ""),
+        )
+        identity = {
+            "drive": [source.simulated, self._content, drive.config, drive.start_s, drive.end_s],
+            "disturb": [drive.disturb, drive.seed],
+            "first": source.first_nodes,
+            "code": [provenance.mapping(), provenance.solving()],
+        }
+        return SourceTask(provenance.digest(identity), drive, source.first_nodes)
+
+
+KINDS: Mapping[str, Callable[[SourceConfig, bool], Source]] = {
+    "simulated": _Drive,
+    "recording": _Drive,
+    "session": _Known,
+    "graph": _Known,
+    "synthetic": _Synthetic,
+}
+"""Kind of a source (a field of `model.SourceConfig`) -> what it does."""
+
+
+def _content(path: Path) -> str:
+    """Digest of a file, or of every file in a folder.
+
+    Raises:
+        StreamError: it is not there.
+    """
+    if not path.exists():
+        raise StreamError(f"{path}: no such file or folder")
+    total = hashlib.sha256()
+    for file in sorted(entry for entry in path.rglob("*") if entry.is_file()) if path.is_dir() else [path]:
+        total.update(f"{file.relative_to(path)}\0".encode())
+        with file.open("rb") as opened:
+            while block := opened.read(_BLOCK):
+                total.update(block)
+    return total.hexdigest()
+
+
+def _read_graph(path: Path) -> Frozen:
+    graph = read_graph(path)
+    graph.validate()
+    return Frozen(graph, _unknown(graph))
+
+
+def _read_session(path: Path | None) -> Frozen:
     from hybridmap.store import MapStore, SessionFolder
     from hybridmap.trajectory import read_tum
 
+    assert path is not None
     folder = SessionFolder(path)
     folder.require()
     with MapStore.open(path) as store:
@@ -155,45 +238,7 @@ def _read_session(path: Path) -> Frozen:
     if not folder.groundtruth.is_file():
         return Frozen(graph, _unknown(graph))
     stamps = np.array([node.stamp_ns for node in experiences.nodes], dtype=np.int64)
-    return Frozen(graph, _truth_at(read_tum(folder.groundtruth), stamps), of_truth=True)
-
-
-def prepare(task: SourceTask) -> SourceResult:
-    """Do what a task says: map the world, or make or take the graph, and find its reference. An error is a frozen failure."""
-    try:
-        frozen = _with_reference(_cut(_made(task), task.first_nodes))
-    except HybridMapError as error:
-        frozen = Frozen(None, np.zeros((0, 3)), failure=" ".join(str(error).split()))
-    return SourceResult(frozen.pack(), provenance.solving())
-
-
-def _made(task: SourceTask) -> Frozen:
-    if task.world is not None:
-        return _mapped(task)
-    if task.synthetic is not None:
-        return laps(task.synthetic, np.random.default_rng(task.seed))
-    assert task.clean is not None
-    return Frozen.unpack(task.clean)
-
-
-def _mapped(task: SourceTask) -> Frozen:
-    """Drive through the world once and freeze the accepted edges; the truth is known."""
-    from hybridmap.mapper import Mapper
-    from hybridmap.streams import open_stream
-
-    assert task.world is not None
-    assert task.config is not None
-    config = Config.from_tree(task.config, "study")
-    stream = open_stream(task.world, config, start_s=task.start_s, end_s=task.end_s)
-    mapper = Mapper(config, stream.rig)
-    for sample in stream:
-        mapper.add(sample)
-    mapper.finish()
-    graph = mapper.map.pose_graph()
-    if not graph.n_edges or stream.groundtruth is None:
-        raise StudyError(f"{task.world}: the drive gave {graph.n_nodes} nodes and no edge; drive longer (end_s)")
-    stamps = np.array([node.stamp_ns for node in mapper.map.nodes], dtype=np.int64)
-    return Frozen(graph, _truth_at(stream.groundtruth, stamps), of_truth=True)
+    return Frozen(graph, truth_at(read_tum(folder.groundtruth), stamps), of_truth=True)
 
 
 def laps(config: SyntheticConfig, rng: np.random.Generator) -> Frozen:
@@ -236,14 +281,6 @@ def _with_reference(frozen: Frozen) -> Frozen:
     solution = create(LEAST_SQUARES).solve(frozen.graph)
     found = solution.report.status in (SolveStatus.CONVERGED, SolveStatus.MAX_ITERATIONS)
     return replace(frozen, reference=solution.poses) if found else frozen
-
-
-def _truth_at(truth: Trajectory, stamps_ns: Any) -> Array:
-    from hybridmap.evaluate.association import known_at
-
-    poses = truth.at(stamps_ns)
-    poses[~known_at(truth, stamps_ns)] = np.nan
-    return poses
 
 
 def _unknown(graph: PoseGraph) -> Array:

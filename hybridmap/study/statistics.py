@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybridmap.geometry import Array
-from hybridmap.study.cell import MEASURES, CellResult
+from hybridmap.study.cell import CellResult
 from hybridmap.study.grid import Cell, Grid
+from hybridmap.study.measures import measures_of
 from hybridmap.study.model import StatisticsConfig
 
 LEAST = {"t": 3, "bootstrap": 5}
@@ -96,7 +97,7 @@ def summarise(grid: Grid, results: Mapping[str, CellResult]) -> list[Summary]:
     for group, by_backend in groups.items():
         for backend, by_seed in by_backend.items():
             against = None if backend == baseline else by_backend[baseline]
-            for measure, (unit, _) in MEASURES.items():
+            for measure, (unit, _) in measures_of(grid.study).items():
                 rows.append(_summary(group, backend, (measure, unit), by_seed, baseline, against, grid.study.statistics))
     return rows
 

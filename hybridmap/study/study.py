@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,10 +10,12 @@ from typing import Any
 
 from hybridmap.metrics import Metric, to_json
 from hybridmap.output import held, write_text
-from hybridmap.study import provenance, tables
+from hybridmap.study import bars, provenance, tables
+from hybridmap.study.bars import Verdict
 from hybridmap.study.cell import CellResult
-from hybridmap.study.folder import CELLS_CSV, METRICS, STUDY, STUDY_FOLDER, SUMMARY_CSV, TIMINGS_CSV, StudyFolder
+from hybridmap.study.folder import BARS_CSV, CELLS_CSV, METRICS, STUDY, STUDY_FOLDER, SUMMARY_CSV, TIMINGS_CSV, StudyFolder
 from hybridmap.study.grid import Cell, Grid, lay_out
+from hybridmap.study.measures import measures_of
 from hybridmap.study.model import StudyConfig, quoted
 from hybridmap.study.pools import Pool
 from hybridmap.study.runner import Progress, run
@@ -28,6 +31,7 @@ class Study:
         grid: its cells.
         results: key -> result.
         summaries: sums over the seeds, a group, back-end and measure each.
+        verdicts: every bar, group by group.
         computed: cells that this run computed; the others were known.
         head: the keys of `metrics.json` beside its list.
         metrics: the figures.
@@ -37,6 +41,7 @@ class Study:
     grid: Grid
     results: dict[str, CellResult]
     summaries: list[Summary]
+    verdicts: list[Verdict]
     computed: int
     head: dict[str, Any]
     metrics: list[Metric]
@@ -46,11 +51,16 @@ class Study:
         """Every cell with its result, in the order of the tables."""
         return [(cell, self.results[cell.key]) for cell in self.grid.cells]
 
+    @property
+    def missed(self) -> list[Verdict]:
+        """Bars that are not kept."""
+        return [verdict for verdict in self.verdicts if not verdict.passed]
+
 
 def run_study(study: StudyConfig, out: Path, pool: Pool, progress: Progress | None = None) -> Study:
     """Run or go on with a study; what an earlier run in the same folder knows is not computed again.
 
-    The folder gets `study.yaml`, `cells.csv`, `timings.csv`, `summary.csv` and `metrics.json`.
+    The folder gets `study.yaml`, `cells.csv`, `timings.csv`, `summary.csv`, `bars.csv` and `metrics.json`.
 
     Raises:
         OutputError: the folder cannot be used, or another run is writing there.
@@ -63,17 +73,19 @@ def run_study(study: StudyConfig, out: Path, pool: Pool, progress: Progress | No
         outcomes = run(grid, folder, pool, progress)
         summaries = summarise(grid, outcomes.results)
         head = _head(grid, outcomes.results)
-        metrics = _metrics(summaries)
+        verdicts = bars.judge(grid, outcomes.results)
+        metrics = _metrics(summaries, verdicts)
         texts = {
             STUDY: study.to_yaml(),
-            CELLS_CSV: tables.cells_csv(grid.cells, outcomes.results),
+            CELLS_CSV: tables.cells_csv(grid.cells, outcomes.results, measures_of(study)),
             TIMINGS_CSV: tables.timings_csv(grid.cells, outcomes.results),
             SUMMARY_CSV: tables.summary_csv(summaries),
+            BARS_CSV: tables.bars_csv(verdicts),
             METRICS: to_json(head, metrics) + "\n",
         }
         for name, text in texts.items():
             write_text(out / name, text)
-    return Study(folder, grid, outcomes.results, summaries, outcomes.computed, head, metrics)
+    return Study(folder, grid, outcomes.results, summaries, verdicts, outcomes.computed, head, metrics)
 
 
 def _head(grid: Grid, results: dict[str, CellResult]) -> dict[str, Any]:
@@ -88,15 +100,24 @@ def _head(grid: Grid, results: dict[str, CellResult]) -> dict[str, Any]:
     }
 
 
-def _metrics(summaries: Sequence[Summary]) -> list[Metric]:
-    """Median and mean of each measure, and the mean difference to the baseline, `<figure>/<group>/<back-end>`."""
+def _metrics(summaries: Sequence[Summary], verdicts: Sequence[Verdict]) -> list[Metric]:
+    """Median and mean of each measure, the mean difference to the baseline, and every bar: `<figure>/<group>/<back-end>`."""
     metrics = []
     for one in summaries:
         stage = f"{one.label}/{one.backend}"
-        stem = one.measure.removesuffix(f"_{one.unit}")
+        stem = _stem(one.measure, one.unit)
         metrics.append(Metric(f"{stem}_median/{stage}", one.median, one.unit, f"median of {one.solved} of {one.cells} cells"))
         metrics.append(Metric(f"{stem}_mean/{stage}", one.mean.value, one.unit, f"mean, {one.mean}"))
         if one.difference is not None:
             what = f"mean of the paired differences to {quoted(one.baseline)}, {one.difference}"
             metrics.append(Metric(f"{stem}_difference/{stage}", one.difference.value, one.unit, what))
+    for verdict in verdicts:
+        name = f"{_stem(verdict.bar.figure, verdict.unit)}_{verdict.bar.statistic}/{verdict.label}"
+        metrics = [metric for metric in metrics if metric.name != name]
+        limit = verdict.limit if math.isfinite(verdict.limit) else None
+        metrics.append(Metric(name, verdict.value, verdict.unit, verdict.said, limit, verdict.passed))
     return metrics
+
+
+def _stem(measure: str, unit: str) -> str:
+    return measure.removesuffix(f"_{unit}")

@@ -8,32 +8,45 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from hybridmap.study.cell import MEASURES, CellResult
+from hybridmap.study.bars import Verdict
+from hybridmap.study.cell import CellResult
 from hybridmap.study.grid import Cell
+from hybridmap.study.measures import TIMINGS
 from hybridmap.study.statistics import Summary
 
 _LABELS = ("source", "setting", "false_loop_kind", "false_loop_rate", "seed", "backend")
 _COUNTS = ("nodes", "edges", "own_loops", "false_loops")
-CELL_COLUMNS = (*_LABELS, "status", *MEASURES, *_COUNTS, "message", "key")
-"""Of `cells.csv`."""
 SUMMARY_COLUMNS = (
     *(label for label in _LABELS if label != "seed"),
     *("measure", "unit", "cells", "solved", "median", "mean", "mean_low", "mean_high"),
     *("baseline", "pairs", "difference_mean", "difference_low", "difference_high", "share_lower"),
 )
 """Of `summary.csv`."""
-TIMING_COLUMNS = (*_LABELS, "cpu_s", "key")
+TIMING_COLUMNS = (*_LABELS, *TIMINGS, "key")
 """Of `timings.csv`."""
+BAR_COLUMNS = (
+    *(label for label in _LABELS if label != "seed"),
+    *("figure", "unit", "statistic", "value", "side", "bar", "passed", "median", "worst", "values"),
+)
+"""Of `bars.csv`."""
 
 
-def cells_csv(cells: Sequence[Cell], results: Mapping[str, CellResult]) -> str:
+def cells_csv(cells: Sequence[Cell], results: Mapping[str, CellResult], measures: Iterable[str]) -> str:
     """A line a cell in the order of the grid; numbers with all their digits, nothing where there is no figure."""
-    return _text(CELL_COLUMNS, (_cell_row(cell, results[cell.key]) for cell in cells))
+    names = tuple(dict.fromkeys((*measures, *_COUNTS)))
+    columns = (*_LABELS, "status", *names, "message", "key")
+    return _text(columns, (_cell_row(cell, results[cell.key], names) for cell in cells))
 
 
 def timings_csv(cells: Sequence[Cell], results: Mapping[str, CellResult]) -> str:
     """Process time of each cell, when it was computed; apart, since no two runs agree on it."""
-    return _text(TIMING_COLUMNS, ((*_labels(cell), shown(results[cell.key].cpu_s), cell.key) for cell in cells))
+    rows = ((cell, results[cell.key].timings) for cell in cells)
+    return _text(TIMING_COLUMNS, ((*_labels(cell), *(shown(spent.get(n)) for n in TIMINGS), cell.key) for cell, spent in rows))
+
+
+def bars_csv(verdicts: Sequence[Verdict]) -> str:
+    """A line a bar and group; the value of each seed in the last column, a dash where there is none."""
+    return _text(BAR_COLUMNS, (_bar_row(one) for one in verdicts))
 
 
 def shown(value: float | None) -> str:
@@ -48,8 +61,8 @@ def _labels(cell: Cell) -> tuple[str, ...]:
     return cell.source, cell.setting, cell.kind, shown(cell.rate), seed, cell.backend
 
 
-def _cell_row(cell: Cell, result: CellResult) -> tuple[str, ...]:
-    figures = tuple(shown(result.figures.get(name)) for name in (*MEASURES, *_COUNTS))
+def _cell_row(cell: Cell, result: CellResult, names: Sequence[str]) -> tuple[str, ...]:
+    figures = tuple(shown(result.figures.get(name)) for name in names)
     return (*_labels(cell), result.status, *figures, result.message, cell.key)
 
 
@@ -78,3 +91,11 @@ def _summary_row(one: Summary) -> tuple[str, ...]:
 
 def _known(value: float) -> str:
     return shown(value if math.isfinite(value) else None)
+
+
+def _bar_row(one: Verdict) -> tuple[str, ...]:
+    cell, bar = one.cell, one.bar
+    labels = (cell.source, cell.setting, cell.kind, shown(cell.rate), cell.backend, bar.figure, one.unit)
+    values = " ".join("-" if value is None else shown(value) for value in one.values)
+    judged = (bar.statistic, _known(one.value), bar.side, _known(one.limit), "yes" if one.passed else "no")
+    return (*labels, *judged, _known(one.median), _known(one.worst), values)

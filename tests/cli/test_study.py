@@ -38,7 +38,17 @@ def test_a_study_is_run_and_gone_on_with(run, tmp_path, monkeypatch):
     assert json.loads((out / "metrics.json").read_text()) == told
     assert (told["cells"], told["status"]) == (18, {"converged": 18})
     found = {entry.name for entry in out.iterdir()} - {".lock"}
-    names = {"study.yaml", "cells.csv", "timings.csv", "summary.csv", "metrics.json", "report.html", "cells", "sources"}
+    names = {
+        "study.yaml",
+        "cells.csv",
+        "timings.csv",
+        "summary.csv",
+        "bars.csv",
+        "metrics.json",
+        "report.html",
+        "cells",
+        "sources",
+    }
     assert found == names
     before = (out / "cells.csv").read_bytes()
     monkeypatch.setattr(study_page, "write_study_page", lambda study: study.folder.path / PAGE)  # one page is enough

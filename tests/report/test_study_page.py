@@ -40,7 +40,7 @@ def made(tmp_path):
 
 def _result(cell: Cell, outcome: float | str) -> CellResult:
     if isinstance(outcome, str):
-        return CellResult(cell.key, "failed", outcome, {}, 0.0, "")
+        return CellResult(cell.key, "failed", outcome, {}, {}, "")
     figures: dict[str, float | None] = {
         "ate_m": outcome,
         "chi2": 1.0,
@@ -49,7 +49,7 @@ def _result(cell: Cell, outcome: float | str) -> CellResult:
         "own_lost": 0.0,
         "own_loops": 3.0,
     }
-    return CellResult(cell.key, "converged", "", figures, 0.0, "")
+    return CellResult(cell.key, "converged", "", figures, {}, "")
 
 
 def error_of(result: CellResult) -> float | None:
@@ -87,12 +87,12 @@ def test_what_failed_is_said_once_and_not_shown_empty(made):
     assert text.count(NO_LOOPS) == 1
     assert f"every one 24 {NO_LOOPS}" in text
     assert "4 groups have no map by any back-end" in text
-    assert [group.label for group in groups_of(study.summaries) if group.lines] == ["laps/default", "again/default"]
+    assert [group.label for group in groups_of(study) if group.lines] == ["laps/default", "again/default"]
 
 
 def test_back_ends_without_a_map_have_no_line_of_dashes_and_are_not_in_the_legend(made, monkeypatch):
     study = made(lambda cell: "diverged" if cell.backend == "relaxed" else 1.0, seeds=3)
-    (first, *_) = groups_of(study.summaries)
+    (first, *_) = groups_of(study)
     assert [line.backend for line in first.lines] == ["gtsam-lm", "odometry"]
     assert first.without == ("relaxed",)
     assert "Without a map: relaxed." in text_of(study)

@@ -9,10 +9,12 @@ from hybridmap.errors import BackendError
 from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.study import cell as cells
-from hybridmap.study.disturb import with_drift, with_false_loops
+from hybridmap.study.drift import with_drift, with_false_loops
+from hybridmap.study.drive import Drive
+from hybridmap.study.frozen import Frozen
 from hybridmap.study.grid import lay_out
 from hybridmap.study.model import DriftConfig, SyntheticConfig
-from hybridmap.study.sources import Frozen, SourceTask, laps, prepare
+from hybridmap.study.sources import Given, SourceTask, laps, prepare
 from tests.study.studies import small
 
 
@@ -134,16 +136,16 @@ def test_the_same_seed_gives_every_back_end_the_same_false_loops(frozen):
 
 def test_without_truth_the_reference_is_the_clean_optimum(frozen):
     unknown = Frozen(frozen.graph, np.full((40, 3), np.nan))
-    made = Frozen.unpack(prepare(SourceTask("key", clean=unknown.pack())).frozen)
+    made = Frozen.unpack(prepare(SourceTask("key", Given(unknown.pack()))).frozen)
     assert not made.of_truth
     assert figures_of(made, backends=["gtsam-lm"])["gtsam-lm", ""].figures["ate_m"] < 1e-6
-    kept = Frozen.unpack(prepare(SourceTask("key", clean=frozen.pack(), first_nodes=30)).frozen)
+    kept = Frozen.unpack(prepare(SourceTask("key", Given(frozen.pack()), first_nodes=30)).frozen)
     assert np.array_equal(kept.reference, frozen.reference[:30])
     assert kept.graph.n_nodes == 30
 
 
 def test_a_source_that_cannot_be_had_is_a_status_of_its_cells():
-    result = prepare(SourceTask("key", world="lab", config={"nodes": {"distance_m": -1.0}}))
+    result = prepare(SourceTask("key", Drive("lab", {"nodes": {"distance_m": -1.0}})))
     failed = Frozen.unpack(result.frozen)
     assert failed.graph is None
     found = figures_of(failed, backends=["gtsam-lm"])["gtsam-lm", "random"]
@@ -154,7 +156,7 @@ def test_a_source_that_cannot_be_had_is_a_status_of_its_cells():
 def test_a_world_is_mapped_with_its_truth():
     study = small(
         seeds=[0],
-        sources=[{"world": "lab", "end_s": 2.5, "overrides": {"simulation.camera": {"width_px": 64, "height_px": 48}}}],
+        sources=[{"simulated": "lab", "end_s": 2.5, "overrides": {"simulation.camera": {"width_px": 64, "height_px": 48}}}],
         backends=["odometry"],
         false_loops={},
     )

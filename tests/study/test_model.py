@@ -1,18 +1,23 @@
 """A study's configuration: short forms, variants, paths, and refusals that name the key."""
 
+from itertools import product
+
 import pytest
 
+from hybridmap.config import Config
 from hybridmap.errors import ConfigError
 from hybridmap.study import StudyConfig, named_studies
 from hybridmap.study.grid import lay_out
-from hybridmap.study.model import backend_settings
+from hybridmap.study.model import DRIVES, backend_settings
 from tests.study.studies import TREE, small
+
+DRIVE = {"sources": ["lab"], "backends": [{"backend": "primary", "way": "mapped"}], "false_loops": {}}
 
 
 def test_short_forms_are_spelt_out():
     study = small(seeds=3, sources=["lab"], backends=["gtsam-lm", {"backend": "odometry", "name": "none"}])
     assert study.seeds == (0, 1, 2)
-    assert (study.sources[0].world, study.sources[0].title) == ("lab", "lab")
+    assert (study.sources[0].simulated, study.sources[0].title) == ("lab", "lab")
     assert [(variant.backend, variant.title) for variant in study.backends] == [("gtsam-lm", "gtsam-lm"), ("odometry", "none")]
 
 
@@ -52,12 +57,31 @@ def test_the_resolved_study_reads_back_to_an_equal_one(tmp_path, monkeypatch):
         ({"backends": ["gtsam-ml"]}, "unknown back-end 'gtsam-ml'; there are odometry"),
         ({"backends": ["gtsam-lm", "gtsam-lm"]}, "backends: 'gtsam-lm' is there twice"),
         ({"backends": []}, "backends: "),
-        ({"sources": [{"name": "x"}]}, "x: found none, expected one of world, session, graph, synthetic"),
-        ({"sources": [{"world": "lab", "graph": "a.g2o"}]}, "found world and graph"),
+        ({"sources": [{"name": "x"}]}, "x: found none, expected one of simulated, recording, session, graph, synthetic"),
+        ({"sources": [{"simulated": "lab", "graph": "a.g2o"}]}, "found simulated and graph"),
+        ({"sources": [{"world": "lab"}]}, "`world` is now called `simulated`"),
         ({"sources": ["labb"]}, "no world called 'labb'; there are lab"),
         ({"sources": [{"graph": "$NO_SUCH_PLACE/a.g2o"}]}, "NO_SUCH_PLACE is not set"),
-        ({"sources": [{"synthetic": {}, "config": "laser"}]}, "for worlds only"),
-        ({"settings": [{"name": "a", "overrides": {"seed": 1}}]}, "overrides need a world to map"),
+        ({"sources": [{"synthetic": {}, "config": "laser"}]}, "for simulated and recording only"),
+        ({"sources": [{"simulated": "lab", "relations": "a.txt"}]}, "for recording only"),
+        ({"settings": [{"name": "a", "overrides": {"seed": 1}}]}, "is a graph already, and the setting a has overrides"),
+        ({"settings": [{"name": "a", "disturb": {"darker": 0.5}}]}, "is a graph already, and the setting a has"),
+        ({"backends": [{"backend": "odometry", "way": "mapped"}]}, "is a graph already; name the back-ends"),
+        (DRIVE | {"false_loops": {"rates": [0.1]}}, "false_loops: a drive as it was mapped takes none"),
+        (DRIVE | {"settings": [{"name": "a", "drift": {"noise": 1.0}}]}, "for a drive as it was mapped use disturb"),
+        (
+            DRIVE | {"settings": [{"name": "a", "disturb": {"darkr": 0.5}}]},
+            "unknown disturbance 'darkr'; there are",
+        ),
+        (DRIVE | {"settings": [{"name": "a", "disturb": {"darker": 1.5}}]}, "darker: expected at most 1, found 1.5"),
+        (DRIVE | {"settings": [{"name": "a", "disturb": {"kidnapped_s": [5, 2, 9]}}]}, "expected .picked up, put down, end."),
+        (DRIVE | {"settings": [{"name": "a", "disturb": {"kidnapped_s": 5}}]}, r"expected 3 number\(s\), found 1"),
+        (DRIVE | {"backends": [{"backend": "primary", "way": "mapped", "start": "angular"}]}, "takes no settings and no start"),
+        ({"backends": [{"backend": "primary"}]}, "unknown back-end 'primary'"),
+        ({"bars": [{"figure": "ate", "at_most": 1}]}, "bars: ate: no such figure; there are ate_m"),
+        ({"bars": [{"figure": "ate_m"}]}, "bars: ate_m: expected either at_most or at_least"),
+        ({"bars": [{"figure": "ate_m", "at_most": "nobody"}]}, "backends has no 'nobody'"),
+        ({"bars": [{"figure": "ate_m", "at_most": 1, "rates": 0.5}]}, "false_loops.rates has no '0.5'"),
         ({"false_loops": {"rates": [1.0]}}, "false_loops.rates.0: .*less than 1"),
         ({"seeds": [1, 1]}, "seeds: '1' is there twice"),
         ({"seeds": 0}, "seeds: expected how many there are, 1 or more, or a list of them, found 0"),
@@ -87,8 +111,11 @@ def test_every_study_that_comes_along_is_whole(name, monkeypatch, tmp_path):
     monkeypatch.setenv("HYBRIDMAP_DATA", str(tmp_path))
     study = StudyConfig.load(name)
     assert study.description
-    assert len(study.backends) > 1
-    if not any(source.graph or source.session for source in study.sources):
+    assert len(study.backends) > 1 or study.bars
+    for source, setting in product(study.sources, study.settings):
+        if source.kind in DRIVES:
+            Config.load(source.config or source.simulated or "laser", {**source.overrides, **setting.overrides})
+    if all(source.kind in ("simulated", "synthetic") for source in study.sources):
         assert len({cell.key for cell in lay_out(study).cells}) > 1
 
 

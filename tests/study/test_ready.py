@@ -35,7 +35,7 @@ def test_the_printed_example_ends_well_in_small(example, tmp_path):
 
 @pytest.mark.slow
 def test_the_world_of_the_printed_example_has_loops(example, tmp_path):
-    world = next(source for source in example.sources if source.world)
+    world = next(source for source in example.sources if source.simulated)
     changes = {"seeds": (0,), "sources": (world,), "settings": example.settings[:1], "backends": example.backends[:1]}
     done = run_study(example.model_copy(update=changes), tmp_path, ThisProcess())
     assert all((result.figures["own_loops"] or 0) > 10 for _, result in done.rows)
@@ -46,13 +46,13 @@ def test_the_world_of_the_printed_example_has_loops(example, tmp_path):
 def test_ready_studies_have_seeds_enough_for_their_intervals(name, monkeypatch):
     monkeypatch.setenv("HYBRIDMAP_DATA", "/data")
     study = StudyConfig.load(name)
-    assert len(study.seeds) >= LEAST[study.statistics.method]
+    assert study.maps or len(study.seeds) >= LEAST[study.statistics.method]
 
 
 @pytest.mark.data
 def test_false_loops_on_intel_ruin_least_squares_and_not_gnc(data_dir, monkeypatch, tmp_path):
     monkeypatch.setenv("HYBRIDMAP_DATA", str(data_dir))
-    changes = {"seeds": [0], "false_loops": {"rates": [0.1], "kinds": ["random"]}, "backends": ["gtsam-lm", "gtsam-gnc"]}
+    changes = {"seeds": [1], "false_loops": {"rates": [0.1], "kinds": ["random"]}, "backends": ["gtsam-lm", "gtsam-gnc"]}
     study = StudyConfig.load("false-loops", changes)
     source = study.sources[0].model_copy(update={"first_nodes": 500})
     done = run_study(study.model_copy(update={"sources": (source,)}), tmp_path, ThisProcess())

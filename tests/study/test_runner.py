@@ -132,7 +132,7 @@ def test_a_mistake_of_ours_is_a_row_and_tried_again(alone, tmp_path, monkeypatch
 
 
 def test_a_source_that_fails_is_a_status_of_its_cells_and_the_others_go_on(tmp_path):
-    sources = [{"name": "laps", "synthetic": {"nodes": 40, "per_lap": 16}}, {"world": "lab", "end_s": 0.2}]
+    sources = [{"name": "laps", "synthetic": {"nodes": 40, "per_lap": 16}}, {"simulated": "lab", "end_s": 0.2}]
     done = run_study(small(sources=sources, seeds=[3], false_loops={}), tmp_path, ThisProcess())
     assert done.head["status"] == {"converged": 3, "unmapped": 3}
     page = write_study_page(done).read_text()

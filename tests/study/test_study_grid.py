@@ -107,7 +107,7 @@ def test_a_graph_file_enters_by_its_content_not_its_place(graph_file, tmp_path):
 
 def test_a_world_s_key_depends_on_its_configuration():
     def world(overrides, end_s=5.0):
-        study = small(sources=[{"world": "lab", "end_s": end_s}], settings=[{"name": "a", "overrides": overrides}])
+        study = small(sources=[{"simulated": "lab", "end_s": end_s}], settings=[{"name": "a", "overrides": overrides}])
         return {cell.source_key for cell in lay_out(study).cells}
 
     base = world({})

@@ -1,0 +1,123 @@
+"""What the figures of a study have to keep to: each bar, group by group, over the seeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hybridmap.backends.base import ODOMETRY
+from hybridmap.study.cell import CellResult
+from hybridmap.study.grid import Cell, Grid
+from hybridmap.study.measures import unit_of
+from hybridmap.study.model import BarConfig
+
+_ROUND_OFF = 1e-6  # a map without any loop is that of odometry; by so much may rounding part them
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """A bar held against one group and back-end.
+
+    Attributes:
+        bar: what is asked.
+        cell: the first cell of the group; its labels are those of all but for the seed.
+        values: of the cells over the seeds; None where there is no such figure, which misses any bar.
+        limits: what each value is held against.
+        value, limit: the statistic of the values, and the limit that goes with it; NaN where a value is missing.
+        passed: whether the bar is kept.
+    """
+
+    bar: BarConfig
+    cell: Cell
+    values: tuple[float | None, ...]
+    limits: tuple[float, ...]
+    value: float
+    limit: float
+    passed: bool
+
+    @property
+    def label(self) -> str:
+        """The group in words, with the back-end."""
+        return f"{self.cell.label}/{self.cell.backend}"
+
+    @property
+    def unit(self) -> str:
+        """Of the figure."""
+        return unit_of(self.bar.figure)
+
+    @property
+    def median(self) -> float:
+        """Of the values; NaN where one is missing."""
+        return float(np.median(_whole(self.values)))
+
+    @property
+    def worst(self) -> float:
+        """Of the values: the least for a lower bar, the greatest for an upper one; NaN where one is missing."""
+        return float((np.min if self.bar.side == "at least" else np.max)(_whole(self.values)))
+
+    @property
+    def said(self) -> str:
+        """One line for people."""
+        over = f" of {len(self.values)} seeds" if len(self.values) > 1 else ""
+        missing = sum(value is None for value in self.values)
+        lacking = f", {missing} without a figure" if missing else ""
+        return f"{self.bar.statistic}{over}{lacking}; {self.bar.side} {self.limit:g}"
+
+
+def judge(grid: Grid, results: Mapping[str, CellResult]) -> list[Verdict]:
+    """Hold every bar of the study against every group that it is for, in their order."""
+    groups: dict[tuple[tuple[str, str, str, float], str], list[Cell]] = {}
+    for cell in grid.cells:
+        groups.setdefault((cell.group, cell.backend), []).append(cell)
+    return [
+        _verdict(bar, cells, groups, results)
+        for bar in grid.study.bars
+        for cells in groups.values()
+        if _is_for(bar, cells[0], grid)
+    ]
+
+
+def _is_for(bar: BarConfig, cell: Cell, grid: Grid) -> bool:
+    named = ((bar.sources, cell.source), (bar.settings, cell.setting), (bar.kinds, cell.kind), (bar.rates, cell.rate))
+    if any(chosen and found not in chosen for chosen, found in named):
+        return False
+    dead_reckoning = {variant.title for variant in grid.study.backends if variant.backend == ODOMETRY}
+    return cell.backend in bar.backends if bar.backends else cell.backend not in dead_reckoning
+
+
+def _verdict(
+    bar: BarConfig,
+    cells: Sequence[Cell],
+    groups: Mapping[tuple[tuple[str, str, str, float], str], Sequence[Cell]],
+    results: Mapping[str, CellResult],
+) -> Verdict:
+    values = tuple(results[cell.key].figure(bar.figure) for cell in cells)
+    slack = 0.0
+    if isinstance(bar.at_most, str):
+        others = (results[cell.key].figure(bar.figure) for cell in groups[cells[0].group, bar.at_most])
+        limits, slack = tuple(math.nan if other is None else other for other in others), _ROUND_OFF
+    else:
+        limits = (_limit(bar),) * len(cells)
+    found, held = _whole(values), np.array(limits)
+    if bar.statistic == "worst":
+        at = int(np.argmin(found - held) if bar.side == "at least" else np.argmax(found - held))
+        value, limit = float(found[at]), float(held[at])
+    else:
+        statistic = np.median if bar.statistic == "median" else np.mean
+        value, limit = float(statistic(found)), float(statistic(held))
+    passed = value >= limit - slack if bar.side == "at least" else value <= limit + slack
+    return Verdict(bar, cells[0], values, limits, value, limit, bool(passed))
+
+
+def _limit(bar: BarConfig) -> float:
+    limit = bar.at_most if bar.at_least is None else bar.at_least
+    assert isinstance(limit, float)
+    return limit
+
+
+def _whole(values: Sequence[float | None]) -> np.ndarray:
+    """(N,) with NaN for what is missing."""
+    return np.array([math.nan if value is None else value for value in values])

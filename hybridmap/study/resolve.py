@@ -1,0 +1,160 @@
+"""From the words of a study to the study: paths, variants, and what its types cannot see."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TypeVar
+
+from hybridmap.backends.registry import names
+from hybridmap.errors import ConfigError
+from hybridmap.simulation import world_names
+from hybridmap.study import disturb
+from hybridmap.study.measures import FIGURES
+from hybridmap.study.model import (
+    DRIVES,
+    KINDS,
+    BackendVariant,
+    BarConfig,
+    SettingConfig,
+    SourceConfig,
+    StudyConfig,
+    backend_settings,
+    quoted,
+)
+
+_OF_DRIVES = ("config", "overrides", "start_s", "end_s")
+_OF_RECORDINGS = ("reference", "relations")
+_PATHS = ("recording", "session", "graph", "reference", "relations")
+_Entry = TypeVar("_Entry", BackendVariant, SettingConfig)
+
+
+def resolved(study: StudyConfig, origin: str, folder: Path) -> StudyConfig:
+    """The study with absolute paths and every variant spelt out, checked.
+
+    Args:
+        study: as it was written.
+        origin: where it comes from, for errors.
+        folder: where relative paths begin.
+
+    Raises:
+        ConfigError: a name that there is not or that is given twice, or a setting that cannot act.
+    """
+    sources = tuple(_located(source, origin, folder) for source in study.sources)
+    variants = tuple(single for entry in study.backends for single in _expanded(entry, "settings", "backends", origin))
+    settings = tuple(single for entry in study.settings for single in _expanded(entry, "overrides", "settings", origin))
+    study = study.model_copy(update={"sources": sources, "settings": settings, "backends": variants})
+    _check(study, origin)
+    return study
+
+
+def _located(source: SourceConfig, origin: str, folder: Path) -> SourceConfig:
+    """The source with absolute paths; `$NAME` in a path is the environment's."""
+    given = [kind for kind in KINDS if getattr(source, kind) is not None]
+    if len(given) != 1:
+        found = " and ".join(given) or "none"
+        raise ConfigError(f"{origin}: sources: {source.title}: found {found}, expected one of {', '.join(KINDS)}")
+    paths = [key for key in _PATHS if getattr(source, key) is not None]
+    return source.model_copy(update={key: _absolute(getattr(source, key), origin, folder) for key in paths})
+
+
+def _absolute(path: Path, origin: str, folder: Path) -> Path:
+    expanded = os.path.expandvars(str(path))
+    unset = re.search(r"\$\{?(\w+)", expanded)
+    if unset:
+        raise ConfigError(
+            f"{origin}: {path}: the environment variable {unset[1]} is not set; set it to the folder it stands for"
+        )
+    return (folder / expanded).resolve()
+
+
+def _expanded(entry: _Entry, field: str, origin_key: str, origin: str) -> list[_Entry]:
+    """One entry for each combination of `vary`, whose values go into `field`."""
+    if clash := sorted(set(entry.vary) & set(getattr(entry, field))):
+        raise ConfigError(f"{origin}: {origin_key}: {entry.title}: {clash[0]} is in both {field} and vary")
+    entries = [entry.model_copy(update={"vary": {}})]
+    for key, values in entry.vary.items():
+        entries = [
+            one.model_copy(
+                update={
+                    "name": f"{one.title} {key.rpartition('.')[2]}={value}",
+                    field: {**getattr(one, field), key: value},
+                }
+            )
+            for one in entries
+            for value in values
+        ]
+    return entries
+
+
+def _check(study: StudyConfig, origin: str) -> None:
+    lists: dict[str, list[str]] = {
+        "sources": [source.title for source in study.sources],
+        "settings": [setting.name for setting in study.settings],
+        "backends": [variant.title for variant in study.backends],
+        "seeds": [str(seed) for seed in study.seeds],
+        "false_loops.rates": [str(rate) for rate in study.false_loops.rates],
+        "false_loops.kinds": list(study.false_loops.kinds),
+    }
+    for key, titles in lists.items():
+        twice = next((title for title in titles if titles.count(title) > 1), None)
+        if twice is not None:
+            raise ConfigError(f"{origin}: {key}: {twice!r} is there twice; give each its own name")
+    for variant in study.backends:
+        _check_backend(variant, f"{origin}: backends")
+    for source in study.sources:
+        _check_source(source, study, f"{origin}: sources")
+    for setting in study.settings:
+        _check_setting(setting, study, f"{origin}: settings: {setting.name}")
+    if study.maps and any(study.false_loops.rates):
+        raise ConfigError(f"{origin}: false_loops: a drive as it was mapped takes none; use other back-ends or no false loops")
+    for bar in study.bars:
+        _check_bar(bar, lists, f"{origin}: bars: {bar.figure}")
+
+
+def _check_backend(variant: BackendVariant, origin: str) -> None:
+    if variant.backend not in names() and (variant.backend, variant.way) != ("primary", "mapped"):
+        raise ConfigError(f"{origin}: unknown back-end {variant.backend!r}; there are {', '.join(names())}")
+    if variant.way == "mapped" and (variant.settings or variant.start != "graph"):
+        raise ConfigError(f"{origin}: {variant.title}: `way: mapped` takes no settings and no start; set them for the drive")
+    backend_settings(variant)
+
+
+def _check_source(source: SourceConfig, study: StudyConfig, origin: str) -> None:
+    if source.simulated is not None and source.simulated not in world_names():
+        known = ", ".join(world_names())
+        raise ConfigError(f"{origin}: no world called {source.simulated!r}; there are {known}")
+    for keys, kinds in ((_OF_DRIVES, DRIVES), (_OF_RECORDINGS, ("recording",))):
+        if source.kind not in kinds and any(getattr(source, key) for key in keys):
+            raise ConfigError(f"{origin}: {source.title}: {', '.join(keys)} are for {' and '.join(kinds)} only")
+    if source.kind not in DRIVES and study.maps:
+        raise ConfigError(f"{origin}: {source.title}: is a graph already; name the back-ends that are to solve it")
+    acting = next((setting.name for setting in study.settings if setting.overrides or setting.disturb), None)
+    if source.kind not in DRIVES and acting is not None:
+        raise ConfigError(
+            f"{origin}: {source.title}: is a graph already, and the setting {quoted(acting)} has overrides or disturbances "
+            f"of a drive; use drift, or a study of its own"
+        )
+
+
+def _check_setting(setting: SettingConfig, study: StudyConfig, origin: str) -> None:
+    for name, strength in setting.disturb.items():
+        disturb.check(name, strength, origin)
+    if study.maps and not setting.drift.idle:
+        raise ConfigError(f"{origin}: drift is put onto a frozen graph; for a drive as it was mapped use disturb")
+
+
+def _check_bar(bar: BarConfig, lists: Mapping[str, list[str]], origin: str) -> None:
+    if (bar.at_most is None) == (bar.at_least is None):
+        raise ConfigError(f"{origin}: expected either at_most or at_least")
+    if bar.figure not in FIGURES:
+        raise ConfigError(f"{origin}: no such figure; there are {', '.join(FIGURES)}")
+    named = {"sources": bar.sources, "settings": bar.settings, "backends": bar.backends, "false_loops.kinds": bar.kinds}
+    named["false_loops.rates"] = tuple(map(str, bar.rates))
+    if isinstance(bar.at_most, str):
+        named["backends"] = (*bar.backends, bar.at_most)
+    for key, titles in named.items():
+        if missing := next((title for title in titles if title not in lists[key]), None):
+            raise ConfigError(f"{origin}: {key} has no {missing!r}; there are {', '.join(lists[key])}")
