@@ -114,7 +114,7 @@ def test_both_run_in_map_compare_and_study_by_the_names_of_their_entry_points(ru
     told = run("compare", session, "--backends", "odometry,spread")
     assert told["status"]["spread"] == "converged"
     study.write_text(
-        "sources: [{world: lab, config: laser, end_s: 12}]\n"
+        "sources: [{simulated: lab, config: laser, end_s: 12}]\n"
         "settings: [{name: home, overrides: {vision.sensor: home}}]\n"
         "backends: [odometry, spread]\n"
     )
