@@ -27,7 +27,8 @@ backends.relaxation backends/relaxation/sweeps.py robust_scale_m robust_scale_ra
 backends.robust backends/gtsam/factors.py huber_scale dcs_phi geman_mcclure_scale
 backends.robust backends/judging/weak.py odometry_scale
 backends.gnc backends/gtsam/gnc.py chunk_nodes mu_factor max_rounds
-backends.consistency backends/judging/consistency.py quantile neighbours
+backends.consistency backends/judging/consistency.py neighbours
+backends.consistency graph/agreement.py quantile
 backends.isam2 backends/gtsam/smoother.py relinearize_m relinearize_rad settle_updates
 backends.isam2 backends/gtsam/incremental.py patience
 """
@@ -35,8 +36,16 @@ backends.isam2 backends/gtsam/incremental.py patience
 RENAMED: dict[str, str] = {}
 """Old dotted key -> the key that has taken its place, with the same meaning."""
 
+_RING = "loops agree by the covariances of the map and of their own"
 OTHERWISE: dict[str, str] = {
     "neural.dtype": "every population has double precision",
+    "vision.laser.commitment.heading_deg_per_sqrt_m": _RING,
+    "vision.laser.relocalising.agree_m": _RING,
+    "vision.laser.relocalising.agree_deg": _RING,
+    "vision.relocalising.agree_m": _RING,
+    "vision.relocalising.agree_deg": _RING,
+    "vision.rgbd.closing.support_m": _RING,
+    "vision.rgbd.closing.support_deg": _RING,
 }
 """Old dotted key -> what there is instead."""
 

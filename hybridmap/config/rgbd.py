@@ -142,11 +142,7 @@ class RgbdClosingConfig(Section):
     separation: int = Field(default=2, ge=0)
     """Candidates lie at least this many nodes apart."""
     support_nodes: int = Field(default=12, ge=0)
-    """An edge needs another one from a node within so many, to a node within so many, that agrees; 0: none needed."""
-    support_m: float = Field(default=0.15, gt=0)
-    """Agreement of two edges through the chain between them, m (plus 3 % of its length)."""
-    support_deg: float = Field(default=3.0, gt=0)
-    """Agreement of two edges through the chain between them, degrees (plus 0.5 per metre of its length)."""
+    """An edge needs another one that agrees, from a node within so many, to a node within so many; 0: none needed."""
     pending_nodes: int = Field(default=40, ge=1)
     """A verified edge without support is given up after so many nodes."""
     shift_sigma_m: float = Field(default=0.7, gt=0)

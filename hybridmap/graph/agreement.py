@@ -26,8 +26,10 @@ def chi2_quantile(probability: float) -> float:
     return float(2.0 * gammaincinv(1.5, probability))
 
 
-BOUND = chi2_quantile(0.99)
-"""Squared Mahalanobis distance up to which two loops agree: one pair of true ones in a hundred does not."""
+QUANTILE = 0.99
+"""Share of the pairs of true loops that agree, where the covariances are right."""
+BOUND = chi2_quantile(QUANTILE)
+"""Squared Mahalanobis distance up to which two loops agree."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from hybridmap.backends.judging.clusters import loops_of, neighbouring_pairs
 from hybridmap.backends.objective import SLACK
 from hybridmap.errors import GraphError
-from hybridmap.graph.agreement import agreement, chi2_quantile, largest_consistent_set, ring
+from hybridmap.graph.agreement import BOUND, agreement, chi2_quantile, largest_consistent_set, ring
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.graph.uncertainty import chain_of
 
-QUANTILE = 0.99
-"""Two loops agree while their squared Mahalanobis distance is below this quantile of chi2 with 3 degrees of freedom."""
 NEIGHBOURS = 1
 """Loops between the same places, within 10 nodes at both ends, that each must agree with: a false loop seldom has one."""
 
@@ -50,10 +48,9 @@ def consistent_loops(graph: PoseGraph) -> Consistent:
         raise GraphError(f"graph: no edge of motion joins nodes {chain.breaks[0] - 1} and {chain.breaks[0]}")
     edges = np.flatnonzero(graph.is_loop)
     loops, near = loops_of(graph, edges), neighbouring_pairs(graph, edges)
-    bound = chi2_quantile(QUANTILE)
     apart = ring(loops[near[:, 0]], loops[near[:, 1]], chain.ways).distance
-    agreeing = apart[apart <= bound]
+    agreeing = apart[apart <= BOUND]
     variance = float(np.median(agreeing) / chi2_quantile(0.5)) if len(agreeing) else 1.0
-    chosen = largest_consistent_set(agreement(loops, chain.ways, bound * min(1.0, SLACK * variance)))
+    chosen = largest_consistent_set(agreement(loops, chain.ways, BOUND * min(1.0, SLACK * variance)))
     backed = np.bincount(near[chosen[near].all(axis=1)].ravel(), minlength=len(edges))
     return Consistent(edges[chosen & (backed >= NEIGHBOURS)], variance)

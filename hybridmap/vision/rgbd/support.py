@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybridmap.config.rgbd import RgbdClosingConfig
-from hybridmap.geometry import RelativePose, between, compose
+from hybridmap.geometry import RelativePose
+from hybridmap.graph.agreement import Loops, agrees
 from hybridmap.graph.edges import Edge, Lack, Status, passed
 from hybridmap.vision.base import Belief
 from hybridmap.vision.rgbd import checks
@@ -60,11 +61,11 @@ class Support:
 
     def file(self, new: Hypothesis, belief: Belief) -> list[Edge]:
         """Take in a hypothesis; accept it and what it supports if another one agrees. Its own proposal comes first."""
-        near = self._beside(new)
-        friends = [h for h in near if h.proposal.status is Status.PENDING and self._agrees(new, h, belief)]
-        accepted = (h for h in near if h.proposal.status is Status.ACCEPTED)
-        supporting = len(friends) or int(any(self._agrees(new, h, belief) for h in accepted))
-        asked = checks.of_support(supporting, self._config)
+        near = [h for h in self._beside(new) if h.proposal.status in (Status.PENDING, Status.ACCEPTED)]
+        loops = Loops.measured([(h.source, h.target, h.relative) for h in (new, *near)])
+        agreeing = [near[i] for i in np.flatnonzero(agrees(loops, 0, np.arange(1, len(near) + 1), belief.ways)).tolist()]
+        friends = [h for h in agreeing if h.proposal.status is Status.PENDING]
+        asked = checks.of_support(len(agreeing), self._config)
         self._of_source[new.source].append(new)
         self._pending.append(new)
         self._filed.add((new.source, new.target))
@@ -97,16 +98,3 @@ class Support:
         reach = self._config.support_nodes
         sources = (source for source in range(new.source - reach, new.source + reach + 1) if source != new.source)
         return [h for source in sources for h in self._of_source.get(source, ()) if abs(h.target - new.target) <= reach]
-
-    def _agrees(self, a: Hypothesis, b: Hypothesis, belief: Belief) -> bool:
-        """Two edges give the same pose through the chain between them."""
-        poses = belief.poses_map_node
-        around = compose(between(poses[a.source], poses[b.source]), b.relative.delta)
-        around = compose(around, between(poses[b.target], poses[a.target]))
-        gap = between(a.relative.delta, around)
-        length = sum(
-            abs(float(belief.travel_m[i] - belief.travel_m[j])) for i, j in ((a.source, b.source), (a.target, b.target))
-        )
-        limit_m = self._config.support_m + 0.03 * length
-        limit_rad = np.deg2rad(self._config.support_deg + 0.5 * length)
-        return bool(np.hypot(gap[0], gap[1]) < limit_m and abs(gap[2]) < limit_rad)
