@@ -5,14 +5,13 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from hybridmap.graph.io import write_g2o
 from hybridmap.metrics import Metric, to_json
-from tests.backends.graphs_for_tests import laps
 from tests.narrowing import known
 from tests.store.sessions import ring_map, write_session
 
@@ -34,16 +33,44 @@ def test_picture_of_a_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "picture.png" in capsys.readouterr().out
 
 
+def row(results: Any, **changes: str) -> dict[str, str]:
+    """A line of the record."""
+    given = {
+        "topic": "x",
+        "command": "c",
+        "figure": "ate_m/a",
+        "unit": "m",
+        "values": "0.1 0.3",
+        "median": "0.2",
+        "worst": "0.3",
+    }
+    return given | {"side": "at most", "bar": "0.5", "passed": "yes", "day": "2026-11-30", "machine": "m"} | changes
+
+
 def test_page_of_results_is_what_was_recorded() -> None:
     results = importlib.import_module("results")
-    found = json.loads((ROOT / "docs" / "results.json").read_text())
-    assert (ROOT / "docs" / "results.md").read_text() == results.page(found)
+    found = results.recorded()
+    text = (ROOT / "docs" / "results.md").read_text()
+    assert text == results.page(found)
+    assert len(text.splitlines()) <= 160  # three screens
     readme = (ROOT / "README.md").read_text()
     assert results.with_headlines(readme, found) == readme
     assert "fr079" in readme
 
 
-def test_figures_are_held_against_their_bars(tmp_path: Path) -> None:
+def test_every_figure_with_a_bar_is_in_a_question_or_its_topic_has_others() -> None:
+    results, studies = importlib.import_module("results"), importlib.import_module("result_studies")
+    topics = {topic.name: topic for topic in studies.TOPICS}
+    assert {name for names in studies.PARTS.values() for name in names} == set(topics)
+    for found in results.recorded():
+        assert found["topic"] in topics
+        assert found["passed"] in ("", "yes"), found
+    for name, topic in topics.items():
+        rows = [found for found in results.recorded() if found["topic"] == name]
+        assert all(any(results.is_of(found, question) for found in rows) for question in topic.questions if rows), name
+
+
+def test_a_command_s_figures_are_held_against_the_bars_they_are_given(tmp_path: Path) -> None:
     results, studies = importlib.import_module("results"), importlib.import_module("result_studies")
     step = studies.Step("hybridmap map x", (studies.Figure("ate_rmse/PRIMARY", 0.2), studies.Figure("nodes")), same_graph=True)
     output = {
@@ -55,98 +82,65 @@ def test_figures_are_held_against_their_bars(tmp_path: Path) -> None:
         ],
     }
     done = subprocess.CompletedProcess([], 0, json.dumps(output), "")
-    rows = results.read(step, done, 1.0, ["a"])
-    assert [(row["value"], row["passed"]) for row in rows] == [("0.3", False), ("–", None), ("no", False)]
-    assert results.table_line(rows[0]) == "| `ate_rmse/gtsam-lm` | 0.3 | m | <= 0.2 ✗ missed |"
+    rows = results.read(step, done, 1.0, ["a"], tmp_path)
+    assert [(found["figure"], found["worst"], found["passed"]) for found in rows] == [
+        ("ate_rmse/gtsam-lm", "0.3", "no"),
+        ("nodes", "", ""),
+        ("same_graph", "0", "no"),
+    ]
     with pytest.raises(SystemExit, match="gave no figure"):
-        results.read(studies.Step("x", (studies.Figure("other"),)), done, 1.0, [])
+        results.read(studies.Step("x", (studies.Figure("other"),)), done, 1.0, [], tmp_path)
 
 
 def test_a_command_s_own_bars_are_taken_with_their_side(tmp_path: Path) -> None:
-    results, studies = importlib.import_module("results"), importlib.import_module("result_studies")
+    barred, results, studies = (importlib.import_module(name) for name in ("barred", "results", "result_studies"))
     metrics = [
-        Metric("speed", 7.5, "1", "of the baseline; at least 8", 8.0, False),
-        Metric("error", 0.1, "m", "largest; at most 0.2", 0.2, True),
+        barred.at_least("speed", np.float64(7.5), 8.0, "of the baseline"),
+        barred.at_most("error", 0.1, 0.2, "largest", "m"),
         Metric("unjudged", 3.0, "m", "only shown"),
     ]
     done = subprocess.CompletedProcess([], 1, to_json({}, metrics), "")
-    rows = results.read(studies.Step("python tools/bench.py", own_bars=True), done, 1.0, [])
-    assert [results.table_line(row) for row in rows] == [
-        "| `speed` | 7.5 |  | >= 8 ✗ missed |",
-        "| `error` | 0.1 | m | <= 0.2 ✓ |",
+    rows = results.read(studies.Step("python tools/bench.py", own_bars=True), done, 1.0, [], tmp_path)
+    assert [(found["figure"], found["side"], found["bar"], found["passed"]) for found in rows] == [
+        ("speed", "at least", "8", "no"),
+        ("error", "at most", "0.2", "yes"),
     ]
 
 
-def test_results_names_its_studies() -> None:
+def test_a_study_s_bars_are_taken_with_the_value_of_every_seed(tmp_path: Path) -> None:
+    results, studies = importlib.import_module("results"), importlib.import_module("result_studies")
+    (tmp_path / "s").mkdir()
+    columns = (
+        "source,setting,false_loop_kind,false_loop_rate,backend,figure,unit,statistic,value,side,bar,passed,median,worst,values"
+    )
+    lines = ["intel,default,random,0.1,gnc,ate_m,m,worst,0.3,at most,0.5,yes,0.2,0.3,0.1 0.3"]
+    lines += ["intel,default,random,0.1,gnc,ate_m,m,median,0.2,at most,0.1,no,0.2,0.3,0.1 0.3"]
+    (tmp_path / "s" / "bars.csv").write_text("\n".join([columns, *lines]) + "\n")
+    step = studies.Step("hybridmap study s --out s", study="s", own_bars=True)
+    rows = results.read(step, subprocess.CompletedProcess([], 1, to_json({}, []), ""), 1.0, [], tmp_path)
+    assert [found["figure"] for found in rows] == [
+        "ate_m/intel/default/random 10 %/gnc",
+        "ate_m median/intel/default/random 10 %/gnc",
+    ]
+    assert [(found["values"], found["worst"], found["passed"]) for found in rows] == [
+        ("0.1 0.3", "0.3", "yes"),
+        ("0.1 0.3", "0.2", "no"),
+    ]
+
+
+def test_a_question_has_one_line_with_the_median_and_the_worst_of_its_figures() -> None:
+    results = importlib.import_module("results")
+    one, other = row(results), row(results, figure="ate_m/b", values="0.2 0.4 -", worst="0.4")
+    assert results.line("ATE", [one, other]) == "| ATE | 5 | 0.25 m | 0.4 m | <= 0.5 m | ✓ |"
+    missed = row(results, bar="0.2", passed="no")
+    assert results.line("ATE", [one, missed]) == "| ATE | 4 | 0.2 m | 0.3 m | <= its own; at worst 150 % of it | ✗ 1 missed |"
+    lower = row(results, side="at least", bar="0.05", worst="0.1")
+    assert results.line("ATE", [one, lower]) == "| ATE | 2 | 0.2 m | 0.3 m | >= 0.05 m, <= 0.5 m | ✓ |"
+    mean = row(results, figure="ate_m mean/a", median="0.2", worst="0.2", unit="1")
+    assert results.line("ATE", [mean]) == "| ATE | 1 |  | 0.2 | <= 0.5 | ✓ |"
+    assert results.line("ATE", [row(results, values="0.3", bar="", passed="", side="")]) == "| ATE | 1 |  | 0.3 m |  |  |"
+
+
+def test_results_names_its_topics() -> None:
     said = subprocess.run([sys.executable, ROOT / "tools" / "results.py", "--list"], capture_output=True, text=True, check=True)
-    assert "demo: The demo" in said.stdout
-
-
-def test_a_bar_has_a_side() -> None:
-    barred, results, studies = (importlib.import_module(name) for name in ("barred", "results", "result_studies"))
-    few, many = barred.at_least("speed/x", np.float64(14.0), 15.0, "times"), barred.at_most("cost/x", 1.2, 1.15, "of bare")
-    assert not few.passed
-    assert not many.passed
-    assert barred.at_least("speed/x", 15.0, 15.0, "times").passed
-    assert barred.at_most("cost/x", 1.15, 1.15, "of bare").passed
-    written = json.loads(to_json({}, [few, many]))["metrics"]
-    rows = [results.own_row(studies.Step("x", own_bars=True), metric) for metric in written]
-    assert [results.table_line(row) for row in rows] == [
-        "| `speed/x` | 14 |  | >= 15 ✗ missed |",
-        "| `cost/x` | 1.2 |  | <= 1.15 ✗ missed |",
-    ]
-
-
-def test_the_study_of_false_loops_gives_its_table_as_figures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    study = importlib.import_module("false_loop_study")
-    graph, truth = laps(np.random.default_rng(0), nodes=90, per_lap=30)
-    write_g2o(tmp_path / "laps.g2o", graph, truth)
-    words = ["--seeds", "2", "--shares", "0.1", "--modes", "random", "--backends", "gtsam-lm", "gtsam-gnc", "--json"]
-    monkeypatch.setattr(sys, "argv", ["false_loop_study", str(tmp_path / "laps.g2o"), *words])
-    study.main()
-    printed = capsys.readouterr()
-    found = {metric["name"]: metric["value"] for metric in json.loads(printed.out)["metrics"]}
-    assert found["ate_max/gtsam-gnc-random-10%"] < 0.05 < found["ate_median/gtsam-lm-random-10%"]
-    assert found["within_5_cm/gtsam-gnc-random-10%"] == 2
-    assert found["false_kept/gtsam-lm-random-10%"] >= 5
-    assert found["true_lost/gtsam-lm-random-10%"] == 0.0
-    assert "gtsam-gnc" in printed.err
-
-
-def test_size_counts_lines_importers_and_settings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    size = importlib.import_module("size")
-    texts = {
-        "hybridmap/__init__.py": "from hybridmap.alone import x\n",
-        "hybridmap/alone.py": "x = 1\n\ny = 2\n",
-        "hybridmap/shared.py": "",
-        "hybridmap/cli/one.py": "from hybridmap import shared\n",
-        "hybridmap/cli/two.py": "def later():\n    import hybridmap.shared\n",
-        "tools/one.py": "\n",
-    }
-    for name, text in texts.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(text)
-    files = {size.name_of(path, tmp_path): path for path in (tmp_path / "hybridmap").rglob("*.py")}
-    assert size.importers(files) == {
-        "hybridmap.alone": {"hybridmap"},
-        "hybridmap.shared": {"hybridmap.cli.one", "hybridmap.cli.two"},
-    }
-    size.main(tmp_path)
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[:4] == [
-        "hybridmap: 7 lines, 6 of them not blank",
-        "tools: 1 lines, 0 of them not blank",
-        "modules: 4, with the packages themselves 5",
-        "modules outside cli/ with a single importer: 1",
-    ]
-    assert lines[-1] == "  hybridmap.alone"
-
-
-def test_walk_sees_the_files_of_each_node() -> None:
-    walk = importlib.import_module("walk")
-    overrides = {"simulation.sensors": "laser", "vision.sensor": "laser"}
-    visited = walk.walk("sim:corridor", 6.0, ROOT / "hybridmap", overrides)
-    assert len(visited) > 3
-    assert all({"mapper.py", "neural/grid.py", "vision/laser/front_end.py"} <= files for files in visited[1:])
+    assert "demo: hybridmap demo --out demo" in said.stdout

@@ -1,4 +1,4 @@
-"""The studies behind `docs/results.md`: commands, the figures that are taken from them, and the bars they are held against."""
+"""What stands behind `docs/results.md`: commands, the figures taken from them with their bars, and the page's questions."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ class Step:
         command: as one would type it; `$HYBRIDMAP_DATA` is the folder of recordings.
         figures: taken from its `--json`.
         own_bars: every figure that the command itself holds against a bar is taken.
+        study: folder whose `bars.csv` is read instead.
         wall_bar_s: its wall time is a figure, held against this.
         holds: what is shown by the command's success; without it a failing command is an error.
         same_graph: the graph must be that of the steps before.
@@ -39,37 +40,74 @@ class Step:
     holds: str = ""
     same_graph: bool = False
     own_bars: bool = False
+    study: str = ""
 
 
 @dataclass(frozen=True)
-class Study:
-    """Steps that are run one after the other in one empty folder."""
+class Question:
+    """A line of the page: words, and patterns of the figures that it sums up."""
+
+    what: str
+    figures: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Topic:
+    """Steps that are run one after the other in one empty folder, and what they answer."""
 
     name: str
     title: str
-    about: str
     steps: tuple[Step, ...]
+    questions: tuple[Question, ...]
     needs: str = ""
 
 
-OFFICE = (Figure("ate_rmse/PRIMARY", 0.20),)
+def _asked(*pairs: tuple[str, str]) -> tuple[Question, ...]:
+    return tuple(Question(what, tuple(patterns.split(" | "))) for what, patterns in pairs)
 
 
-def _survival(shares: tuple[str, ...], worst_m: float, seeds: int | None) -> tuple[Figure, ...]:
-    """Figures of `gtsam-gnc` at some shares of false loops: worst error, seeds within 5 cm of ten (else the median), counts."""
-    found = []
-    for where in (f"gtsam-gnc-{mode}-{share}" for share in shares for mode in ("random", "aliased")):
-        usual = Figure(f"within_5_cm/{where}", seeds, at_least=True) if seeds else Figure(f"ate_median/{where}", 0.05)
-        counts = Figure(f"true_lost/{where}", 0.5 if seeds else None), Figure(f"false_kept/{where}", 2 if seeds else None)
-        found += [usual, Figure(f"ate_max/{where}", worst_m), *counts]
-    return tuple(found)
+def _study(name: str) -> Step:
+    return Step(f"hybridmap study {name} --out {name}", study=name, own_bars=True)
 
 
-STUDIES = (
-    Study(
+def _log(name: str, file: str, bars: tuple[float, float], more: tuple[Step, ...] = ()) -> tuple[Step, ...]:
+    source = f"$HYBRIDMAP_DATA/real/{name}"
+    return (
+        Step(f"hybridmap map {source}/{file} --out {name}", (Figure("cpu_s_per_min", 1.5), Figure("nodes"))),
+        Step(
+            f"hybridmap evaluate {name} --relations {source}/relations.txt",
+            (
+                Figure("relation_trans_mean/odometry"),
+                Figure("relation_trans_mean/PRIMARY", bars[0]),
+                Figure("relation_rot_mean/PRIMARY"),
+                Figure("relation_loop_trans_mean/odometry"),
+                Figure("relation_loop_trans_mean/PRIMARY", bars[1]),
+            ),
+        ),
+        *more,
+    )
+
+
+_COMPARED = ("odometry", "relaxation-ratslam", "gtsam-lm", "gtsam-isam2", "gtsam-cauchy", "gtsam-gnc")
+_OF_LOG = _asked(
+    ("relation error of odometry", "relation_trans_mean/odometry"),
+    ("relation error of the map", "relation_trans_mean/gtsam-gnc"),
+    ("of that, loops of more than 60 s", "relation_loop_trans_mean/gtsam-gnc"),
+    ("process time a minute", "cpu_s_per_min"),
+)
+_OFFICE = (Figure("ate_rmse/PRIMARY", 0.20),)
+_GRAPHS = (
+    ("intel.g2o", 45.0492, 1e-6),
+    ("CSAIL.g2o", 40.5914, 1e-6),
+    ("FR079_P_toro.graph", 37.6093, None),
+    ("manhattanOlson3500.g2o", 146.2248, 1e-6),
+    ("city10000.g2o", 512.4995, 1e-6),
+)
+
+TOPICS = (
+    Topic(
         "demo",
-        "The demo",
-        "A laboratory of 10 x 3 m, rendered, driven and mapped with RGB-D; errors against the simulated truth.",
+        "demo, a simulated laboratory, RGB-D",
         (
             Step(
                 "hybridmap demo --out demo",
@@ -83,77 +121,57 @@ STUDIES = (
                 wall_bar_s=45.0,
             ),
         ),
-    ),
-    Study(
-        "fr079",
-        "fr079: an office building, laser, badly drifting wheels",
-        "A real log, mapped with no other option; errors of the published verified relations.",
-        (
-            Step(
-                "hybridmap map $HYBRIDMAP_DATA/real/fr079/fr079.mcap --out fr079",
-                (Figure("cpu_s_per_min", 1.5), Figure("nodes")),
-            ),
-            Step(
-                "hybridmap evaluate fr079 --relations $HYBRIDMAP_DATA/real/fr079/relations.txt",
-                (
-                    Figure("relation_trans_mean/odometry"),
-                    Figure("relation_trans_mean/PRIMARY", 0.048),
-                    Figure("relation_rot_mean/PRIMARY"),
-                    Figure("relation_loop_trans_mean/odometry"),
-                    Figure("relation_loop_trans_mean/PRIMARY", 0.070),
-                ),
-            ),
-            Step(
-                "hybridmap compare fr079 --backends odometry,relaxation-ratslam,gtsam-lm,gtsam-isam2,gtsam-cauchy,gtsam-gnc",
-                tuple(
-                    Figure(f"chi2/{name}")
-                    for name in ("odometry", "relaxation-ratslam", "gtsam-lm", "gtsam-isam2", "gtsam-cauchy", "gtsam-gnc")
-                ),
-            ),
+        _asked(
+            ("ATE of odometry", "ate_rmse/odometry"),
+            ("ATE of relaxation", "ate_rmse/relaxation-ratslam"),
+            ("ATE of the map", "ate_rmse/gtsam-gnc"),
+            ("share of the loops that are right", "loop_precision/graph"),
+            ("wall time", "wall_time"),
         ),
+    ),
+    Topic(
+        "fr079",
+        "fr079, a real office building, laser, badly drifting wheels",
+        _log(
+            "fr079",
+            "fr079.mcap",
+            (0.048, 0.070),
+            (Step(f"hybridmap compare fr079 --backends {','.join(_COMPARED)}", tuple(Figure(f"chi2/{n}") for n in _COMPARED)),),
+        ),
+        _OF_LOG,
         needs="real/fr079/fr079.mcap",
     ),
-    Study(
+    Topic(
         "aces",
-        "aces: a building of corridors, laser, few loops",
-        "A real log, mapped with no other option; errors of the published verified relations.",
-        (
-            Step(
-                "hybridmap map $HYBRIDMAP_DATA/real/aces/aces.bag --out aces", (Figure("cpu_s_per_min", 1.5), Figure("nodes"))
-            ),
-            Step(
-                "hybridmap evaluate aces --relations $HYBRIDMAP_DATA/real/aces/relations.txt",
-                (
-                    Figure("relation_trans_mean/odometry"),
-                    Figure("relation_trans_mean/PRIMARY", 0.040),
-                    Figure("relation_rot_mean/PRIMARY"),
-                    Figure("relation_loop_trans_mean/odometry"),
-                    Figure("relation_loop_trans_mean/PRIMARY", 0.060),
-                ),
-            ),
-        ),
+        "aces, a real building of corridors, laser, few loops",
+        _log("aces", "aces.bag", (0.040, 0.060)),
+        _OF_LOG,
         needs="real/aces/aces.bag",
     ),
-    Study(
+    Topic(
         "office",
-        "office: two laps of a simulated office, from four kinds of source",
-        "The same drive mapped from the live stream, a ROS 1 bag, a ROS 2 mcap and a TUM folder: the same nodes and edges.",
+        "two laps of a simulated office, from a stream, two kinds of bag and a TUM folder",
         (
             Step(
-                "hybridmap map office --out live", (Figure("ate_rmse/odometry"), *OFFICE, Figure("ate_rmse/relaxation-ratslam"))
+                "hybridmap map office --out live",
+                (Figure("ate_rmse/odometry"), *_OFFICE, Figure("ate_rmse/relaxation-ratslam")),
             ),
             Step("hybridmap simulate office --out office.bag"),
-            Step("hybridmap map office.bag --config office --out bag", OFFICE, same_graph=True),
+            Step("hybridmap map office.bag --config office --out bag", _OFFICE, same_graph=True),
             Step("hybridmap simulate office --out office.mcap"),
-            Step("hybridmap map office.mcap --config office --out mcap", OFFICE, same_graph=True),
+            Step("hybridmap map office.mcap --config office --out mcap", _OFFICE, same_graph=True),
             Step("hybridmap simulate office --out office-tum"),
-            Step("hybridmap map office-tum --config office --out tum", OFFICE, same_graph=True),
+            Step("hybridmap map office-tum --config office --out tum", _OFFICE, same_graph=True),
+        ),
+        _asked(
+            ("ATE of odometry", "ate_rmse/odometry"),
+            ("ATE of the map", "ate_rmse/gtsam-gnc"),
+            ("the same graph whatever the source", "same_graph"),
         ),
     ),
-    Study(
+    Topic(
         "hololens",
-        "A real office, RGB-D, hand-held",
-        "Real colour and depth of a hand-held device, with made-up odometry; errors against the device's own tracking.",
+        "a real office, RGB-D, hand-held",
         (
             Step(
                 "hybridmap map $HYBRIDMAP_DATA/real/hololens_office --out hololens",
@@ -167,66 +185,78 @@ STUDIES = (
             ),
             Step("hybridmap export hololens --format ply --out hololens.ply", holds="the merged cloud is written"),
         ),
+        _asked(
+            ("ATE of made-up odometry", "ate_rmse/odometry"),
+            ("ATE of the map", "ate_rmse/gtsam-gnc"),
+            ("process time a minute", "cpu_s_per_min"),
+        ),
         needs="real/hololens_office/rgb.txt",
     ),
-    Study(
-        "rgbd",
-        "Revisits, edges and maps of simulated RGB-D drives, five seeds",
-        "Recall of revisits, false loops that the robust back-end keeps, errors of the loop edges, their squared errors over "
-        "their own covariances (1: calibrated; the bar's other side is 0.5), and the map.",
-        (Step("python tools/rgbd_study.py --recordings $OUT --worlds office lab", own_bars=True),),
+    Topic(
+        "rgbd-drives",
+        "simulated office and laboratory, RGB-D, five seeds each",
+        (_study("rgbd-drives"),),
+        _asked(
+            ("ATE of the map, office", "ate_m/office/*"),
+            ("ATE of the map, laboratory", "ate_m/lab/*"),
+            ("recall of revisits", "loop_recall/*"),
+            ("false loops kept", "false_kept/*"),
+            ("errors of the loops, median", "loop_median_m/*"),
+            ("errors of the loops, 95 %", "loop_p95_m/*"),
+            ("turns of the loops, median", "loop_median_deg/*"),
+            ("turns of the loops, 95 %", "loop_p95_deg/*"),
+            ("errors of the loops over what they claim", "loop_chi2_ratio/*"),
+            ("errors of the registrations over what they claim", "registration_chi2_ratio/*"),
+        ),
     ),
-    Study(
+    Topic(
         "rgbd-cost",
-        "The cost of an RGB-D frame",
-        "Process time a frame, everything included, at 320 x 240 pixels and 10 Hz with `gtsam-isam2`.",
-        (
-            Step(
-                "python tools/rgbd_study.py --recordings $OUT --worlds office --seeds 1 --camera 320x240@10"
-                " --backend gtsam-isam2",
-                own_bars=True,
-            ),
-        ),
+        "simulated office, 320 x 240 at 10 Hz, `gtsam-isam2`",
+        (_study("rgbd-cost"),),
+        _asked(("process time a frame", "cpu_ms_per_view/*")),
     ),
-    Study(
+    Topic(
         "rgbd-robustness",
-        "Worse cameras, worse wheels",
-        "Error of the robust map where pictures are spoilt, wheels worse or the camera is another one; its bar is the error of "
-        "odometry. Beside it the false loops that the robust back-end keeps.",
-        (Step("python tools/rgbd_robustness.py --recordings $OUT", own_bars=True),),
+        "simulated laboratory with worse cameras and wheels",
+        (_study("rgbd-robustness"),),
+        _asked(("ATE of the map, held against that of odometry", "ate_m/*"), ("false loops kept", "false_kept/*")),
     ),
-    Study(
-        "carried",
-        "Carried away unseen",
-        "A robot is carried 20 m away and drives on in a place that it knows. How far until its map has it there, and loops "
-        "that are wrong by more than 1 m; by laser and by RGB-D camera.",
-        (
-            Step("python tools/carried_study.py office --config laser --seeds 1 2 3 4 5", own_bars=True),
-            Step("python tools/carried_study.py office --config rgbd --seeds 1 2 3", own_bars=True),
-        ),
-    ),
-    Study(
-        "never-harmful",
-        "A threshold from far too strict to far too loose",
-        "Error of the robust map at each value of an acceptance threshold; its bar is the error of odometry.",
-        (
-            Step(
-                "python tools/threshold_sweep.py $HYBRIDMAP_DATA/real/fr079/fr079.mcap --config laser"
-                " --relations $HYBRIDMAP_DATA/real/fr079/relations.txt"
-                " --key vision.laser.probes.fit_min --values 0.99 0.95 0.85 0.7 0.5 0.3 0.1 0.01",
-                own_bars=True,
-            ),
-            Step(
-                "python tools/threshold_sweep.py office --key vision.rgbd.pnp.min_inliers --values 400 150 60 30 12 8 6 4",
-                own_bars=True,
-            ),
+    Topic(
+        "laser-robustness",
+        "fr079 and aces with worse lasers, wheels and clocks",
+        (_study("laser-robustness"),),
+        _asked(
+            ("relation error of fr079, held against odometry's", "relation_m/fr079/*"),
+            ("relation error of aces, held against odometry's", "relation_m/aces/*"),
         ),
         needs="real/fr079/fr079.mcap",
     ),
-    Study(
+    Topic(
+        "kidnapped",
+        "a robot is put down 20 m away in a known place",
+        (_study("kidnapped"),),
+        _asked(
+            ("way driven until it is found, by laser", "found_m/office by laser/*"),
+            ("way driven until it is found, by RGB-D", "found_m/office by RGB-D/*"),
+            ("loops wrong by more than 1 m", "wrong_loops/*"),
+        ),
+    ),
+    Topic(
+        "threshold-sweep-laser",
+        "a laser's threshold from far too strict to far too loose, fr079",
+        (_study("threshold-sweep-laser"),),
+        _asked(("relation error, held against odometry's", "relation_m/*")),
+        needs="real/fr079/fr079.mcap",
+    ),
+    Topic(
+        "threshold-sweep-rgbd",
+        "a camera's threshold from far too strict to far too loose, office",
+        (_study("threshold-sweep-rgbd"),),
+        _asked(("ATE, held against odometry's", "ate_m/*")),
+    ),
+    Topic(
         "manhattan",
-        "manhattanOlson3500, one referee",
-        "A standard pose graph through several back-ends. Its best known chi2 is 146.08.",
+        "manhattanOlson3500 through several back-ends",
         (
             Step(
                 "hybridmap compare $HYBRIDMAP_DATA/posegraphs/manhattanOlson3500.g2o"
@@ -239,153 +269,171 @@ STUDIES = (
                 ),
             ),
         ),
+        _asked(
+            ("chi2 of odometry", "chi2/odometry"),
+            ("chi2 of relaxation", "chi2/relaxation-ratslam"),
+            ("chi2 of `gtsam-lm`", "chi2/gtsam-lm"),
+        ),
         needs="posegraphs/manhattanOlson3500.g2o",
     ),
-    Study(
+    Topic(
         "optima",
-        "Standard pose graphs, the global optimum",
-        "From the file's own poses; the bar of chi2 is 1.001 times the best known. Where the gap is proved, no map is better.",
+        "five standard pose graphs, `gtsam-lm`",
         tuple(
             Step(
                 f"hybridmap optimize $HYBRIDMAP_DATA/posegraphs/{name} --backend gtsam-lm",
                 (Figure("chi2/gtsam-lm", bar), Figure("certificate_gap/gtsam-lm", gap), Figure("cpu_s/gtsam-lm", 2.0)),
             )
-            for name, bar, gap in (
-                ("intel.g2o", 45.0492, 1e-6),
-                ("CSAIL.g2o", 40.5914, 1e-6),
-                ("FR079_P_toro.graph", 37.6093, None),
-                ("manhattanOlson3500.g2o", 146.2248, 1e-6),
-                ("city10000.g2o", 512.4995, 1e-6),
-            )
+            for name, bar, gap in _GRAPHS
+        ),
+        _asked(
+            ("chi2, held against 1.001 of the best known", "chi2/gtsam-lm"),
+            ("proved gap to the optimum (one is without a bar)", "certificate_gap/gtsam-lm"),
+            ("process time", "cpu_s/gtsam-lm"),
         ),
         needs="posegraphs/city10000.g2o",
     ),
-    Study(
-        "false-loops",
-        "What survives false loops",
-        "Ten seeds on intel and three on manhattanOlson3500; loops at random, and copies of true ones that are moved together. "
-        "Errors are against the optimum of the clean graph. Then robust relaxation, and an odometry that pulls to one side by "
-        "0.06 rad/m, with no false loop.",
-        (
-            Step(
-                "python tools/false_loop_study.py $HYBRIDMAP_DATA/posegraphs/intel.g2o --seeds 10 --shares 0.1 0.4 0.7",
-                (*_survival(("10%", "40%"), 0.15, 9), *_survival(("70%",), 0.30, None)),
-            ),
-            Step(
-                "python tools/false_loop_study.py $HYBRIDMAP_DATA/posegraphs/manhattanOlson3500.g2o --seeds 3"
-                " --shares 0.1 0.2 0.4",
-                tuple(
-                    Figure(f"ate_max/gtsam-gnc-{mode}-{share}", bar)
-                    for share in ("10%", "20%", "40%")
-                    for mode, bar in (("random", 0.25), ("aliased", 0.05))
-                ),
-            ),
-            Step(
-                "python tools/false_loop_study.py $HYBRIDMAP_DATA/posegraphs/intel.g2o --seeds 10 --shares 0 0.05 0.1"
-                " --backends relaxation-robust relaxation-ratslam",
-                tuple(
-                    Figure(f"ate_max/{name}-{mode}-{share}", 0.10 if name == "relaxation-robust" else None)
-                    for share in ("0%", "5%", "10%")
-                    for mode in ("random", "aliased")
-                    for name in ("relaxation-robust", "relaxation-ratslam")
-                ),
-            ),
-            *(
-                Step(
-                    f"python tools/false_loop_study.py $HYBRIDMAP_DATA/posegraphs/{graph}.g2o --bias 0.06 --shares 0 --seeds 1"
-                    " --modes random --backends odometry relaxation-ratslam gtsam-lm gtsam-cauchy gtsam-gnc gtsam-calibrated",
-                    (
-                        *(
-                            Figure(f"ate_max/{name}-random-0%")
-                            for name in ("odometry", "relaxation-ratslam", "gtsam-lm", "gtsam-cauchy", "gtsam-gnc")
-                        ),
-                        Figure("ate_max/gtsam-calibrated-random-0%", 0.5),
-                        Figure("true_lost/gtsam-calibrated-random-0%", 1.0),
-                    ),
-                )
-                for graph in ("intel", "manhattanOlson3500")
-            ),
+    Topic(
+        "false-loops-intel",
+        "false loops on intel, `gtsam-gnc`, ten seeds",
+        (_study("false-loops-intel"),),
+        _asked(
+            ("10 and 40 % false: share of seeds within 5 cm", "within_5_cm mean/*"),
+            ("10 and 40 % false: ATE", "ate_m/*10 %/* | ate_m/*40 %/*"),
+            ("10 and 40 % false: true loops lost", "own_lost_percent/*"),
+            ("10 and 40 % false: false loops kept", "false_kept/*"),
+            ("70 % false: ATE, medians of the seeds", "ate_m median/*70 %/*"),
+            ("70 % false: ATE", "ate_m/*70 %/*"),
         ),
         needs="posegraphs/intel.g2o",
     ),
-    Study(
-        "cost-backends",
-        "The cost of the back-ends",
-        "Process time as ratios within one run: a sweep of relaxation against plain Python, `gtsam-lm` against bare GTSAM, "
-        "`gtsam-gnc` against GTSAM's own, an update of `gtsam-isam2` against one batch optimisation; and what false edges "
-        "leave behind once they are taken out.",
-        (Step("python tools/backend_bench.py sweep overhead gnc isam2 --data $HYBRIDMAP_DATA", own_bars=True),),
-        needs="posegraphs/city10000.g2o",
+    Topic(
+        "false-loops-manhattan",
+        "10 to 40 % false loops on manhattanOlson3500, `gtsam-gnc`, three seeds",
+        (_study("false-loops-manhattan"),),
+        _asked(("random: ATE", "ate_m/*random*"), ("aliased: ATE", "ate_m/*aliased*")),
+        needs="posegraphs/manhattanOlson3500.g2o",
     ),
-    Study(
+    Topic(
+        "false-loops-relaxation",
+        "up to 10 % false loops on intel, `relaxation-robust`, ten seeds",
+        (_study("false-loops-relaxation"),),
+        _asked(("ATE", "ate_m/*relaxation-robust")),
+        needs="posegraphs/intel.g2o",
+    ),
+    Topic(
+        "bent-odometry",
+        "intel and manhattanOlson3500 with odometry bent by 3.4 deg/m, `gtsam-calibrated`",
+        (_study("bent-odometry"),),
+        _asked(("ATE", "ate_m/*gtsam-calibrated"), ("true loops lost", "own_lost_percent/*gtsam-calibrated")),
+        needs="posegraphs/intel.g2o",
+    ),
+    Topic(
         "cells",
-        "The cells against exact integration",
-        "Decoded from activity alone, against exact integration of the same increments over 230 m.",
-        (
-            Step(
-                'python -m pytest -q -m slow tests/neural -k "230_m"',
-                holds="at 30 Hz every module stays within 0.5 % of its spacing, the position within 0.3 mm (3 seeds)",
-            ),
-        ),
+        "the cells against exact integration over 230 m",
+        (Step('python -m pytest -q -m slow tests/neural -k "230_m"', holds="within_their_bars"),),
+        _asked(("modules within 0.5 % of their spacing, position within 0.3 mm, three seeds", "within_their_bars")),
     ),
-    Study(
+    Topic(
         "verify",
-        "The cells against physiology, three seeds",
-        "Every row that has a bar; the page of each run shows the maps and curves behind it.",
+        "the cells against physiology, three seeds",
         tuple(
             Step(f"hybridmap verify --seed {seed} --out verify-{seed}", own_bars=True, wall_bar_s=180.0)
             for seed in (1, 7, 2026)
         ),
+        _asked(
+            ("gridness", "verify/gridness"),
+            ("orientation of the bands", "verify/band_orientation"),
+            ("period of the bands", "verify/band_period"),
+            ("phase error over the spacing", "verify/phase_error_relu_*"),
+            ("position over 240 m, ReLU", "verify/position_room_relu"),
+            ("cells with a single field", "verify/place_single_recruited"),
+            ("one bump in the attractor", "verify/attractor_one_bump_*"),
+            (
+                "other errors, each against its own bar",
+                "verify/head_direction_* | verify/phase_error_softplus_* | verify/position_corridor_* |"
+                " verify/position_room_softplus | verify/no_shadow_*",
+            ),
+        ),
     ),
-    Study(
-        "speed-cells",
-        "The speed of the cells",
-        "Steps per CPU-second of the sheets against a plain `numpy.fft` implementation of the same dynamics, and of the whole "
-        "front-end at 100 Hz, in one run on one core.",
-        (Step("python tools/bench_neural.py", own_bars=True),),
-    ),
-    Study(
-        "speed-matching",
-        "The speed of the search for known places",
-        "Four bands x 64: the exact search against bare `cv2.batchDistance` and plain numpy on the same data, and how the time "
-        "a frame grows with spatial gating, in one run on one core.",
-        (Step("python tools/bench_matching.py", own_bars=True),),
-    ),
-    Study(
+    Topic(
         "calibration",
-        "Calibration of odometry",
-        "Trained on the first half of each log, tested on every window of the second: end error of dead reckoning in % of raw. "
-        "The table of every row is in docs/calibration.md.",
+        "calibrated odometry in % of raw, tested on the second half of each log",
         (Step("python tools/calibration_study.py --data $HYBRIDMAP_DATA/real --out $OUT", own_bars=True),),
+        _asked(
+            ("fr079 and aces, windows of 16.8 m", "end_error/fr079-16.8m-* | end_error/aces-16.8m-*"),
+            ("fr079 and aces, windows of 70 m", "end_error/fr079-70m-* | end_error/aces-70m-*"),
+            ("five robots with motion capture", "end_error/mrclam6-*"),
+            ("of them, better than raw", "better/mrclam6-*"),
+        ),
         needs="real/mrclam6",
     ),
+    Topic(
+        "cost-backends",
+        "back-ends, ratios of process time within one run",
+        (Step("python tools/backend_bench.py sweep overhead gnc isam2 --data $HYBRIDMAP_DATA", own_bars=True),),
+        _asked(
+            ("a sweep of relaxation, times as fast as plain Python", "speed/relaxation-*"),
+            ("`gtsam-lm` over bare GTSAM", "overhead/*"),
+            ("`gtsam-gnc`, times as fast as GTSAM's own, each against its bar", "speed_gnc/*"),
+            ("updates of `gtsam-isam2` a batch optimisation", "updates_a_batch/*"),
+            ("chi2 of its last update, of batch", "chi2_last_update/* | chi2_at_the_end/*"),
+        ),
+        needs="posegraphs/city10000.g2o",
+    ),
+    Topic(
+        "speed-cells",
+        "the cells, in one run on one core",
+        (Step("python tools/bench_neural.py", own_bars=True),),
+        _asked(
+            ("sheets, times as fast as plain `numpy.fft`", "sheets_over_baseline/*"),
+            ("front-end at 100 Hz, times real time", "x_real_time_at_100_Hz/*"),
+        ),
+    ),
+    Topic(
+        "speed-matching",
+        "search for known places, 1,000 to 100,000 nodes",
+        (Step("python tools/bench_matching.py", own_bars=True),),
+        _asked(
+            ("time over bare `cv2.batchDistance`", "search_over_bare/*"),
+            ("times as fast as plain numpy", "numpy_over_search/*"),
+            ("gated, time over that at the smallest map", "gated_against_the_smallest/*"),
+        ),
+    ),
 )
+
+PARTS = {
+    "Maps": ("demo", "fr079", "aces", "office", "hololens", "rgbd-drives", "rgbd-cost"),
+    "What may go wrong": (
+        *("rgbd-robustness", "laser-robustness", "kidnapped", "threshold-sweep-laser", "threshold-sweep-rgbd"),
+    ),
+    "Back-ends on standard graphs": (
+        *("manhattan", "optima", "false-loops-intel", "false-loops-manhattan", "false-loops-relaxation", "bent-odometry"),
+    ),
+    "Cells and odometry": ("cells", "verify", "calibration"),
+    "Speed": ("cost-backends", "speed-cells", "speed-matching"),
+}
+"""Headings of the page and their topics."""
 
 
 @dataclass(frozen=True)
 class Headline:
     """A line of the README's table: one figure of odometry and of the primary back-end, both in m."""
 
-    study: str
+    topic: str
     label: str
     odometry: str
     mapped: str
 
 
+def _headline(topic: str, label: str, measure: str) -> Headline:
+    return Headline(topic, label, f"{measure}/odometry", f"{measure}/gtsam-gnc")
+
+
 HEADLINES = (
-    Headline("demo", "demo, simulated laboratory, RGB-D: ATE", "ate_rmse/odometry", "ate_rmse/gtsam-gnc"),
-    Headline("office", "two laps of a simulated office, RGB-D: ATE", "ate_rmse/odometry", "ate_rmse/gtsam-gnc"),
-    Headline("hololens", "a real office, hand-held RGB-D: ATE", "ate_rmse/odometry", "ate_rmse/gtsam-gnc"),
-    Headline(
-        "fr079",
-        "fr079, real wheels and laser: mean relation error",
-        "relation_trans_mean/odometry",
-        "relation_trans_mean/gtsam-gnc",
-    ),
-    Headline(
-        "aces",
-        "aces, real wheels and laser: mean relation error",
-        "relation_trans_mean/odometry",
-        "relation_trans_mean/gtsam-gnc",
-    ),
+    _headline("demo", "demo, simulated laboratory, RGB-D: ATE", "ate_rmse"),
+    _headline("office", "two laps of a simulated office, RGB-D: ATE", "ate_rmse"),
+    _headline("hololens", "a real office, hand-held RGB-D: ATE", "ate_rmse"),
+    _headline("fr079", "fr079, real wheels and laser: mean relation error", "relation_trans_mean"),
+    _headline("aces", "aces, real wheels and laser: mean relation error", "relation_trans_mean"),
 )

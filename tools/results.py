@@ -1,60 +1,89 @@
 """Run the commands behind every figure that the project claims; write `docs/results.md` and the README's table.
 
-    python tools/results.py                  every study (those without their recordings are left as they were)
-    python tools/results.py --only demo      some of them; the others keep what was found before
-    python tools/results.py --list           their names
+    python tools/results.py                  everything (what lacks its recordings is left as it was)
+    python tools/results.py --only demo      some of it; the rest keeps what was found before
+    python tools/results.py --list           names and commands
+    python tools/results.py --page           write the page and the README's table again, and run nothing
 
-What was found is kept in `docs/results.json`, so that studies can be run one at a time. Recordings are looked for in
-`$HYBRIDMAP_DATA`, else in `../shared/data`.
+What was found is kept in `docs/results.csv`, a line a figure: its value (of a study: of every seed), median, worst, bar, day
+and machine. The page has a line a question. Recordings are looked for in `$HYBRIDMAP_DATA`, else in `../shared/data`.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import io
 import json
 import os
 import platform
 import shlex
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from fnmatch import fnmatchcase
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from result_studies import HEADLINES, STUDIES, Figure, Step, Study
+from result_studies import HEADLINES, PARTS, TOPICS, Figure, Question, Step, Topic
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE, RECORD, README = ROOT / "docs" / "results.md", ROOT / "docs" / "results.json", ROOT / "README.md"
+PAGE, RECORD, README = ROOT / "docs" / "results.md", ROOT / "docs" / "results.csv", ROOT / "README.md"
 HEADLINES_BEGIN, HEADLINES_END = "<!-- results: written by tools/results.py -->\n", "<!-- end of results -->\n"
 DATA = "$HYBRIDMAP_DATA"
+COLUMNS = ("topic", "command", "figure", "unit", "values", "median", "worst", "side", "bar", "passed", "day", "machine")
 PROGRAMS = {
     "hybridmap": (sys.executable, "-c", "from hybridmap.cli import main; main()"),
     "python": (sys.executable,),
 }
+HEAD = ("| what | figures | median | worst | bar | |", "|---|---:|---:|---:|---|---|")
+Row = dict[str, str]
 
 
 def main() -> None:
     """Parse the command line, run, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=[study.name for study in STUDIES], help="these studies alone")
-    parser.add_argument("--list", action="store_true", help="name the studies and stop")
+    parser.add_argument("--only", nargs="+", choices=[topic.name for topic in TOPICS], help="these alone")
+    parser.add_argument("--list", action="store_true", help="name them with their commands and stop")
+    parser.add_argument("--page", action="store_true", help="run nothing")
     arguments = parser.parse_args()
     if arguments.list:
-        print("\n".join(f"{study.name}: {study.title}" for study in STUDIES))
+        print("\n".join(f"{topic.name}: {step.command}" for topic in TOPICS for step in topic.steps))
         return
-    found: dict[str, Any] = json.loads(RECORD.read_text()) if RECORD.is_file() else {}
-    for study in STUDIES:
-        if arguments.only and study.name not in arguments.only:
+    rows = recorded()
+    for topic in TOPICS:
+        if arguments.page or (arguments.only and topic.name not in arguments.only):
             continue
-        if study.needs and not (data_folder() / study.needs).exists():
-            print(f"{study.name}: left out, {DATA}/{study.needs} is not here")
+        if topic.needs and not (data_folder() / topic.needs).exists():
+            print(f"{topic.name}: left out, {DATA}/{topic.needs} is not here")
             continue
-        found[study.name] = run(study)
-        RECORD.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-        PAGE.write_text(page(found), encoding="utf-8")
-        README.write_text(with_headlines(README.read_text(encoding="utf-8"), found), encoding="utf-8")
+        rows = [row for row in rows if row["topic"] != topic.name] + run(topic)
+        write(rows)
+    write(rows)
+
+
+def recorded() -> list[Row]:
+    """What was found so far."""
+    if not RECORD.is_file():
+        return []
+    with RECORD.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write(rows: list[Row]) -> None:
+    """The record, the page and the README's table."""
+    order = {topic.name: number for number, topic in enumerate(TOPICS)}
+    rows = sorted((row for row in rows if row["topic"] in order), key=lambda row: order[row["topic"]])
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    RECORD.write_text(text.getvalue(), encoding="utf-8")
+    PAGE.write_text(page(rows), encoding="utf-8")
+    README.write_text(with_headlines(README.read_text(encoding="utf-8"), rows), encoding="utf-8")
 
 
 def data_folder() -> Path:
@@ -62,19 +91,18 @@ def data_folder() -> Path:
     return Path(os.environ.get("HYBRIDMAP_DATA") or ROOT.parent / "shared" / "data")
 
 
-def run(study: Study) -> dict[str, Any]:
-    """Run the steps of a study in an empty folder; what each of its figures came to."""
-    rows: list[dict[str, Any]] = []
-    where = machine()
+def run(topic: Topic) -> list[Row]:
+    """Run the steps of a topic in an empty folder; what each of its figures came to."""
+    rows: list[Row] = []
+    seen = {"topic": topic.name, "machine": machine(), "day": time.strftime("%Y-%m-%d", time.gmtime())}
     with tempfile.TemporaryDirectory() as folder:
         hashes: list[str] = []
-        for step in study.steps:
-            print(f"{study.name}: {step.command}", flush=True)
+        for step in topic.steps:
+            print(f"{topic.name}: {step.command}", flush=True)
             started = time.perf_counter()
             done = execute(step, Path(folder))
-            elapsed_s = time.perf_counter() - started
-            rows += read(step, done, elapsed_s, hashes)
-    return {"rows": rows, "machine": where, "day": time.strftime("%Y-%m-%d", time.gmtime())}
+            rows += [row | seen for row in read(step, done, time.perf_counter() - started, hashes, Path(folder))]
+    return rows
 
 
 def execute(step: Step, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -89,11 +117,13 @@ def execute(step: Step, folder: Path) -> subprocess.CompletedProcess[str]:
     return done
 
 
-def read(step: Step, done: subprocess.CompletedProcess[str], elapsed_s: float, hashes: list[str]) -> list[dict[str, Any]]:
+def read(step: Step, done: subprocess.CompletedProcess[str], elapsed_s: float, hashes: list[str], folder: Path) -> list[Row]:
     """The rows that a step gives: its figures, its wall time if asked for, whether it passed, whether its graph is the same."""
     rows = []
+    if step.study:
+        rows += [study_row(step, line) for line in csv.DictReader((folder / step.study / "bars.csv").open(encoding="utf-8"))]
     if step.holds:
-        rows.append(row(step, step.holds, "holds" if done.returncode == 0 else "fails", "", None, done.returncode == 0))
+        rows.append(row(step, step.holds, float(done.returncode == 0), "1", "at least", 1.0))
     if step.figures or step.own_bars:
         output = json.loads(done.stdout)
         values = {metric["name"]: metric for metric in output["metrics"]}
@@ -102,46 +132,56 @@ def read(step: Step, done: subprocess.CompletedProcess[str], elapsed_s: float, h
             name = figure.name.replace("PRIMARY", primary)
             if name not in values:
                 raise SystemExit(f"{step.command}: gave no figure {name}; there are {', '.join(values)}")
-            rows.append(figure_row(step, figure, values[name], primary))
-        if step.own_bars:
+            rows.append(figure_row(step, figure, name, values[name]))
+        if step.own_bars and not step.study:
             rows += [own_row(step, metric) for metric in output["metrics"] if metric.get("bar") is not None]
         hashes.append(output.get("graph_hash", ""))
     if step.same_graph:
-        same = len(set(hashes)) == 1
-        rows.append(row(step, "the same graph as before (one hash)", "yes" if same else "no", "", None, same))
+        rows.append(row(step, "same_graph", float(len(set(hashes)) == 1), "1", "at least", 1.0))
     if step.wall_bar_s is not None:
-        rows.append(row(step, "wall time", f"{elapsed_s:.1f}", "s", step.wall_bar_s, elapsed_s <= step.wall_bar_s))
+        rows.append(row(step, "wall_time", elapsed_s, "s", "at most", step.wall_bar_s))
     return rows
 
 
-def figure_row(step: Step, figure: Figure, metric: dict[str, Any], primary: str) -> dict[str, Any]:
-    """One figure, held against its bar if it has one."""
-    value = metric["value"]
-    passed = None
-    if figure.bar is not None:
-        passed = value is not None and (value >= figure.bar if figure.at_least else value <= figure.bar)
-    name = figure.name.replace("PRIMARY", primary)
-    return row(step, f"`{name}`", shown(value), metric["unit"], figure.bar, passed, at_least=figure.at_least)
+def figure_row(step: Step, figure: Figure, name: str, metric: dict[str, Any]) -> Row:
+    """One figure of a command, held against the bar that it is given here."""
+    return row(step, name, metric["value"], metric["unit"], "at least" if figure.at_least else "at most", figure.bar)
 
 
-def own_row(step: Step, metric: dict[str, Any]) -> dict[str, Any]:
+def own_row(step: Step, metric: dict[str, Any]) -> Row:
     """One figure that the command itself holds against a bar; its description says on which side it must lie."""
-    at_least = f"at least {metric['bar']:g}" in metric["description"]
-    what = f"`{metric['name']}`"
-    return row(step, what, shown(metric["value"]), metric["unit"], metric["bar"], metric["passed"], at_least=at_least)
+    side = "at least" if f"at least {metric['bar']:g}" in metric["description"] else "at most"
+    return row(step, metric["name"], metric["value"], metric["unit"], side, metric["bar"]) | {
+        "passed": "yes" if metric["passed"] else "no"
+    }
 
 
-def shown(value: float | None) -> str:
-    """A value as it stands in the table."""
-    return "–" if value is None else f"{value:.5g}"
+def study_row(step: Step, line: Row) -> Row:
+    """A line of a study's `bars.csv`."""
+    rate = f"{line['false_loop_kind']} {100 * float(line['false_loop_rate']):g} %" if line["false_loop_kind"] else ""
+    where = "/".join(part for part in (line["source"], line["setting"], rate, line["backend"]) if part)
+    found = {name: line[name] for name in ("unit", "values", "median", "worst", "side", "bar", "passed")}
+    statistic = ""
+    if line["statistic"] != "worst":
+        statistic, found["median"], found["worst"] = f" {line['statistic']}", line["value"], line["value"]
+    return {"command": step.command, "figure": f"{line['figure']}{statistic}/{where}", **found}
 
 
-def row(
-    step: Step, what: str, value: str, unit: str, bar: float | None, passed: bool | None, *, at_least: bool = False
-) -> dict[str, Any]:
-    """A line of the table."""
-    line = {"what": what, "value": value, "unit": unit, "bar": bar, "passed": passed, "command": step.command}
-    return {**line, "at_least": True} if at_least else line
+def row(step: Step, figure: str, value: float | None, unit: str, side: str, bar: float | None) -> Row:
+    """A line of the record with one value."""
+    text = "" if value is None else f"{value:.6g}"
+    passed = None if bar is None else value is not None and (value >= bar if side == "at least" else value <= bar)
+    return {
+        "command": step.command,
+        "figure": figure,
+        "unit": unit,
+        "values": text,
+        "median": text,
+        "worst": text,
+        "side": "" if bar is None else side,
+        "bar": "" if bar is None else f"{bar:.6g}",
+        "passed": {None: "", True: "yes", False: "no"}[passed],
+    }
 
 
 def machine() -> str:
@@ -156,54 +196,108 @@ def machine() -> str:
     return f"{os.cpu_count()} cores of {model} (load {os.getloadavg()[0]:.1f} from other work), {system}"
 
 
-def page(found: dict[str, Any]) -> str:
-    """The Markdown page."""
+def page(rows: list[Row]) -> str:
+    """The Markdown page: a line a question."""
     lines = [
         "# Results",
         "",
-        "Every figure that the project claims, with the command that gives it and the machine it was seen on. Written by",
-        f"`tools/results.py`; do not edit. `{DATA}` is the folder of recordings. A figure with a bar is held against it.",
+        "What the project claims, a line a question: the median and the worst of so many figures, and the bar that every one",
+        "of them is held against. Each figure, of each seed, with its command, day and machine: [results.csv](results.csv).",
+        f"Written by `tools/results.py`; do not edit. `{DATA}` is the folder of recordings.",
     ]
-    for study in STUDIES:
-        if study.name in found:
-            lines += section(study, found[study.name])
-    return "\n".join(lines) + "\n"
+    for part, names in PARTS.items():
+        found = [line for topic in TOPICS if topic.name in names for line in table(topic, rows)]
+        if found:
+            lines += [
+                "",
+                f"## {part}",
+                "",
+                "| what | figures | median | worst | bar | |",
+                "|---|---:|---:|---:|---|---|",
+                *found,
+            ]
+    return "\n".join([*lines, *commands(rows)]) + "\n"
 
 
-def with_headlines(readme: str, found: dict[str, Any]) -> str:
+def table(topic: Topic, rows: list[Row]) -> list[str]:
+    """The lines of a topic's questions; those of which nothing is recorded are left out."""
+    lines = []
+    for number, question in enumerate(topic.questions):
+        asked = [row for row in rows if row["topic"] == topic.name and is_of(row, question)]
+        if asked:
+            title = f"**{topic.title}**: " if number == 0 else ""
+            lines.append(line(title + question.what, asked))
+    return lines
+
+
+def is_of(found: Row, question: Question) -> bool:
+    """Whether a figure is one that a question sums up."""
+    return any(fnmatchcase(found["figure"], pattern) for pattern in question.figures)
+
+
+def line(what: str, rows: list[Row]) -> str:
+    """One line of the page: the median and the worst of all figures, and their bar.
+
+    Where a bar is on the mean or the median over the seeds, each of them is one figure.
+    """
+    shown = [found for found in rows if found["side"] == rows[0]["side"]]
+    single = any(" mean/" in found["figure"] or " median/" in found["figure"] for found in shown)
+    values = [value for found in shown for value in ([found["median"]] if single else found["values"].split()) if value != "-"]
+    count = sum(1 if single else len(found["values"].split()) or 1 for found in shown)
+    medians = [float(value) for value in values or [found["median"] for found in shown] if value]
+    worsts = [float(found["worst"]) for found in shown if found["worst"]]
+    units = {found["unit"] for found in shown}
+    unit = "" if units == {"1"} else f" {shown[0]['unit']}"
+    median = f"{statistics.median(medians):.4g}{unit}" if medians and count > 1 and len(units) == 1 else ""
+    worst = f"{(min if shown[0]['side'] == 'at least' else max)(worsts):.4g}{unit}" if worsts and len(units) == 1 else ""
+    missed = sum(found["passed"] == "no" for found in rows)
+    verdict = "" if not rows[0]["passed"] else "✓" if not missed else f"✗ {missed} missed"
+    return f"| {what} | {count} | {median} | {worst} | {bar_text(rows, unit)} | {verdict} |"
+
+
+def bar_text(rows: list[Row], unit: str) -> str:
+    """The bar, or both; where each figure has one of its own, how near the worst of them comes to it."""
+    texts = []
+    for side, sign in (("at least", ">="), ("at most", "<=")):
+        held = [found for found in rows if found["bar"] and found["side"] == side]
+        if len({found["bar"] for found in held}) == 1:
+            texts.append(f"{sign} {float(held[0]['bar']):.4g}{unit}")
+        elif held:
+            shares = [float(found["worst"]) / float(found["bar"]) for found in held if found["worst"] and float(found["bar"])]
+            texts.append(f"{sign} its own; at worst {100.0 * (min if sign == '>=' else max)(shares):.3g} % of it")
+    return ", ".join(texts)
+
+
+def commands(rows: list[Row]) -> list[str]:
+    """What to type for each topic, and where and when it was seen."""
+    lines = ["", "## Commands", "", "| of | commands | seen |", "|---|---|---|"]
+    machines = list(dict.fromkeys(bare(found["machine"]) for found in rows))
+    for topic in TOPICS:
+        found = [row for row in rows if row["topic"] == topic.name]
+        if found:
+            seen = ", ".join(sorted({f"{row['day']} [{machines.index(bare(row['machine'])) + 1}]" for row in found}))
+            typed = f"`{topic.steps[0].command}`" + (f" and {len(topic.steps) - 1} more" if len(topic.steps) > 1 else "")
+            lines.append(f"| {topic.title} | {typed} | {seen} |")
+    return [*lines, "", *(f"[{number}]: {name}.  " for number, name in enumerate(machines, start=1))]
+
+
+def bare(name: str) -> str:
+    """A machine, whatever else ran on it."""
+    before, _, after = name.partition(" (load ")
+    return before + after.partition(")")[2]
+
+
+def with_headlines(readme: str, rows: list[Row]) -> str:
     """The README with its table of results brought up to what was found."""
     before, rest = readme.split(HEADLINES_BEGIN)
     _, after = rest.split(HEADLINES_END)
     lines = ["| | odometry | mapped |", "|---|---:|---:|"]
     for headline in HEADLINES:
-        values = {line["what"].strip("`"): line["value"] for line in found.get(headline.study, {"rows": []})["rows"]}
+        values = {found["figure"]: found["worst"] for found in rows if found["topic"] == headline.topic}
         if headline.odometry in values and headline.mapped in values:
             odometry, mapped = (float(values[name]) for name in (headline.odometry, headline.mapped))
             lines.append(f"| {headline.label} | {odometry:.2f} m | {mapped:.3f} m |")
     return before + HEADLINES_BEGIN + "\n" + "\n".join(lines) + "\n\n" + HEADLINES_END + after
-
-
-def section(study: Study, result: dict[str, Any]) -> list[str]:
-    """One study: each command with its figures, and where it was seen."""
-    lines = ["", f"## {study.title}", "", study.about]
-    commands: list[str] = []
-    for step in study.steps:
-        commands.append(step.command)
-        rows = [line for line in result["rows"] if line["command"] == step.command]
-        if rows:
-            lines += ["", "```console", *commands, "```", "", "| figure | value | unit | bar |", "|---|---:|---|---|"]
-            lines += [table_line(line) for line in rows]
-            commands.clear()
-    return [*lines, "", f"Seen on {result['day']}: {result['machine']}."]
-
-
-def table_line(line: dict[str, Any]) -> str:
-    """A figure as a line of a Markdown table."""
-    verdict = {None: "", True: "✓", False: "✗ missed"}[line["passed"]]
-    side = ">=" if line.get("at_least") else "<="
-    bar = f"{side} {line['bar']:g} {verdict}" if line["bar"] is not None else verdict
-    unit = "" if line["unit"] == "1" else line["unit"]
-    return f"| {line['what']} | {line['value']} | {unit} | {bar} |"
 
 
 if __name__ == "__main__":

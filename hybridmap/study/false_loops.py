@@ -1,4 +1,4 @@
-"""False loop closures, bent odometry and drop-outs put into a graph on purpose, to see what a back-end survives."""
+"""False loop closures and drop-outs put into a graph on purpose, to see what a back-end survives."""
 
 from __future__ import annotations
 
@@ -50,14 +50,6 @@ def inject(graph: PoseGraph, share: float, mode: Literal["random", "aliased"], r
         edge_ids=np.concatenate([graph.edge_ids, last + 1 + np.arange(count)]),
         entered=entered,
     )
-
-
-def bend(graph: PoseGraph, bias_rad_m: float) -> PoseGraph:
-    """Add a heading bias to every odometry edge, in rad a metre of its length; `initial` becomes the bent chain."""
-    deltas = graph.deltas.copy()
-    odometry = graph.kinds == EdgeKind.ODOMETRY
-    deltas[odometry, 2] += bias_rad_m * np.hypot(deltas[odometry, 0], deltas[odometry, 1])
-    return chain(replace(graph, deltas=deltas))
 
 
 def drop_out(graph: PoseGraph, share: float, rng: np.random.Generator) -> PoseGraph:
