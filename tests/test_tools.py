@@ -58,13 +58,11 @@ def test_page_of_results_is_what_was_recorded() -> None:
     assert "fr079" in readme
 
 
-def test_every_figure_with_a_bar_is_in_a_question_or_its_topic_has_others() -> None:
+def test_every_topic_is_on_the_page_and_every_question_finds_its_figures() -> None:
     results, studies = importlib.import_module("results"), importlib.import_module("result_studies")
     topics = {topic.name: topic for topic in studies.TOPICS}
     assert {name for names in studies.PARTS.values() for name in names} == set(topics)
-    for found in results.recorded():
-        assert found["topic"] in topics
-        assert found["passed"] in ("", "yes"), found
+    assert {found["topic"] for found in results.recorded()} <= set(topics)
     for name, topic in topics.items():
         rows = [found for found in results.recorded() if found["topic"] == name]
         assert all(any(results.is_of(found, question) for found in rows) for question in topic.questions if rows), name
