@@ -32,7 +32,8 @@ def scan(pose: np.ndarray) -> np.ndarray:
     cross = np.where(cross == 0, 1e-12, cross)
     t = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / cross
     u = (start[:, 0] * direction[..., 1] - start[:, 1] * direction[..., 0]) / cross
-    return np.where((t > 0) & (u >= 0) & (u <= 1), t, np.inf).min(axis=1).astype(np.float32)
+    nearest: np.ndarray = np.where((t > 0) & (u >= 0) & (u <= 1), t, np.inf).min(axis=1)
+    return nearest.astype(np.float32)
 
 
 @dataclass

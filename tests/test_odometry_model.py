@@ -20,7 +20,8 @@ raw_steps = st.tuples(st.floats(-2.0, 2.0), st.floats(-1.0, 1.0), st.floats(-1.5
 
 def by_the_integrator(step, gains):
     """Pose after one step from the origin, of chord and turn as the path integrator takes them."""
-    forward, left, turn = step_of(*step.tolist(), gains)
+    dx_m, dy_m, dyaw_rad = step
+    forward, left, turn = step_of(dx_m, dy_m, dyaw_rad, gains)
     cos, sin = np.cos(0.5 * turn), np.sin(0.5 * turn)
     return np.array([cos * forward - sin * left, sin * forward + cos * left, turn])
 
@@ -33,8 +34,8 @@ def by_the_regression(step, gains):
 
 def by_the_graph(step, gains):
     """The odometry edge as the calibrating back-end has it."""
-    one = {"information": np.eye(3)[None], "kinds": np.array([EdgeKind.ODOMETRY], dtype=np.int8), "edge_ids": np.array([0])}
-    graph = PoseGraph(np.zeros((2, 3)), np.array([0]), np.array([1]), step[None], **one)
+    ends, kinds = (np.array([0]), np.array([1])), np.array([EdgeKind.ODOMETRY], dtype=np.int8)
+    graph = PoseGraph(np.zeros((2, 3)), *ends, step[None], np.eye(3)[None], kinds, np.array([0]))
     return with_calibrated_odometry(graph, gains).deltas[0]
 
 
@@ -72,7 +73,8 @@ def test_an_arc_in_parts_is_the_whole_arc(step, gains, parts):
 @given(raw_steps)
 def test_neutral_gains_change_nothing(step):
     np.testing.assert_allclose(apply(step[None], NEUTRAL)[0], step, atol=1e-14)
-    forward, left, turn = step_of(*step.tolist(), NEUTRAL)
+    dx_m, dy_m, dyaw_rad = step
+    forward, left, turn = step_of(dx_m, dy_m, dyaw_rad, NEUTRAL)
     assert turn == step[2]
     assert np.hypot(forward, left) == pytest.approx(np.hypot(step[0], step[1]), abs=1e-14)
 

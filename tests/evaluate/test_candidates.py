@@ -7,6 +7,7 @@ import pytest
 
 from hybridmap.config.inputs import CameraConfig, SimulationConfig
 from hybridmap.evaluate.candidates import (
+    CandidateErrors,
     CandidateLimits,
     Reading,
     Truth,
@@ -88,7 +89,7 @@ def office():
 
 def test_the_literal_rule_is_inverted_and_four_bands_beat_one(office):
     profiles, truth = office
-    found = {}
+    found: dict[str, CandidateErrors] = {}
     for bands in (1, 4):
         readings = {name: reading for name, of, reading in all_readings() if of == bands}
         rows = score_matrix(profiles[bands], truth.queries, list(readings.values()))

@@ -99,7 +99,7 @@ def test_published_reference_solutions_have_their_published_errors(data_dir, nam
 
 def _raw_odometry(source) -> Trajectory:
     highlevel, typesys = pytest.importorskip("rosbags.highlevel"), pytest.importorskip("rosbags.typesys")
-    poses = {}
+    poses: dict[int, tuple[float, float, float]] = {}
     with highlevel.AnyReader([source], default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)) as reader:
         odometry = [connection for connection in reader.connections if connection.topic == "/odom"]
         for connection, _, raw in reader.messages(odometry):

@@ -40,7 +40,8 @@ def evo_statistics(metric, estimate: Trajectory, reference: Trajectory, *, align
     if align:
         ours.align(theirs)
     metric.process_data((theirs, ours))
-    return metric.get_all_statistics()
+    statistics: dict[str, float] = metric.get_all_statistics()
+    return statistics
 
 
 def test_ate_agrees_with_evo():
