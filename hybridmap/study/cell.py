@@ -22,7 +22,7 @@ from hybridmap.geometry import Array, align, between, compose
 from hybridmap.graph.connectivity import chain
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.study import provenance
-from hybridmap.study.drift import Kind, with_drift, with_false_loops
+from hybridmap.study.false_loops import Kind, with_drift, with_false_loops
 from hybridmap.study.frozen import Frozen
 from hybridmap.study.measures import KEPT, NEAR_M
 from hybridmap.study.model import BackendVariant, DriftConfig, Start, Way

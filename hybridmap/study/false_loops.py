@@ -1,4 +1,4 @@
-"""False loop closures and drop-outs put into a graph on purpose, to see what a back-end survives."""
+"""What is done to a frozen graph on purpose before a back-end gets it: errors of its odometry, drop-outs, false loops."""
 
 from __future__ import annotations
 
@@ -9,16 +9,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.errors import GraphError
-from hybridmap.geometry import compose
+from hybridmap.geometry import Array, between, compose, exp
 from hybridmap.graph.connectivity import chain
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.study.model import DriftConfig
 
+Kind = Literal["random", "aliased"]
+_STREAMS = ("drift", "dropouts")  # each draws from a stream of its own
 _DROP_OUT_M, _DROP_OUT_RAD = 0.5, np.deg2rad(20.0)
 _RUN = 5  # aliased loops that come one after the other and agree with each other
 
 
-def inject(graph: PoseGraph, share: float, mode: Literal["random", "aliased"], rng: np.random.Generator) -> PoseGraph:
+def with_drift(graph: PoseGraph, drift: DriftConfig, seed: int) -> PoseGraph:
+    """The graph with wrong odometry edges; `initial` moves along with them.
+
+    A step of length s turns by a further bias * s, half of it before the step, and is (1 + scale) s long.
+    """
+    if drift.idle:
+        return graph
+    odometry = np.flatnonzero(graph.kinds == EdgeKind.ODOMETRY)
+    deltas = graph.deltas.copy()
+    deltas[odometry] = _drifted(deltas[odometry], drift)
+    if drift.noise > 0.0:
+        covariance = np.linalg.inv(graph.information[odometry])
+        white = _generator("drift", 0.0, seed).standard_normal((len(odometry), 3, 1))
+        twist = drift.noise * (np.linalg.cholesky(covariance) @ white)[:, :, 0]
+        deltas[odometry] = compose(deltas[odometry], exp(twist))
+    if drift.dropouts > 0.0:
+        deltas = drop_out(replace(graph, deltas=deltas), drift.dropouts, _generator("dropouts", drift.dropouts, seed)).deltas
+    return replace(graph, deltas=deltas, initial=_moved(graph, deltas))
+
+
+def with_false_loops(graph: PoseGraph, kind: Kind, rate: float, seed: int) -> PoseGraph:
+    """The graph with false loops appended (`inject`); the same for every back-end.
+
+    Raises:
+        GraphError: no loop to copy.
+    """
+    return graph if rate == 0.0 else inject(graph, rate, kind, np.random.default_rng(seed))
+
+
+def inject(graph: PoseGraph, share: float, mode: Kind, rng: np.random.Generator) -> PoseGraph:
     """Append false loops until they are `share` of all loops; their `edge_ids` follow the last one.
 
     Args:
@@ -76,6 +108,32 @@ def drop_out(graph: PoseGraph, share: float, rng: np.random.Generator) -> PoseGr
     slip = np.column_stack([_DROP_OUT_M * np.cos(direction), _DROP_OUT_M * np.sin(direction), turn])
     deltas[hit] = compose(deltas[hit], slip)
     return chain(replace(graph, deltas=deltas))
+
+
+def _generator(stream: str, rate: float, seed: int) -> np.random.Generator:
+    """The chance of one error of the odometry at one rate; that of false loops is the seed's own."""
+    return np.random.default_rng([seed, _STREAMS.index(stream), round(1e6 * rate)])
+
+
+def _drifted(deltas: Array, drift: DriftConfig) -> Array:
+    length = np.hypot(deltas[:, 0], deltas[:, 1])
+    turn = np.deg2rad(drift.heading_bias_deg_per_m) * length
+    half = np.column_stack([np.zeros((len(turn), 2)), 0.5 * turn])
+    longer = deltas * np.array([1.0 + drift.scale_bias, 1.0 + drift.scale_bias, 1.0])
+    return compose(compose(half, longer), half)
+
+
+def _moved(graph: PoseGraph, deltas: Array) -> Array:
+    """The graph's initial poses, each step between them changed as the odometry edge of the same two nodes was."""
+    forward = (graph.kinds == EdgeKind.ODOMETRY) & (graph.targets - graph.sources == 1)
+    steps = between(graph.initial[:-1], graph.initial[1:])
+    before, after = graph.deltas[forward], deltas[forward]
+    at = graph.sources[forward]
+    steps[at] = compose(steps[at], between(before, after))
+    poses = graph.initial.copy()
+    for k in range(1, graph.n_nodes):
+        poses[k] = compose(poses[k - 1], steps[k - 1])
+    return poses
 
 
 def _random_pairs(

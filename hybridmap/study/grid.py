@@ -8,7 +8,7 @@ from functools import cache, partial
 from itertools import product
 
 from hybridmap.study.cell import CellTask, key_of
-from hybridmap.study.drift import Kind
+from hybridmap.study.false_loops import Kind
 from hybridmap.study.model import SettingConfig, SourceConfig, StudyConfig, backend_settings
 from hybridmap.study.sources import Source, SourceTask, open_source
 

@@ -25,7 +25,6 @@ _SOLVING = (
     "geometry.py",
     "graph",
     "study/cell.py",
-    "study/drift.py",
     "study/false_loops.py",
     "study/sources.py",
 )

@@ -9,8 +9,8 @@ from hybridmap.errors import BackendError
 from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.study import cell as cells
-from hybridmap.study.drift import with_drift, with_false_loops
 from hybridmap.study.drive import Drive
+from hybridmap.study.false_loops import with_drift, with_false_loops
 from hybridmap.study.frozen import Frozen
 from hybridmap.study.grid import lay_out
 from hybridmap.study.model import DriftConfig, SyntheticConfig
