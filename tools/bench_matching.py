@@ -22,7 +22,7 @@ from hybridmap.vision.profile import normalised
 from hybridmap.vision.search import ProfileIndex
 from hybridmap.vision.templates import Matcher
 
-WIDTH, NEAREST = 64, 5
+WIDTH, MAX_SHIFT, NEAREST = 64, 16, 5
 MATCHING = MatchingConfig()
 BARS = {"search / bare": 1.5, "numpy / search": 10.0, "gated, against the smallest": 2.0}
 STEP_M, LANE_M, LANE_NODES = 0.25, 1.0, 200
@@ -61,7 +61,7 @@ class Bare:
     def __call__(self) -> None:
         """Search once."""
         length = self.query.shape[1]
-        for c in range(-MATCHING.max_shift, MATCHING.max_shift + 1):
+        for c in range(-MAX_SHIFT, MAX_SHIFT + 1):
             skip = self.bands * abs(c)
             ours = self.query[:, skip:] if c >= 0 else self.query[:, : length - skip]
             theirs = self.stored[:, : length - skip] if c >= 0 else self.stored[:, skip:]
@@ -71,7 +71,7 @@ class Bare:
 def plain(query: NDArray[np.float32], stored: NDArray[np.float32]) -> NDArray[np.int64]:
     """The baseline: equation 12 for every shift in numpy, the bands' mean, the least over the shifts, the nearest."""
     least = np.full(len(stored), np.inf)
-    for c in range(-MATCHING.max_shift, MATCHING.max_shift + 1):
+    for c in range(-MAX_SHIFT, MAX_SHIFT + 1):
         ours = query[:, max(c, 0) : WIDTH + min(c, 0)]
         theirs = stored[:, :, max(-c, 0) : WIDTH - max(c, 0)]
         np.minimum(least, np.abs(theirs - ours).mean(axis=(1, 2)), out=least)
@@ -99,8 +99,8 @@ def measure(count: int, bands: int, numpy_up_to: int) -> dict[str, float]:
     """Times in ms, and their ratios, of one size of map."""
     rng = np.random.default_rng(count)
     stored, query = views(count, bands, rng), views(1, bands, rng)[0]
-    index = ProfileIndex(np.full(bands, 1.0 / bands), WIDTH, MATCHING.max_shift)
-    matcher = Matcher("four-band", MATCHING.mu_r, MATCHING.mu_d, MATCHING.max_shift)
+    index = ProfileIndex(np.full(bands, 1.0 / bands), WIDTH, MAX_SHIFT)
+    matcher = Matcher("four-band", MATCHING.mu_r, MATCHING.mu_d, MAX_SHIFT)
     for profile in stored:
         index.add(profile)
         matcher.add(profile)

@@ -31,6 +31,47 @@ backends.consistency backends/judging/consistency.py neighbours
 backends.consistency graph/agreement.py quantile
 backends.isam2 backends/gtsam/smoother.py relinearize_m relinearize_rad settle_updates
 backends.isam2 backends/gtsam/incremental.py patience
+vision.templates vision/templates.py threshold stable_frames
+vision.relocalising vision/relocalising.py support mismatch_max mismatch_scale wait_m
+vision.relocalising vision/rgbd/closing.py span_m doubt_nodes unrecognised_nodes known_m known_deg:KNOWN_RAD
+vision.relocalising vision/rgbd/whole_map.py separation doubtful_m
+vision.laser.scan vision/laser/cloud.py range_max_m cell_m
+vision.laser.registration vision/laser/likelihood.py reach_m field_sigma_m
+vision.laser.registration vision/laser/registration.py cauchy_scale_m iterations inlier_m sigma_m spurious
+vision.laser.tracking vision/laser/tracking.py submap_nodes narrow wide lost inliers_sure contradiction_m contradiction_deg
+vision.laser.tracking vision/laser/tracking.py floor_m floor_deg
+vision.laser.tracking vision/laser/checks.py inliers_min inliers_weak translation_max_m
+vision.laser.probes vision/laser/hypotheses.py length_m target_every_m target_half_m points gate_inflation gate_m gate_deg
+vision.laser.probes vision/laser/hypotheses.py window_m targets modes_per_target modes modes_sure floor_m floor_deg
+vision.laser.probes vision/laser/checks.py near_min violation_max loosest_max_m ambiguity_max
+vision.laser.commitment vision/laser/clusters.py wait_m probes span_m span_per_efold_m
+vision.laser.commitment vision/laser/hypotheses.py sure_sigma_m
+vision.laser.commitment vision/laser/checks.py rival
+vision.laser.relocalising vision/relocalising.py support mismatch_max mismatch_scale wait_m
+vision.laser.relocalising vision/laser/whole_map.py span_m unrecognised_probes from_m often_m submaps misfit
+vision.laser.relocalising vision/laser/continuity.py map_violation sure_m
+vision.laser.relocalising vision/laser/checks.py contradiction_sigmas violation:WAY_VIOLATION
+vision.laser.relocalising vision/laser/hypotheses.py modes:MODES_ANYWHERE
+vision.laser.revisits vision/laser/revisits.py radius_m every_m apart_m partners probe_half_m target_half_m
+vision.laser.revisits vision/laser/revisits.py search_m search_deg ambiguous_m floor_m floor_deg
+vision.laser.retrace vision/laser/retrace.py block_nodes radius_m map_nodes prior_m prior_deg inliers_min off_max_m off_max_deg
+vision.rgbd.features vision/rgbd/features.py count fast_threshold ratio
+vision.rgbd.registration vision/rgbd/tracking.py back keypoint_reach_m translation_floor_m:FLOORS rotation_floor_deg:FLOORS
+vision.rgbd.registration vision/rgbd/tracking.py held_translation_floor_m:HELD_FLOORS held_rotation_floor_deg:HELD_FLOORS
+vision.rgbd.registration vision/rgbd/depth_grid.py grid_px grid_columns
+vision.rgbd.registration vision/rgbd/depth_registration.py iterations max_distance_m max_normal_deg min_points correlation
+vision.rgbd.registration vision/rgbd/noise_level.py noise_factor
+vision.rgbd.registration vision/rgbd/checks.py min_inliers:DEPTH_INLIERS_MIN contradiction_sigma
+vision.rgbd.pnp vision/rgbd/checks.py min_inliers_alone max_height_m max_tilt_deg agree_m:REVERSE_M agree_deg:REVERSE_DEG
+vision.rgbd.pnp vision/rgbd/checks.py map_inliers map_overlap map_points map_sigma_m
+vision.rgbd.pnp vision/rgbd/pnp_solver.py reprojection_px iterations
+vision.rgbd.pnp vision/rgbd/pnp.py translation_floor_m:FLOORS rotation_floor_deg:FLOORS
+vision.rgbd.pnp vision/rgbd/pnp.py held_translation_floor_m:HELD_FLOORS held_rotation_floor_deg:HELD_FLOORS
+vision.rgbd.closing vision/rgbd/closing.py gate_per_m gate_growth_m heading_deg heading_deg_per_m accept separation
+vision.rgbd.closing vision/rgbd/closing.py pending_nodes shift_sigma_m shift_sigma_deg
+vision.rgbd.closing vision/rgbd/closing.py repropose_m repropose_per_node repropose_online
+vision.rgbd.closing vision/rgbd/revisits.py repropose_sigma_m:MAP_SIGMA_M repropose_sigma_deg:MAP_SIGMA_DEG
+vision.rgbd.closing vision/rgbd/support.py support_nodes
 """
 
 RENAMED: dict[str, str] = {}
@@ -46,6 +87,15 @@ OTHERWISE: dict[str, str] = {
     "vision.relocalising.agree_deg": _RING,
     "vision.rgbd.closing.support_m": _RING,
     "vision.rgbd.closing.support_deg": _RING,
+    "simulation.camera.noise": "simulation.noise is a factor for every sensor",
+    "simulation.laser.noise": "simulation.noise is a factor for every sensor",
+    "vision.matching.mu_d": "it is 1 - vision.matching.mu_r",
+    "vision.matching.max_shift": "it is a quarter of vision.profile.width",
+    "vision.templates.max_shift": "it is a sixteenth of vision.profile.width",
+    "vision.laser.scan.profile_width": "vision.profile.width is that of every sensor",
+    "vision.relocalising.candidates": "vision.relocalising.enabled says whether a lost robot is looked for",
+    "vision.rgbd.registration.keypoints": "matched keypoints always join the depth",
+    "vision.rgbd.pnp.refine": "poses by features are always refined on depth",
 }
 """Old dotted key -> what there is instead."""
 

@@ -70,7 +70,7 @@ def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
         mode,
         matching.mu_r,
         matching.mu_d,
-        min(matching.max_shift, profiles[0].shape[1] - 1),
+        min(settings.profile.max_shift, profiles[0].shape[1] - 1),
         matching.g_bar,
         matching.sequence,
         circular,
@@ -117,7 +117,7 @@ def _modes_of_ranges(
         raise EvaluationError(f"{store.path}: its nodes hold no views: there are no candidates to judge")
     for circular in (False, True) if settings.circular else (False,):
         pairs = judge_pairs(stamps, truth, FROM_ANY_SIDE if circular else DEFAULT_LIMITS)
-        readings = [Reading("plain", max_shift=settings.matching.max_shift, sequence=n, circular=circular) for n in (1, 5)]
+        readings = [Reading("plain", max_shift=settings.profile.max_shift, sequence=n, circular=circular) for n in (1, 5)]
         for reading, row in zip(readings, score_matrix(profiles, pairs.queries, readings), strict=True):
             name = "full circle, from any side" if circular else "fan, from the same side"
             yield name + (f", {reading.sequence} in a row" if reading.sequence > 1 else ""), candidate_errors(row, pairs)

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.agreement import AgreementConfig
 from hybridmap.geometry import Array, RelativePose, between, compose, inverse
 from hybridmap.graph.agreement import Loops, agreement, largest_consistent_set
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status, at_least
@@ -18,6 +17,14 @@ from hybridmap.vision.gating import Chain, Whereabouts
 
 Indices = NDArray[np.int64]
 
+SUPPORT = 4
+"""Nodes whose closures must put the robot at one and the same place: rooms that look alike seldom do so four times."""
+MISMATCH_MAX = 0.15
+"""Mean mismatch, of sightings that say how badly they fit, at which no travel is enough; half of it doubles the travel."""
+MISMATCH_SCALE = 0.03
+"""Of one node's sightings at different places, one that fits worse by this counts for a factor e less."""
+WAIT_M = 32.0
+"""Travel after which a sighting that no others agreed with is given up, m."""
 REHUNG_M, REHUNG_RAD = 0.5, float(np.deg2rad(10.0))
 """Standard deviations of the edge in the place of the broken one: it holds the chain together, the closures place it."""
 WHERE_IT_WAS = 2.0
@@ -44,18 +51,17 @@ class Settlement:
 class Relocaliser:
     """Keeps the sightings of a lost robot. The newer node is the source of an edge.
 
-    Sightings wait until `support` of them, of distinct nodes over `span_m` of travel, put the robot at one and the same pose,
+    Sightings wait until `SUPPORT` of them, of distinct nodes over `span_m` of travel, put the robot at one and the same pose,
     and those that contradict them count for less than half as much. Then all of them enter the map together, and the odometry
     edge at which the chain broke gives way to one that leads to where they have it; registrations across the break are taken
     back. A sighting may say how badly it fits (its figure `mismatch`, 0 for perfectly): the worse those that agree best, the
     more travel is needed, and of one node's sightings the worse count less.
     """
 
-    def __init__(self, config: AgreementConfig, whereabouts: Whereabouts, new_key: Callable[[], int], settings: str) -> None:
-        """Start without a sighting; `settings` is the dotted name of the configuration."""
+    def __init__(self, whereabouts: Whereabouts, new_key: Callable[[], int], span_m: float) -> None:
+        """Start without a sighting; those that agree must cover `span_m` of travel."""
         self.whereabouts = whereabouts
-        self._settings = settings
-        self._config = config
+        self._span_m = span_m
         self._new_key = new_key
         self._waiting: list[Edge] = []
         self._agree: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
@@ -83,7 +89,7 @@ class Relocaliser:
         chosen = np.flatnonzero(largest_consistent_set(self._agree, weights))
         if not self._enough(chosen, weights, belief):
             return Settlement(out)
-        agreeing = at_least("agreeing", len(chosen), self._config.support, f"{self._settings}.support")
+        agreeing = at_least("agreeing", len(chosen), SUPPORT)
         friends = tuple(self._waiting[i].settled(agreeing) for i in chosen.tolist())
         self._waiting = [s for i, s in enumerate(self._waiting) if i not in set(chosen.tolist())]
         out += [*friends, *self.dismiss(Lack.CONTRADICTED)]
@@ -119,7 +125,7 @@ class Relocaliser:
 
     def _expired(self, belief: Belief) -> list[Edge]:
         """Refuse sightings that have waited too long."""
-        old_nodes = belief.travel_m < belief.travel_m[-1] - self._config.wait_m
+        old_nodes = belief.travel_m < belief.travel_m[-1] - WAIT_M
         old = [s for s in self._waiting if old_nodes[s.source]]
         kept = [i for i, s in enumerate(self._waiting) if not old_nodes[s.source]]
         self._waiting, self._agree = [self._waiting[i] for i in kept], self._agree[np.ix_(kept, kept)]
@@ -129,7 +135,7 @@ class Relocaliser:
         """(n,) 1 for each node's best sighting, less for those of the same node that fit worse."""
         sources, mismatch = self._sources(), self._mismatch()
         best = np.array([mismatch[sources == source].min() for source in sources])
-        return np.asarray(np.exp((best - mismatch) / self._config.mismatch_scale))
+        return np.asarray(np.exp((best - mismatch) / MISMATCH_SCALE))
 
     def _enough(self, chosen: Indices, weights: Array, belief: Belief) -> bool:
         """Whether the chosen ones, or the best fitting of them, cover enough travel, and hardly any contradict them."""
@@ -137,12 +143,12 @@ class Relocaliser:
             return False
         mismatch = self._mismatch()[chosen]
         order = np.argsort(mismatch, kind="stable")
-        sources, worst = self._sources()[chosen[order]], self._config.mismatch_max
-        for count in range(self._config.support, len(chosen) + 1):
+        sources, worst = self._sources()[chosen[order]], MISMATCH_MAX
+        for count in range(SUPPORT, len(chosen) + 1):
             fits = 1.0 - float(mismatch[order[:count]].mean()) / worst
             seen = np.unique(sources[:count])
             span_m = float(belief.travel_m[seen[-1]] - belief.travel_m[seen[0]])
-            if fits > 0.0 and len(seen) >= self._config.support and span_m * fits >= self._config.span_m:
+            if fits > 0.0 and len(seen) >= SUPPORT and span_m * fits >= self._span_m:
                 return True
         return False
 

@@ -319,13 +319,18 @@ class Recognition:
     difference: float
 
 
+THRESHOLD = 0.5
+"""A view is new when its profile differs by more than this from every template (mean absolute difference of z-normalised
+profiles): two views of one place a step apart differ by less."""
+STABLE_FRAMES = 3
+"""A new view founds a template when it has been new in this many consecutive frames: a blurred frame founds none."""
+
+
 class ViewTemplates:
     """View templates V: one is founded when the view has been new in several consecutive frames."""
 
-    def __init__(self, threshold: float, stable_frames: int, max_shift: int, mu_r: float, mu_d: float) -> None:
+    def __init__(self, max_shift: int, mu_r: float, mu_d: float) -> None:
         self._matcher = Matcher("plain", mu_r, mu_d, max_shift)
-        self._threshold = threshold
-        self._stable_frames = stable_frames
         self._new_for = 0
 
     def __len__(self) -> int:
@@ -337,8 +342,8 @@ class ViewTemplates:
             return Recognition(self._matcher.add(profile), True, float("inf"))
         match = self._matcher.best(profile, 1)
         best, difference = int(match.indices[0]), float(match.score[0])
-        self._new_for = self._new_for + 1 if difference > self._threshold else 0
-        if self._new_for < self._stable_frames:
+        self._new_for = self._new_for + 1 if difference > THRESHOLD else 0
+        if self._new_for < STABLE_FRAMES:
             return Recognition(best, False, difference)
         self._new_for = 0
         return Recognition(self._matcher.add(profile), True, difference)

@@ -52,7 +52,7 @@ def test_every_command_explains_itself(command):
         (["map", "office", "--out", "s", "--start", "-5"], "--start"),
         (["map", "office", "--out", "s", "--end", "inf"], "--end"),
         (["map", "office", "--out", "/proc/no/such"], "/proc/no"),
-        (["map", "office", "--out", "s", "--set", "vision.laser.scan.cell_m=1e-6"], "vision.laser.scan.cell_m"),
+        (["map", "office", "--out", "s", "--set", "vision.laser.probes.fit_min=2"], "vision.laser.probes.fit_min"),
         (["map", "office", "--out", ""], "--out: found nothing"),
         (["map", "office", "--out="], "--out: found nothing"),
         (["map", "", "--out", "s"], "an argument: found nothing"),

@@ -22,7 +22,7 @@ def bench(monkeypatch):
 def test_the_baseline_finds_the_same_views(bench):
     rng = np.random.default_rng(0)
     stored = bench.views(300, 4, rng)
-    index = ProfileIndex(np.full(4, 0.25), bench.WIDTH, bench.MATCHING.max_shift)
+    index = ProfileIndex(np.full(4, 0.25), bench.WIDTH, bench.MAX_SHIFT)
     for profile in stored:
         index.add(profile)
     for near in range(0, 300, 60):

@@ -5,9 +5,9 @@ from itertools import count
 import numpy as np
 import pytest
 
-from hybridmap.config.agreement import AgreementConfig
 from hybridmap.geometry import RelativePose, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
+from hybridmap.vision import relocalising
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import Chain, Whereabouts
 from hybridmap.vision.relocalising import Relocaliser
@@ -23,9 +23,9 @@ THERE, ELSEWHERE = 10, 25
 class Search:
     """Gives a relocaliser what was seen from node after node, and keeps the last word on each."""
 
-    def __init__(self, config=None, steps=()):
+    def __init__(self, span_m=0.75, steps=()):
         self.keys = count()
-        self.relocaliser = Relocaliser(config or AgreementConfig(), Whereabouts(0), self.keys.__next__, "x")
+        self.relocaliser = Relocaliser(Whereabouts(0), self.keys.__next__, span_m)
         self.relocaliser.tracked(BROKEN_AT, Chain.BROKEN, list(steps))
         self.proposals = {}
         self.settlements = []
@@ -102,13 +102,13 @@ def test_a_robot_found_where_the_chain_has_it_was_not_carried():
 
 
 def test_agreement_needs_travel_and_not_only_views():
-    search = Search(AgreementConfig(span_m=1.1)).drive(range(40, 44), THERE)
+    search = Search(span_m=1.1).drive(range(40, 44), THERE)
     assert search.lost
     assert not search.drive([44], THERE).lost
 
 
 def test_several_sightings_of_one_node_are_one_support():
-    search = Search(AgreementConfig(span_m=0.0))
+    search = Search(span_m=0.0)
     search.see(40, *((THERE, None),) * 8)
     assert search.lost
 
@@ -143,8 +143,9 @@ def test_the_worse_they_fit_the_more_travel_is_needed(mismatch, nodes):
     assert needed == nodes
 
 
-def test_old_sightings_are_given_up():
-    search = Search(AgreementConfig(wait_m=6.0)).drive(range(40, 43), THERE)
+def test_old_sightings_are_given_up(monkeypatch):
+    monkeypatch.setattr(relocalising, "WAIT_M", 6.0)
+    search = Search().drive(range(40, 43), THERE)
     search.see(65)
     assert search.verdicts() == [Status.REJECTED] * 3
     assert all(p.lack is Lack.UNSUPPORTED for p in search.proposals.values())
@@ -159,7 +160,7 @@ def test_what_waits_can_be_dismissed():
 
 
 def test_sightings_of_a_chain_that_holds_hang_nothing_anew():
-    relocaliser = Relocaliser(AgreementConfig(), Whereabouts(1), iter(range(99)).__next__, "x")
+    relocaliser = Relocaliser(Whereabouts(1), iter(range(99)).__next__, 0.75)
     relocaliser.whereabouts.unrecognised()
     found = []
     for node in range(40, 44):

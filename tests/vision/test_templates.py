@@ -107,7 +107,7 @@ def test_store_grows():
 def test_a_template_is_founded_only_when_the_view_stays_new():
     rng = np.random.default_rng(7)
     a, b = smooth(rng, 2, 64).astype(np.float32), smooth(rng, 2, 64).astype(np.float32)
-    templates = ViewTemplates(threshold=0.4, stable_frames=3, max_shift=2, mu_r=0.5, mu_d=0.5)
+    templates = ViewTemplates(max_shift=2, mu_r=0.5, mu_d=0.5)
     assert templates.recognise(a).founded
     assert not templates.recognise(b).founded
     assert not templates.recognise(a).founded  # back again: b was not stable

@@ -9,10 +9,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.laser import ScanConfig
 from hybridmap.geometry import Array
 from hybridmap.streams.laser import Laser
 
+RANGE_MAX_M = 20.0
+"""Returns farther away are left out, m: beyond it the beams of most lasers are too far apart to give a wall its normal."""
+CELL_M = 0.05
+"""Points of one cell are merged into one, m: a few times the noise of a range."""
 NEIGHBOURS = 3
 
 
@@ -48,21 +51,20 @@ class Cloud:
 EMPTY = Cloud(np.zeros((0, 2)), np.zeros((0, 2)))
 
 
-def cloud_of_scan(ranges_m: NDArray[np.float32], laser: Laser, config: ScanConfig) -> Cloud:
+def cloud_of_scan(ranges_m: NDArray[np.float32], laser: Laser) -> Cloud:
     """Points of one scan in `base_link`, merged by cell.
 
     Args:
         ranges_m: (B,) ranges, NaN where invalid.
         laser: bearings and mounting.
-        config: range limit and cell size.
     """
-    return clouds_of_scans([ranges_m], laser, config)[0]
+    return clouds_of_scans([ranges_m], laser)[0]
 
 
-def clouds_of_scans(ranges_m: Sequence[NDArray[np.float32]], laser: Laser, config: ScanConfig) -> list[Cloud]:
+def clouds_of_scans(ranges_m: Sequence[NDArray[np.float32]], laser: Laser) -> list[Cloud]:
     """The same for many scans, worked out together: a scan is too small to keep an array operation busy."""
     ranges = np.array(ranges_m, dtype=np.float64).reshape(len(ranges_m), -1)
-    valid = (ranges >= laser.range_min_m) & (ranges <= min(laser.range_max_m, config.range_max_m))
+    valid = (ranges >= laser.range_min_m) & (ranges <= min(laser.range_max_m, RANGE_MAX_M))
     valid &= valid.sum(axis=1, keepdims=True) >= 2 * NEIGHBOURS + 1
     scan, beam = np.nonzero(valid)
     if len(scan) == 0:
@@ -71,12 +73,12 @@ def clouds_of_scans(ranges_m: Sequence[NDArray[np.float32]], laser: Laser, confi
     points = np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], axis=1)
     step = abs(float(laser.bearings_rad[-1] - laser.bearings_rad[0])) / max(len(laser.bearings_rad) - 1, 1)
     normals = _normals(points, np.minimum(1.0, 0.1 + 8.0 * step * distance), scan)
-    whole, group = _merged(Cloud(points, normals).moved(laser.pose_base_laser), scan, config.cell_m)
+    whole, group = _merged(Cloud(points, normals).moved(laser.pose_base_laser), scan, CELL_M)
     ends = np.searchsorted(group, np.arange(len(ranges_m) + 1))
     return [Cloud(whole.points[a:b], whole.normals[a:b]) for a, b in pairwise(ends.tolist())]
 
 
-def merged(clouds: Iterable[Cloud], cell_m: float) -> Cloud:
+def merged(clouds: Iterable[Cloud], cell_m: float = CELL_M) -> Cloud:
     """All points, those of one cell averaged; the order follows the cells, so it depends on the points alone."""
     parts = [c for c in clouds if len(c)]
     if not parts:
@@ -85,7 +87,7 @@ def merged(clouds: Iterable[Cloud], cell_m: float) -> Cloud:
     return _merged(whole, np.zeros(len(whole), dtype=np.int64), cell_m)[0]
 
 
-def merged_at(clouds: Sequence[Cloud], poses: Array, cell_m: float) -> Cloud:
+def merged_at(clouds: Sequence[Cloud], poses: Array, cell_m: float = CELL_M) -> Cloud:
     """Merge clouds that were taken from poses (N, 3); the points come out in the frame of the poses."""
     counts = [len(c) for c in clouds]
     if sum(counts) == 0:

@@ -9,12 +9,18 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.laser import CommitmentConfig
 from hybridmap.graph.agreement import Loops, agreement, largest_consistent_set
 from hybridmap.graph.edges import Check, Edge, Lack, passed
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser import checks
-from hybridmap.vision.laser.hypotheses import Hypothesis
+from hybridmap.vision.laser.hypotheses import SURE_SIGMA_M, Hypothesis
+
+WAIT_M = 32.0
+"""Travel after which a hypothesis that found no cluster is given up, m: it is tried again at the end."""
+PROBES, SPAN_M = 3, 3.0
+"""Distinct probes that a cluster needs, and travel that they must cover, m; in a narrow gate one probe less is enough."""
+SPAN_PER_EFOLD_M = 1.0
+"""Travel that they must cover beside that for each factor e by which the gate is wider: there more places look alike, m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,9 +80,8 @@ class Ripe:
 class Commitment:
     """The queue of waiting hypotheses."""
 
-    def __init__(self, config: CommitmentConfig, travel_of: Callable[[int], float]) -> None:
+    def __init__(self, travel_of: Callable[[int], float]) -> None:
         """Start empty; `travel_of` gives the travel until a node, m."""
-        self._config = config
         self._travel = travel_of
         self._queue: list[Waiting] = []
         self._given_up: list[Waiting] = []
@@ -89,7 +94,7 @@ class Commitment:
     def settle(self, travel_m: float, belief: Belief) -> list[Settled]:
         """Give up what waited too long; commit the best cluster if it is good enough, with all that agrees with it."""
         out = [Settled(w.key, w.hypothesis, lack=Lack.UNSUPPORTED) for w in self._expire(travel_m)]
-        return out + self._commit_all(belief, self._config.span_per_efold_m)
+        return out + self._commit_all(belief, SPAN_PER_EFOLD_M)
 
     def flush(self, belief: Belief) -> list[Settled]:
         """At the end: go once more through all that found no cluster, by the rule of a narrow gate.
@@ -112,7 +117,7 @@ class Commitment:
 
     def _expire(self, travel_m: float) -> list[Waiting]:
         """Take out what has waited too long, and remember it for the end."""
-        old = [w for w in self._queue if travel_m - self._travel(w.hypothesis.probe) > self._config.wait_m]
+        old = [w for w in self._queue if travel_m - self._travel(w.hypothesis.probe) > WAIT_M]
         self._keep([i for i, w in enumerate(self._queue) if w not in old])
         self._given_up += old
         return old
@@ -142,11 +147,10 @@ class Commitment:
 
     def _asked(self, cluster: Cluster, rival: float, span_per_efold_m: float) -> tuple[Check, ...]:
         """What a cluster is held against; `rival`: score of the best one that contradicts it."""
-        c = self._config
-        wider = max(0.0, float(np.log(max(cluster.sigma_m, 1e-9) / c.sure_sigma_m)))
-        probes = c.probes if wider > 0.0 else max(c.probes - 1, 1)
-        span_m = c.span_m + span_per_efold_m * wider
-        return checks.of_cluster(cluster.probes, probes, cluster.span_m, span_m, rival / max(cluster.score, 1e-9), c)
+        wider = max(0.0, float(np.log(max(cluster.sigma_m, 1e-9) / SURE_SIGMA_M)))
+        probes = PROBES if wider > 0.0 else PROBES - 1
+        span_m = SPAN_M + span_per_efold_m * wider
+        return checks.of_cluster(cluster.probes, probes, cluster.span_m, span_m, rival / max(cluster.score, 1e-9))
 
     def _commit(self, ripe: Ripe) -> list[Settled]:
         """Accept everything that agrees with all members; refuse what contradicts most of them."""

@@ -40,19 +40,18 @@ class LaserFrontEnd:
 
     def __init__(self, config: VisionConfig, laser: Laser) -> None:
         """Start without a node."""
-        self._config = config.laser
+        self._config, self._profile_width = config.laser, config.profile.width
         self._laser = laser
-        self._atlas = Atlas(self._config)
-        self._tracker = Tracker(self._config, self._atlas)
-        self._prober = Prober(self._config, self._atlas, laser)
+        self._atlas = Atlas()
+        self._tracker = Tracker(self._atlas)
+        self._prober = Prober(self._config.probes, self._atlas, laser)
         self._reviser = Reviser(self._config, self._atlas, laser)
-        self._commitment = Commitment(self._config.commitment, self._atlas.travel_m.__getitem__)
-        t, m = config.templates, config.matching
-        self._templates = ViewTemplates(t.threshold, t.stable_frames, t.max_shift, m.mu_r, m.mu_d)
+        self._commitment = Commitment(self._atlas.travel_m.__getitem__)
+        self._templates = ViewTemplates(config.profile.width // 16, config.matching.mu_r, config.matching.mu_d)
         self._profiles: list[NDArray[np.float32]] = []
-        self._continuity = Continuity(self._config, self._atlas, laser, self._tracker)
-        self._whole_map = WholeMap(self._config, self._atlas, self._prober, self._continuity, self._profiles, self._next_key)
-        self._retracer = Retracer(self._config, self._atlas, laser)
+        self._continuity = Continuity(config, self._atlas, laser, self._tracker)
+        self._whole_map = WholeMap(config, self._atlas, self._prober, self._continuity, self._profiles, self._next_key)
+        self._retracer = Retracer(self._atlas, laser)
         self._scans: list[SeenScan] = []
         self._steps: list[Array] = []
         self._between: list[SeenScan] = []
@@ -71,7 +70,7 @@ class LaserFrontEnd:
         if frame.ranges_m.shape != self._laser.bearings_rad.shape:
             raise StreamError(f"laser: expected {len(self._laser.bearings_rad)} ranges, found {frame.ranges_m.shape}")
         self._scans.append(SeenScan(frame, len(self._profiles) - 1, np.array(delta_node_robot, dtype=np.float64)))
-        profile = laser_profile(frame.ranges_m, self._laser.bearings_rad, self._config.scan.profile_width)
+        profile = laser_profile(frame.ranges_m, self._laser.bearings_rad, self._profile_width)
         if not self._config.scan.templates:
             return View(frame.stamp_ns, profile, -1, False)
         seen = self._templates.recognise(profile)
@@ -160,7 +159,7 @@ class LaserFrontEnd:
         return self._keys - 1
 
     def _cloud(self, scan: LaserScan) -> Cloud:
-        return cloud_of_scan(scan.ranges_m, self._laser, self._config.scan)
+        return cloud_of_scan(scan.ranges_m, self._laser)
 
     def _clouds_between(self) -> Iterator[tuple[Array, Cloud]]:
         return ((seen.motion, self._cloud(seen.scan)) for seen in self._between)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridmap.config.laser import LaserConfig
+from hybridmap.config.vision import ProbeConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, invert_relative, wrap_angle
 from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, passed
 from hybridmap.streams.laser import Laser
@@ -18,6 +18,27 @@ from hybridmap.vision.laser.registration import align, ambiguity_of
 from hybridmap.vision.laser.submap import Atlas, Field, Submap
 from hybridmap.vision.laser.visibility import violation_both_ways
 
+LENGTH_M = 10.0
+"""Travel that a probe covers, m: long enough that a corner or a door is in it."""
+TARGET_EVERY_M, TARGET_HALF_M = 4.0, 6.0
+"""Travel between the anchors of old submaps, and that a submap covers to either side, m: a probe fits wholly into one."""
+POINTS = 120
+"""Points of a probe that score the starts."""
+GATE_INFLATION = 4.0
+"""Factor on the deviations of the gate: a chain bends more than the covariances of its edges, taken as independent, have it."""
+GATE_M, GATE_DEG = 2.5, 4.0
+"""Width of the gate beside that, m and degrees: submaps see as far."""
+WINDOW_M = 3.5
+"""A target is searched this far about its anchor; the next anchors take over beyond it, m."""
+TARGETS = 16
+"""Old submaps that are searched more closely, the likeliest."""
+MODES_PER_TARGET, MODES, MODES_SURE, MODES_ANYWHERE = 2, 6, 3, 8
+"""Separated modes that are verified: of a target; of a probe; of one in narrow gates, where one place is in question; of one
+that is held against the whole map."""
+SURE_SIGMA_M = 0.8
+"""A gate is narrow below this standard deviation, m: rooms are farther apart."""
+FLOOR_M, FLOOR_DEG = 0.004, 0.04
+"""Standard deviations of the registration of two submaps at least, m and degrees: what their bending hides."""
 REGISTERED_POINTS = 400
 UNKNOWN = 1e8
 SAME_M, SAME_RAD = 0.3, 0.1
@@ -106,7 +127,7 @@ class _Mode:
 class Prober:
     """Proposes and measures hypotheses."""
 
-    def __init__(self, config: LaserConfig, atlas: Atlas, laser: Laser) -> None:
+    def __init__(self, config: ProbeConfig, atlas: Atlas, laser: Laser) -> None:
         self._config = config
         self._atlas = atlas
         self._laser = laser
@@ -120,26 +141,26 @@ class Prober:
             belief: gives the gate.
             since: only submaps about this node and later ones are searched.
         """
-        c, atlas = self._config.probes, self._atlas
-        recent = atlas.along(node, c.length_m, 0.0)
+        atlas = self._atlas
+        recent = atlas.along(node, LENGTH_M, 0.0)
         recent = recent[recent <= node]
         middle = 0.5 * (atlas.travel_m[int(recent[0])] + atlas.travel_m[node])
         probe = atlas.submap(int(recent[np.searchsorted(np.asarray(atlas.travel_m)[recent], middle)]), recent)
         gates = self._gates(probe.anchor, int(recent[0]), since, belief)
         modes = self._search(gates, probe)
-        sure = all(mode.gate.sigma_m < self._config.commitment.sure_sigma_m for mode in modes)
-        return _distinct([self._verify(mode, probe, Search.GATE) for mode in modes[: c.modes_sure if sure else c.modes]])
+        sure = all(mode.gate.sigma_m < SURE_SIGMA_M for mode in modes)
+        return _distinct([self._verify(mode, probe, Search.GATE) for mode in modes[: MODES_SURE if sure else MODES]])
 
     def probe_anywhere(self, probe: Submap, anchors: Sequence[int]) -> list[Hypothesis]:
         """Hold a submap against those about some anchors, wherever the map has it and whatever its heading."""
         gates = [_Gate(anchor, IDENTITY, UNKNOWN, np.pi, UNKNOWN) for anchor in anchors]
-        modes = self._search(gates, probe)[: self._config.relocalising.modes]
+        modes = self._search(gates, probe)[:MODES_ANYWHERE]
         return _distinct([self._verify(mode, probe, Search.WHOLE_MAP) for mode in modes])
 
     def anchors_before(self, node: int) -> list[int]:
         """Anchors of old submaps that lie wholly before a node."""
         self._extend_anchors()
-        atlas, half_m = self._atlas, self._config.probes.target_half_m
+        atlas, half_m = self._atlas, TARGET_HALF_M
         limit = atlas.travel_m[node] - half_m
         first = atlas.piece(node).start
         return [a for a in self._anchors if a < first or (a < node and atlas.travel_m[a] < limit)]
@@ -148,13 +169,13 @@ class Prober:
         """Promising starts on the likeliest targets, the best first."""
         candidates = [self._candidate(gate, probe) for gate in gates]
         candidates = sorted((k for k in candidates if k.starts), key=lambda k: -k.starts[0].score)
-        chosen = candidates[: self._config.probes.targets]
+        chosen = candidates[:TARGETS]
         return sorted((mode for k in chosen for mode in self._modes(k, probe)), key=lambda m: -m.score)
 
     def _extend_anchors(self) -> None:
         travel = self._atlas.travel_m
         while True:
-            wanted = travel[self._anchors[-1]] + self._config.probes.target_every_m if self._anchors else 0.0
+            wanted = travel[self._anchors[-1]] + TARGET_EVERY_M if self._anchors else 0.0
             after = int(np.searchsorted(travel, wanted))
             if after >= len(travel):
                 return
@@ -162,16 +183,15 @@ class Prober:
 
     def _gates(self, center: int, oldest: int, since: int, belief: Belief) -> list[_Gate]:
         """Targets that lie wholly before the probe and inside the gate; the gate follows the covariance and has no cap."""
-        c = self._config.probes
         anchors = [a for a in self.anchors_before(oldest) if a >= since]
         if not anchors:
             return []
-        covariance = c.gate_inflation**2 * np.nan_to_num(belief.covariance_from(center)[anchors], posinf=UNKNOWN)
+        covariance = GATE_INFLATION**2 * np.nan_to_num(belief.covariance_from(center)[anchors], posinf=UNKNOWN)
         sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:, :2, :2])[:, 1])
-        radius = c.gate_sigmas * sigma_m + c.gate_m
-        heading = c.gate_sigmas * np.sqrt(covariance[:, 2, 2]) + np.deg2rad(c.gate_deg)
+        radius = self._config.gate_sigmas * sigma_m + GATE_M
+        heading = self._config.gate_sigmas * np.sqrt(covariance[:, 2, 2]) + np.deg2rad(GATE_DEG)
         expected = between(belief.poses_map_node[anchors], belief.poses_map_node[center])
-        inside = np.hypot(expected[:, 0], expected[:, 1]) <= radius + c.window_m
+        inside = np.hypot(expected[:, 0], expected[:, 1]) <= radius + WINDOW_M
         return [
             _Gate(anchors[i], expected[i], float(radius[i]), float(min(heading[i], np.pi)), float(sigma_m[i]))
             for i in np.flatnonzero(inside)
@@ -179,45 +199,43 @@ class Prober:
 
     def _candidate(self, gate: _Gate, probe: Submap) -> _Candidate:
         """The best starts on the part of the gate that this target answers for."""
-        c = self._config.probes
-        target = self._atlas.around(gate.anchor, c.target_half_m)
-        offsets = square(c.window_m, 2.0 * STEP_M)
-        inside = (np.hypot(offsets[:, 0], offsets[:, 1]) <= c.window_m) & (
+        target = self._atlas.around(gate.anchor, TARGET_HALF_M)
+        offsets = square(WINDOW_M, 2.0 * STEP_M)
+        inside = (np.hypot(offsets[:, 0], offsets[:, 1]) <= WINDOW_M) & (
             np.hypot(*(offsets - gate.expected[:2]).T) <= gate.radius_m
         )
         if not inside.any():
             return _Candidate(gate, target, [])
         headings = gate.expected[2] + np.deg2rad(spaced(np.rad2deg(gate.heading_rad), 2.0 * STEP_DEG))
-        points = probe.cloud.thinned(c.points // 2).points
+        points = probe.cloud.thinned(POINTS // 2).points
         wide = self._atlas.scoring_field(target, Field.WIDE)
         return _Candidate(gate, target, survivors(wide, points, offsets[inside], headings))
 
     def _modes(self, candidate: _Candidate, probe: Submap) -> list[_Mode]:
         """Separated maxima of the likelihood on one target."""
-        c = self._config.probes
         sharp = self._atlas.scoring_field(candidate.target, Field.SHARP)
-        starts = sharpened(sharp, probe.cloud.thinned(c.points).points, candidate.starts, c.modes_per_target)
+        starts = sharpened(sharp, probe.cloud.thinned(POINTS).points, candidate.starts, MODES_PER_TARGET)
         return [_Mode(candidate.gate, candidate.target, start.pose, start.score) for start in starts]
 
     def _verify(self, mode: _Mode, probe: Submap, search: Search) -> Hypothesis:
-        c, gate = self._config.probes, mode.gate
+        gate = mode.gate
         cloud, field = probe.cloud.thinned(REGISTERED_POINTS), self._atlas.fine_field(mode.target)
-        alignment = align(field, cloud, mode.pose[None], self._config.registration)
+        alignment = align(field, cloud, mode.pose[None])
         pose, near, fit = alignment.poses[0], float(alignment.near[0]), float(alignment.fit[0])
-        covariance = alignment.covariance(0, self._config.registration, c.floor_m, np.deg2rad(c.floor_deg))
+        covariance = alignment.covariance(0, FLOOR_M, np.deg2rad(FLOOR_DEG))
         loosest_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1]))
         figures = {"start": mode.score, "inliers": float(alignment.inliers[0]), "rms_m": float(alignment.rms_m[0])}
-        asked, seen = checks.of_fit(near, fit, c), 0.0
+        asked, seen = checks.of_fit(near, fit, self._config.fit_min), 0.0
         fits = passed(asked)
         if search is Search.GATE:
             figures["gate_sigma_m"] = gate.sigma_m
             off_m = float(np.hypot(*(pose - gate.expected)[:2]))
             off_deg = float(np.rad2deg(abs(wrap_angle(pose[2] - gate.expected[2]))))
             asked += checks.of_gate(off_m, off_deg, gate.radius_m, np.rad2deg(gate.heading_rad))
-        asked += checks.of_place(loosest_m, ambiguity_of(field, cloud, alignment), c)
+        asked += checks.of_place(loosest_m, ambiguity_of(field, cloud, alignment))
         if passed(asked):
             seen = violation_both_ways(probe, mode.target, pose, self._atlas.ranges, self._laser)
-            asked += checks.of_free_space(seen, c)
+            asked += checks.of_free_space(seen)
         relative = invert_relative(self._atlas.joining(gate.anchor, pose, covariance, probe.anchor))
         return Hypothesis(
             probe.anchor, gate.anchor, relative, near * fit, gate.sigma_m, search, asked, figures, fits, 1.0 - fit + seen

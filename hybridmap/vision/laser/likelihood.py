@@ -8,7 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.geometry import Array, wrap_angle
-from hybridmap.vision.laser.cloud import Cloud
+from hybridmap.vision.laser.cloud import CELL_M, Cloud
+
+REACH_M = 0.3
+"""A point farther than this from every target point has no partner, m: a chair's width, less than a corridor's."""
+FIELD_SIGMA_M = 0.12
+"""Width of the likelihood field on which starts are scored, m: about a step of the grid of starts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +52,13 @@ def _bounded(cells: Array, low: int, high: int) -> NDArray[np.int64]:
     return cells.astype(np.int64)
 
 
-def build_field(cloud: Cloud, cell_m: float, reach_m: float, sigma_m: float, search_m: float = 0.0) -> LikelihoodField:
+def build_field(
+    cloud: Cloud,
+    cell_m: float = CELL_M,
+    reach_m: float = REACH_M,
+    sigma_m: float = FIELD_SIGMA_M,
+    search_m: float = 0.0,
+) -> LikelihoodField:
     """Grow every point with a normal into its surroundings, the far cells first so that the nearest point wins.
 
     Args:

@@ -8,11 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.laser import RegistrationConfig
 from hybridmap.geometry import Array, compose
 from hybridmap.vision.laser.cloud import Cloud
 from hybridmap.vision.laser.likelihood import LikelihoodField, ambiguity
 
+CAUCHY_SCALE_M = 0.05
+"""Residual at which a partner's weight is halved, m: the size of a cell."""
+ITERATIONS = 20
+"""Most iterations; a good start needs less than half of them."""
+INLIER_M = 0.1
+"""Largest point-to-line residual of an inlier, m: two cells."""
+SIGMA_M = 0.01
+"""Standard deviation of a point's residual at least, m: the noise of a laser."""
+SPURIOUS = 0.04
+"""Share of the inliers whose information along any direction is not believed: normals err by some 10 degrees."""
 CONVERGED = 5e-4
 LEAST = 1e-6
 WEAKEST_INFORMATION = (1.0, 1.0, 4.0)
@@ -49,14 +58,14 @@ class Alignment:
     rms_m: Array
     points: int
 
-    def covariance(self, k: int, config: RegistrationConfig, floor_m: float, floor_rad: float) -> Array:
+    def covariance(self, k: int, floor_m: float, floor_rad: float) -> Array:
         """Covariance (3, 3) of registration k in the moving frame: loose along a bare corridor, never below the floors.
 
         The variance of the residuals times the inverse Hessian, as for least squares with independent points; the floors
         stand for what residuals do not show: a target that is itself bent.
         """
-        variance = max(config.sigma_m, float(self.rms_m[k])) ** 2
-        trusted = self._without_spurious(k, config.spurious)
+        variance = max(SIGMA_M, float(self.rms_m[k])) ** 2
+        trusted = self._without_spurious(k, SPURIOUS)
         covariance = np.linalg.inv(trusted / variance + np.diag(WEAKEST_INFORMATION))
         floor = np.diag([floor_m**2, floor_m**2, floor_rad**2])
         return np.asarray(0.5 * (covariance + covariance.T) + floor)
@@ -107,30 +116,27 @@ class _Partners:
     has: NDArray[np.bool_]
 
 
-def align(
-    field: LikelihoodField, cloud: Cloud, starts: Array, config: RegistrationConfig, prior: Prior | None = None
-) -> Alignment:
+def align(field: LikelihoodField, cloud: Cloud, starts: Array, prior: Prior | None = None) -> Alignment:
     """Register a cloud from K starts: Gauss-Newton on point-to-line residuals with Cauchy weights.
 
     Args:
         field: the target.
         cloud: P points in the moving frame.
         starts: (K, 3) poses of the moving frame in the target's.
-        config: scale, iterations, inlier limit.
         prior: holds the pose where the walls leave it free; it is no part of `hessian`.
     """
     poses = np.array(starts, dtype=np.float64)
     moving = _Moving(*(np.ascontiguousarray(a[..., i]) for a in (cloud.points, cloud.normals) for i in (0, 1)))
-    scale = 2.0 * config.cauchy_scale_m
-    for iteration in range(config.iterations):
+    scale = 2.0 * CAUCHY_SCALE_M
+    for iteration in range(ITERATIONS):
         hessian, gradient = _normal_equations(_partners(field, moving, poses), scale)
         steps = _newton_steps(hessian, gradient, poses, prior)
         poses = compose(poses, steps.clip(-0.3, 0.3))
         if iteration >= 2:
-            scale = config.cauchy_scale_m
+            scale = CAUCHY_SCALE_M
             if np.abs(steps).max() < CONVERGED:
                 break
-    return _judge(_partners(field, moving, poses), poses, config)
+    return _judge(_partners(field, moving, poses), poses)
 
 
 def _partners(field: LikelihoodField, moving: _Moving, poses: Array) -> _Partners:
@@ -184,8 +190,8 @@ def _solved(h: list[list[float]], g: list[float]) -> list[float]:
     return [-g[0] / h[0][0] - l1 * z1 - l2 * z2, z1, z2]
 
 
-def _judge(partners: _Partners, poses: Array, config: RegistrationConfig) -> Alignment:
-    inlier = partners.has & (np.abs(partners.residual) < config.inlier_m)
+def _judge(partners: _Partners, poses: Array) -> Alignment:
+    inlier = partners.has & (np.abs(partners.residual) < INLIER_M)
     count, near = inlier.sum(axis=1), partners.has.sum(axis=1)
     n = max(partners.has.shape[1], 1)
     jacobian = partners.jacobian * inlier[:, None]

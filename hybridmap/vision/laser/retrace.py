@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.laser import LaserConfig
 from hybridmap.geometry import Array, between, compose, interpolate, wrap_angle
 from hybridmap.streams.laser import Laser, LaserScan
 from hybridmap.trajectory import Anchors, anchors_on
@@ -17,6 +16,16 @@ from hybridmap.vision.laser.likelihood import build_field
 from hybridmap.vision.laser.registration import Prior, align
 from hybridmap.vision.laser.submap import Atlas
 
+BLOCK_NODES = 8
+"""Consecutive nodes whose scans share one local map: they see much the same."""
+RADIUS_M, MAP_NODES = 6.0, 60
+"""Nodes of the local map lie this near its middle, m, and are the nearest so many: enough walls, and little time."""
+PRIOR_M, PRIOR_DEG = 0.02, 6.0
+"""Standard deviations of what the wheels give between two nodes, m and degrees: they drift in heading, hardly in distance."""
+INLIERS_MIN = 0.6
+"""Least share of inliers of a scan that is believed: as of a good registration of a node."""
+OFF_MAX_M, OFF_MAX_DEG = 0.3, 17.0
+"""Largest correction that is believed, m and degrees: half a step between nodes."""
 TURN_AS_TRAVEL_M = 0.3
 NOWHERE_M = 1e6
 
@@ -33,8 +42,7 @@ class SeenScan:
 class Retracer:
     """Registers scans to the map, block of nodes by block."""
 
-    def __init__(self, config: LaserConfig, atlas: Atlas, laser: Laser) -> None:
-        self._config = config
+    def __init__(self, atlas: Atlas, laser: Laser) -> None:
         self._atlas = atlas
         self._laser = laser
 
@@ -55,7 +63,7 @@ class Retracer:
         for first, stop in self._blocks():
             block = np.flatnonzero((nodes >= first) & (nodes < stop))
             if len(block):
-                clouds = clouds_of_scans([scans[i].scan.ranges_m for i in block.tolist()], self._laser, self._config.scan)
+                clouds = clouds_of_scans([scans[i].scan.ranges_m for i in block.tolist()], self._laser)
                 found[block], good[block] = self._register(clouds, expected[block], poses[first:stop], poses)
         for piece in self._atlas.pieces[1:]:
             good[(nodes == piece.start - 1) & (_way(motions) > 0.0)] = False
@@ -64,25 +72,23 @@ class Retracer:
 
     def _blocks(self) -> list[tuple[int, int]]:
         """First and one past the last node of each block; none of them goes beyond a piece of the chain."""
-        size = self._config.retrace.block_nodes
+        size = BLOCK_NODES
         return [(first, min(first + size, p.stop)) for p in self._atlas.pieces for first in range(p.start, p.stop, size)]
 
     def _register(self, clouds: list[Cloud], expected: Array, block: Array, poses: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Poses (K, 3) of a block's scans, and which of them are to be believed."""
-        c = self._config.retrace
         distance = np.hypot(*(poses[:, :2] - block[:, :2].mean(axis=0)).T)
-        near = np.argsort(distance, kind="stable")[: c.map_nodes]
-        near = np.union1d(near[distance[near] < c.radius_m], np.argsort(distance, kind="stable")[:1])
-        cell, settings = self._config.scan.cell_m, self._config.registration
-        local = merged_at([self._atlas.clouds[i] for i in near.tolist()], poses[near], cell)
-        field = build_field(local, cell, settings.reach_m, settings.field_sigma_m)
+        near = np.argsort(distance, kind="stable")[:MAP_NODES]
+        near = np.union1d(near[distance[near] < RADIUS_M], np.argsort(distance, kind="stable")[:1])
+        local = merged_at([self._atlas.clouds[i] for i in near.tolist()], poses[near])
+        field = build_field(local)
         stack, counts = _stacked(clouds)
-        prior = Prior(expected, c.prior_m, float(np.deg2rad(c.prior_deg)))
-        alignment = align(field, stack, expected, settings, prior)
+        prior = Prior(expected, PRIOR_M, float(np.deg2rad(PRIOR_DEG)))
+        alignment = align(field, stack, expected, prior)
         inliers = alignment.inliers * stack.points.shape[1] / np.maximum(counts, 1)
         off = between(expected, alignment.poses)
-        close = (np.hypot(off[:, 0], off[:, 1]) < c.off_max_m) & (np.abs(off[:, 2]) < np.deg2rad(c.off_max_deg))
-        return alignment.poses, np.asarray(close & (inliers >= c.inliers_min))
+        close = (np.hypot(off[:, 0], off[:, 1]) < OFF_MAX_M) & (np.abs(off[:, 2]) < np.deg2rad(OFF_MAX_DEG))
+        return alignment.poses, np.asarray(close & (inliers >= INLIERS_MIN))
 
 
 def _stacked(clouds: list[Cloud]) -> tuple[Cloud, NDArray[np.int64]]:

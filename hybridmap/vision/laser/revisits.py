@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.laser import LaserConfig
+from hybridmap.config.vision import LaserConfig
 from hybridmap.geometry import Array, between, invert_relative, wrap_angle
 from hybridmap.graph.edges import Search, passed
 from hybridmap.streams.laser import Laser
@@ -16,6 +16,21 @@ from hybridmap.vision.laser.likelihood import score_starts, spaced, square
 from hybridmap.vision.laser.registration import Prior, align, ambiguity_of
 from hybridmap.vision.laser.submap import Atlas, Field
 from hybridmap.vision.laser.visibility import violation_both_ways
+
+RADIUS_M = 2.5
+"""Nodes nearer than this are registered again, m: they see the same room."""
+EVERY_M = 1.0
+"""Travel between two nodes that take part, m."""
+APART_M, PARTNERS = 12.0, 3
+"""Travel between two passes, m, and most earlier passes that a node is registered to."""
+PROBE_HALF_M, TARGET_HALF_M = 1.5, 4.0
+"""Travel about the node whose scans are registered, and about the partner to whose scans, m: short, so that neither bends."""
+SEARCH_M, SEARCH_DEG = 0.45, 4.5
+"""Half-widths of the grid of starts, m and degrees: how far an optimised map still is off."""
+AMBIGUOUS_M = 1.5
+"""Standard deviation along a direction in which a registration is ambiguous, m."""
+FLOOR_M, FLOOR_DEG = 0.002, 0.025
+"""Standard deviations of such a registration at least, m and degrees."""
 
 
 class Reviser:
@@ -50,50 +65,49 @@ class Reviser:
     def _grid(self) -> NDArray[np.int64]:
         """Nodes about every so many metres of travel."""
         travel = np.asarray(self._atlas.travel_m)
-        wanted = np.arange(0.0, travel[-1] + 1e-9, self._config.revisits.every_m)
+        wanted = np.arange(0.0, travel[-1] + 1e-9, EVERY_M)
         return np.unique(np.searchsorted(travel, wanted).clip(0, len(travel) - 1))
 
     def _partners(self, node: int, grid: NDArray[np.int64], poses: Array) -> list[int]:
         """Nearest older node of each earlier pass, at most a few."""
-        c, travel = self._config.revisits, self._atlas.travel_m
+        travel = self._atlas.travel_m
         old = grid[: np.searchsorted(grid, node)]
         distance = np.hypot(*(poses[old, :2] - poses[node, :2]).T)
-        near = [int(i) for i in np.argsort(distance, kind="stable") if distance[i] < c.radius_m]
+        near = [int(i) for i in np.argsort(distance, kind="stable") if distance[i] < RADIUS_M]
         chosen: list[int] = []
         for i in near:
             other = int(old[i])
-            apart = [abs(travel[other] - travel[o]) > c.apart_m for o in chosen]
-            if travel[node] - travel[other] > c.apart_m and all(apart):
+            apart = [abs(travel[other] - travel[o]) > APART_M for o in chosen]
+            if travel[node] - travel[other] > APART_M and all(apart):
                 chosen.append(other)
-        return [o for o in chosen[: c.partners] if (node, o) not in self._done]
+        return [o for o in chosen[:PARTNERS] if (node, o) not in self._done]
 
     def register(self, node: int, other: int, poses: Array, search: Search = Search.NEAR) -> Hypothesis:
         """Register the scans about a node to those about an older one, from where the poses (N, 3) have them; `search`: why."""
-        c, settings = self._config.revisits, self._config.registration
-        target, probe = self._atlas.around(other, c.target_half_m), self._atlas.around(node, c.probe_half_m)
+        target, probe = self._atlas.around(other, TARGET_HALF_M), self._atlas.around(node, PROBE_HALF_M)
         sharp, fine = self._atlas.scoring_field(target, Field.SHARP), self._atlas.fine_field(target)
         expected = between(poses[other], poses[node])
-        offsets = square(c.search_m, 0.15)
-        headings = expected[2] + np.deg2rad(spaced(c.search_deg, 1.5))
+        offsets = square(SEARCH_M, 0.15)
+        headings = expected[2] + np.deg2rad(spaced(SEARCH_DEG, 1.5))
         scores = score_starts(sharp, probe.cloud.thinned(100).points, expected[:2], headings, offsets)
         h, t = np.unravel_index(int(np.argmax(scores)), scores.shape)
         start = np.array([*(expected[:2] + offsets[t]), headings[h]])
         prior = Prior(expected, 1.0, 0.2)
-        alignment = align(fine, probe.cloud.thinned(300), start[None], settings, prior)
-        covariance = alignment.covariance(0, settings, c.floor_m, np.deg2rad(c.floor_deg))
+        alignment = align(fine, probe.cloud.thinned(300), start[None], prior)
+        covariance = alignment.covariance(0, FLOOR_M, np.deg2rad(FLOOR_DEG))
         pose = alignment.poses[0]
         near, fit, off = float(alignment.near[0]), float(alignment.fit[0]), pose - expected
         ambiguity = ambiguity_of(fine, probe.cloud, alignment)
-        if ambiguity > self._config.probes.ambiguity_max:
+        if ambiguity > checks.AMBIGUITY_MAX:
             weakest = alignment.weakest_direction(0)
-            covariance[:2, :2] += c.ambiguous_m**2 * np.outer(weakest, weakest)
-        asked, seen = checks.of_fit(near, fit, self._config.probes), 0.0
+            covariance[:2, :2] += AMBIGUOUS_M**2 * np.outer(weakest, weakest)
+        asked, seen = checks.of_fit(near, fit, self._config.probes.fit_min), 0.0
         fits = passed(asked)
         off_deg = float(np.rad2deg(abs(wrap_angle(off[2]))))
         asked += checks.of_gate(np.hypot(*off[:2]), off_deg, checks.OFF_MAX_M, checks.OFF_MAX_DEG)
         if passed(asked):
             seen = violation_both_ways(probe, target, pose, self._atlas.ranges, self._laser)
-            asked += checks.of_free_space(seen, self._config.probes)
+            asked += checks.of_free_space(seen)
         relative = invert_relative(self._atlas.joining(other, pose, covariance, node))
         figures = {"ambiguity": ambiguity}
         return Hypothesis(node, other, relative, near * fit, 0.0, search, asked, figures, fits, 1.0 - fit + seen)

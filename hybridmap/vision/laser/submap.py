@@ -13,7 +13,6 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.laser import LaserConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose_relative
 from hybridmap.vision.laser.cloud import Cloud, merged_at
 from hybridmap.vision.laser.likelihood import LikelihoodField, build_field
@@ -88,8 +87,7 @@ class Atlas:
         travel_m: path length along the chain.
     """
 
-    def __init__(self, config: LaserConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self._submaps: _Recent[Span, Submap] = _Recent(SUBMAPS_KEPT)
         self._fine: _Recent[Span, LikelihoodField] = _Recent(FINE_KEPT)
         self._scoring: dict[Field, _Recent[Span, LikelihoodField]] = {kind: _Recent(kind.value[3]) for kind in Field}
@@ -154,7 +152,7 @@ class Atlas:
         """Merge the clouds of some nodes in the frame of an anchor."""
         numbers = np.asarray(nodes, dtype=np.int64)
         poses = between(self.chain[anchor], np.array([self.chain[i] for i in numbers]).reshape(-1, 3))
-        cloud = merged_at([self.clouds[i] for i in numbers.tolist()], poses, self._config.scan.cell_m)
+        cloud = merged_at([self.clouds[i] for i in numbers.tolist()], poses)
         return Submap(anchor, numbers, poses, cloud)
 
     def around(self, anchor: int, half_m: float) -> Submap:
@@ -171,11 +169,7 @@ class Atlas:
 
     def fine_field(self, target: Submap) -> LikelihoodField:
         """The field of a submap to which clouds are registered."""
-        settings, cell_m = self._config.registration, self._config.scan.cell_m
-        return self._fine.get(
-            _span(target.anchor, target.nodes),
-            lambda: build_field(target.cloud, cell_m, settings.reach_m, settings.field_sigma_m),
-        )
+        return self._fine.get(_span(target.anchor, target.nodes), lambda: build_field(target.cloud))
 
 
 def _span(anchor: int, nodes: NDArray[np.int64]) -> Span:

@@ -7,15 +7,45 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridmap.config.laser import LaserConfig, SearchConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, wrap_angle
 from hybridmap.graph.edges import Check, passed
 from hybridmap.vision.laser import checks
-from hybridmap.vision.laser.cloud import Cloud, merged
+from hybridmap.vision.laser.cloud import CELL_M, Cloud, merged
 from hybridmap.vision.laser.likelihood import LikelihoodField, build_field, score_starts, spaced, square
 from hybridmap.vision.laser.registration import Alignment, Prior, align
 from hybridmap.vision.laser.submap import Atlas
 
+SUBMAP_NODES = 25
+"""Nodes in the submap: some 12 m of way, in which the chain hardly bends."""
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A grid of starts about the odometry, and how sure the odometry is taken to be.
+
+    Attributes:
+        half_m, half_deg: half-widths of the grid.
+        prior_m, prior_deg: standard deviations of the odometry as prior of the registration.
+    """
+
+    half_m: float
+    half_deg: float
+    prior_m: float
+    prior_deg: float
+
+
+NARROW = Window(half_m=0.2, half_deg=8.0, prior_m=0.1, prior_deg=5.0)
+"""First search: usual wheels over half a metre."""
+WIDE = Window(half_m=0.45, half_deg=40.0, prior_m=0.1, prior_deg=40.0)
+"""Second search, when the first is weak or contradicts the odometry: drop-outs of wheels are mostly of heading."""
+LOST = Window(half_m=1.0, half_deg=60.0, prior_m=0.7, prior_deg=60.0)
+"""Last search, when the scans between the nodes did not help either."""
+INLIERS_SURE = 0.75
+"""Least share of inliers at which a registration may contradict the odometry without further search."""
+CONTRADICTION_M, CONTRADICTION_DEG = 0.15, 3.0
+"""A good registration this far from the odometry drops the odometry edge: several times what wheels err over a step."""
+FLOOR_M, FLOOR_DEG = 0.001, 0.02
+"""Standard deviations of a node's place in the submap at least, m and degrees: what residuals do not show."""
 SCORED_POINTS = 90
 WIDE_GAIN, LOST_GAIN = 0.03, 0.1
 
@@ -48,8 +78,7 @@ class Step:
 class Tracker:
     """Registers each new node to the submap of the last ones."""
 
-    def __init__(self, config: LaserConfig, atlas: Atlas) -> None:
-        self._config = config
+    def __init__(self, atlas: Atlas) -> None:
         self._atlas = atlas
 
     def step(self, cloud: Cloud, odometry: RelativePose, between_nodes: Callable[[], Iterable[tuple[Array, Cloud]]]) -> Step:
@@ -60,13 +89,13 @@ class Tracker:
             odometry: its pose in the frame of the last node.
             between_nodes: gives, in order, the scans between the two: motion since the last node and cloud.
         """
-        c, field = self._config.tracking, self._field()
+        field = self._field()
         best = self._search(field, cloud, odometry.delta)
         if self._doubtful(best, odometry.delta):
             stepped = self._step_by_step(field, cloud, odometry.delta, between_nodes())
             best = _better(best, stepped, 0.0)
         if self._doubtful(best, odometry.delta):
-            best = _better(best, self._grid(field, cloud, odometry.delta, c.lost), LOST_GAIN)
+            best = _better(best, self._grid(field, cloud, odometry.delta, LOST), LOST_GAIN)
         return self._judge(best, odometry)
 
     def pair(self, cloud: Cloud, following: Cloud, odometry: Array) -> Alignment:
@@ -74,36 +103,35 @@ class Tracker:
         field = self._field_of(cloud)
         best = self._search(field, following, odometry)
         if self._doubtful(best, odometry):
-            best = _better(best, self._grid(field, following, odometry, self._config.tracking.lost), LOST_GAIN)
+            best = _better(best, self._grid(field, following, odometry, LOST), LOST_GAIN)
         return best
 
     def _doubtful(self, alignment: Alignment, expected: Array) -> bool:
         """Whether a registration is weak, or contradicts the odometry without being very good."""
-        c, inliers = self._config.tracking, alignment.inliers[0]
-        return bool(inliers < c.inliers_min or (inliers < c.inliers_sure and self._contradicts(alignment.poses[0], expected)))
+        inliers = alignment.inliers[0]
+        return bool(
+            inliers < checks.INLIERS_MIN or (inliers < INLIERS_SURE and self._contradicts(alignment.poses[0], expected))
+        )
 
     def _field(self, extra: Sequence[Cloud] = ()) -> LikelihoodField:
         n = len(self._atlas)
-        nodes = range(max(n - self._config.tracking.submap_nodes, self._atlas.piece(n - 1).start), n)
+        nodes = range(max(n - SUBMAP_NODES, self._atlas.piece(n - 1).start), n)
         cloud = self._atlas.submap(n - 1, nodes).cloud
         if extra:
-            cloud = merged([cloud, *extra], self._config.scan.cell_m)
+            cloud = merged([cloud, *extra])
         return self._field_of(cloud)
 
     def _field_of(self, cloud: Cloud) -> LikelihoodField:
-        settings = self._config.registration
-        search = self._config.tracking.lost.half_m + 2 * self._config.scan.cell_m
-        return build_field(cloud, self._config.scan.cell_m, settings.reach_m, settings.field_sigma_m, search)
+        return build_field(cloud, search_m=LOST.half_m + 2 * CELL_M)
 
     def _search(self, field: LikelihoodField, cloud: Cloud, expected: Array) -> Alignment:
         """Narrow first; wide when that is weak or disagrees with the odometry, and then whichever has more inliers."""
-        c = self._config.tracking
-        narrow = self._grid(field, cloud, expected, c.narrow)
-        if narrow.inliers[0] >= c.inliers_min and not self._contradicts(narrow.poses[0], expected):
+        narrow = self._grid(field, cloud, expected, NARROW)
+        if narrow.inliers[0] >= checks.INLIERS_MIN and not self._contradicts(narrow.poses[0], expected):
             return narrow
-        return _better(narrow, self._grid(field, cloud, expected, c.wide), WIDE_GAIN)
+        return _better(narrow, self._grid(field, cloud, expected, WIDE), WIDE_GAIN)
 
-    def _grid(self, field: LikelihoodField, cloud: Cloud, expected: Array, window: SearchConfig) -> Alignment:
+    def _grid(self, field: LikelihoodField, cloud: Cloud, expected: Array, window: Window) -> Alignment:
         sigma_m, sigma_rad = window.prior_m, np.deg2rad(window.prior_deg)
         headings, offsets = np.deg2rad(spaced(window.half_deg, 2.0)), square(window.half_m, 0.1)
         scores = score_starts(field, cloud.thinned(SCORED_POINTS).points, expected[:2], expected[2] + headings, offsets)
@@ -112,7 +140,7 @@ class Tracker:
         h, t = np.unravel_index(int(np.argmax(scores)), scores.shape)
         start = np.array([*(expected[:2] + offsets[t]), expected[2] + headings[h]])
         prior = Prior(expected, sigma_m, float(sigma_rad))
-        return align(field, cloud, start[None], self._config.registration, prior)
+        return align(field, cloud, start[None], prior)
 
     def _step_by_step(
         self, field: LikelihoodField, cloud: Cloud, odometry: Array, between_nodes: Iterable[tuple[Array, Cloud]]
@@ -123,27 +151,25 @@ class Tracker:
         for motion, scan in between_nodes:
             alignment = self._search(field, scan, compose(pose, between(last, motion)))
             pose, last = alignment.poses[0], motion
-            if alignment.inliers[0] >= self._config.tracking.inliers_weak:
+            if alignment.inliers[0] >= checks.INLIERS_WEAK:
                 seen.append(scan.moved(pose))
                 field = self._field(seen)
         return self._search(field, cloud, compose(pose, between(last, odometry)))
 
     def _contradicts(self, pose: Array, expected: Array) -> bool:
-        c = self._config.tracking
         off_m = float(np.hypot(*(pose - expected)[:2]))
-        return off_m > c.contradiction_m or abs(wrap_angle(pose[2] - expected[2])) > np.deg2rad(c.contradiction_deg)
+        return off_m > CONTRADICTION_M or abs(wrap_angle(pose[2] - expected[2])) > np.deg2rad(CONTRADICTION_DEG)
 
     def _judge(self, alignment: Alignment, odometry: RelativePose) -> Step:
-        c = self._config.tracking
         pose, inliers, fit = alignment.poses[0], float(alignment.inliers[0]), float(alignment.fit[0])
         off_m = float(np.hypot(*(pose - odometry.delta)[:2]))
-        asked = checks.of_step(inliers, off_m, c)
+        asked = checks.of_step(inliers, off_m)
         if not passed(asked):
             return Step(odometry, asked, False, inliers, fit, odometry.covariance)
-        covariance = alignment.covariance(0, self._config.registration, c.floor_m, np.deg2rad(c.floor_deg))
+        covariance = alignment.covariance(0, FLOOR_M, np.deg2rad(FLOOR_DEG))
         if self._doubtful(alignment, odometry.delta):
             covariance = covariance + np.diag([0.05**2, 0.05**2, np.deg2rad(1.5) ** 2])
-        wrong = bool(inliers >= c.inliers_min and self._contradicts(pose, odometry.delta))
+        wrong = bool(inliers >= checks.INLIERS_MIN and self._contradicts(pose, odometry.delta))
         edge = self._atlas.joining(len(self._atlas) - 1, pose, covariance)
         return Step(edge, asked, wrong, inliers, fit, covariance)
 

@@ -7,17 +7,30 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybridmap.config.laser import LaserConfig
+from hybridmap.config.vision import VisionConfig
 from hybridmap.graph.edges import Check, Edge, Lack
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import Chain, Whereabouts
 from hybridmap.vision.laser.continuity import RECENT_M, Continuity
-from hybridmap.vision.laser.hypotheses import Hypothesis, Prober
+from hybridmap.vision.laser.hypotheses import LENGTH_M, Hypothesis, Prober
 from hybridmap.vision.laser.submap import Atlas
 from hybridmap.vision.profile import Profile
 from hybridmap.vision.relocalising import Relocaliser, Settlement
 from hybridmap.vision.templates import Matcher
 
+UNRECOGNISED_PROBES = 2
+"""Probes that recognise nothing while the map contradicts what is seen, with none that does between them, after which the
+robot is lost too."""
+SPAN_M = 1.5
+"""Travel that sightings must cover, m: submaps that overlap less than they say something new."""
+FROM_M, OFTEN_M = 0.9, 6.0
+"""Travel since the break from which on the scans since then are held against the whole map, and up to which that is done at
+each node, m; then as often as loops are looked for."""
+SUBMAPS = 100
+"""Old submaps that are searched, at most; where there are more, those whose views are likest."""
+MISFIT = 0.015
+"""Where the scans of the drive fit one another better than so (the share that does not), a sighting that fits as badly as
+elsewhere is a worse one: its mismatch counts for more, in proportion."""
 MISFIT_STEPS = 10
 """Steps for which the usual misfit of scans is taken before any was seen."""
 ALIKE = (0.5, 0.5)
@@ -33,23 +46,23 @@ class WholeMap:
 
     def __init__(
         self,
-        config: LaserConfig,
+        config: VisionConfig,
         atlas: Atlas,
         prober: Prober,
         continuity: Continuity,
         profiles: Sequence[Profile],
         new_key: Callable[[], int],
     ) -> None:
-        self._config = config
+        self._every_m = config.laser.probes.every_m
         self._atlas = atlas
         self._prober = prober
         self._profiles = profiles
         self._new_key = new_key
         self._continuity = continuity
-        self._whereabouts = Whereabouts(config.relocalising.unrecognised_probes)
-        self._relocaliser = Relocaliser(config.relocalising, self._whereabouts, new_key, "vision.laser.relocalising")
-        self._views = Matcher("plain", *ALIKE, max_shift=config.scan.profile_width // 4)
-        self._misfits, self._steps = MISFIT_STEPS * config.relocalising.misfit, MISFIT_STEPS
+        self._whereabouts = Whereabouts(UNRECOGNISED_PROBES if config.relocalising.enabled else 0)
+        self._relocaliser = Relocaliser(self._whereabouts, new_key, SPAN_M)
+        self._views = Matcher("plain", *ALIKE, max_shift=config.profile.max_shift)
+        self._misfits, self._steps = MISFIT_STEPS * MISFIT, MISFIT_STEPS
         self._broken_at: int | None = None
         self._lost_m, self._searched_m = 0.0, -np.inf
 
@@ -97,7 +110,7 @@ class WholeMap:
             return
         elif self._continuity.contradicted(node, belief):
             if not self._whereabouts.lost:
-                self._lost_m = self._atlas.travel_m[node] - self._config.relocalising.from_m
+                self._lost_m = self._atlas.travel_m[node] - FROM_M
             self._whereabouts.unrecognised()
 
     def closed(self) -> list[Edge]:
@@ -117,7 +130,7 @@ class WholeMap:
             return Settlement([])
         self._searched_m = self._atlas.travel_m[node]
         broken = self._broken_at is not None
-        recent = self._atlas.along(node, self._config.probes.length_m if broken else RECENT_M, 0.0)
+        recent = self._atlas.along(node, LENGTH_M if broken else RECENT_M, 0.0)
         anchors = self._prober.anchors_before(self.since if broken else int(recent[0]))
         found = self._prober.probe_anywhere(self._atlas.submap(node, recent), self._likeliest(node, anchors))
         settlement = self._relocaliser.settle([self._sighting(h) for h in found], belief)
@@ -125,14 +138,14 @@ class WholeMap:
 
     def _due(self, node: int) -> bool:
         """Whether the whole map is to be searched: at each node soon after it got lost, then as often as it is probed."""
-        c, travel_m = self._config.relocalising, self._atlas.travel_m[node]
-        if travel_m - self._lost_m <= c.often_m:
-            return travel_m - self._lost_m >= c.from_m
-        return travel_m - self._searched_m >= self._config.probes.every_m
+        travel_m = self._atlas.travel_m[node]
+        if travel_m - self._lost_m <= OFTEN_M:
+            return travel_m - self._lost_m >= FROM_M
+        return travel_m - self._searched_m >= self._every_m
 
     def _likeliest(self, node: int, anchors: list[int]) -> list[int]:
         """All anchors if they are few; else those about the nodes whose views are most like the robot's."""
-        most = self._config.relocalising.submaps
+        most = SUBMAPS
         if len(anchors) <= most:
             return anchors
         for profile in self._profiles[len(self._views.store) :]:
@@ -148,7 +161,7 @@ class WholeMap:
         sighting = h.proposed(self._new_key(), Lack.WAITING)
         if not h.passed:
             return sighting
-        worse = max(1.0, self._config.relocalising.misfit / (self._misfits / self._steps))
+        worse = max(1.0, MISFIT / (self._misfits / self._steps))
         return replace(sighting, figures={**h.figures, "mismatch": worse * h.misfit})
 
     def _found(self, settlement: Settlement, belief: Belief) -> Settlement:

@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
-from hybridmap.config.rgbd import PnpConfig, RegistrationConfig, RgbdClosingConfig
 from hybridmap.graph.edges import Check, at_least, at_most
 
-_REGISTRATION, _PNP, _CLOSING = "vision.rgbd.registration", "vision.rgbd.pnp", "vision.rgbd.closing"
+_MIN_INLIERS = "vision.rgbd.pnp.min_inliers"
+DEPTH_INLIERS_MIN = 0.5
+"""Least share of the points in common view that fit: half of a view may have changed."""
+CONTRADICTION_SIGMA = 8.0
+"""A good registration that differs from odometry by more than this many sigma contradicts it: slips do, drift does not."""
+MIN_INLIERS_ALONE = 30
+"""Fewest keypoints that agree where there is too little depth in common view to refine on."""
+MAX_HEIGHT_M, MAX_TILT_DEG = 0.1, 3.0
+"""The robot stays on the floor: largest change of height, m, and tilt, degrees."""
+REVERSE_M, REVERSE_DEG = 0.1, 2.0
+"""The two directions must give the same pose within this, m and degrees."""
+MAP_INLIERS, MAP_OVERLAP, MAP_POINTS, MAP_SIGMA_M = 0.8, 0.35, 150, 0.05
+"""By depth alone, from the map's guess: least share of the points in common view that fit, least share of a keyframe's points
+that the other one sees, fewest matched points, largest standard deviation in the loosest direction, m. All are stricter than
+with features: one wall fits any other."""
 SURE_INLIERS, SURE_SLACK_M = 0.8, 0.03
 """A registration may contradict odometry only where it fits better than this and is surer than this in every direction."""
 HELD_HEIGHT, HELD_TILT = 3.0, 2.0
@@ -16,18 +29,17 @@ PLAUSIBLE_SIGMA = 16.3**0.5
 """Deviations of the map that one as sure as it says exceeds once in a thousand (3 degrees of freedom)."""
 
 
-def of_step(depth_inliers: float, slack_m: float, odometry_sigma: float, c: RegistrationConfig) -> tuple[Check, ...]:
+def of_step(depth_inliers: float, slack_m: float, odometry_sigma: float) -> tuple[Check, ...]:
     """Of the registration of a new node: its inliers; one that is not sure may not contradict the odometry."""
-    checks = of_depth(depth_inliers, c)
+    checks = of_depth(depth_inliers)
     if not (depth_inliers > SURE_INLIERS and slack_m < SURE_SLACK_M):
-        limit = f"{_REGISTRATION}.contradiction_sigma"
-        checks += (at_most("odometry_sigma", odometry_sigma, c.contradiction_sigma, limit),)
+        checks += (at_most("odometry_sigma", odometry_sigma, CONTRADICTION_SIGMA),)
     return checks
 
 
-def of_depth(depth_inliers: float, c: RegistrationConfig) -> tuple[Check, ...]:
+def of_depth(depth_inliers: float) -> tuple[Check, ...]:
     """Of a registration: the share of the depth in common view that fits."""
-    return (at_least("depth_inliers", depth_inliers, c.min_inliers, f"{_REGISTRATION}.min_inliers"),)
+    return (at_least("depth_inliers", depth_inliers, DEPTH_INLIERS_MIN),)
 
 
 def of_profile(profile_G: float, c_t: float) -> tuple[Check, ...]:
@@ -35,57 +47,53 @@ def of_profile(profile_G: float, c_t: float) -> tuple[Check, ...]:
     return (at_most("profile_G", profile_G, c_t, "vision.matching.c_t"),)
 
 
-def of_matches(matches: int, c: PnpConfig) -> tuple[Check, ...]:
+def of_matches(matches: int, least: int) -> tuple[Check, ...]:
     """Of two views: how many features match."""
-    return (at_least("matches", matches, c.min_inliers, f"{_PNP}.min_inliers"),)
+    return (at_least("matches", matches, least, _MIN_INLIERS),)
 
 
-def of_pose(feature_inliers: int, c: PnpConfig) -> tuple[Check, ...]:
+def of_pose(feature_inliers: int, least: int) -> tuple[Check, ...]:
     """Of a pose by features: how many of them agree on it."""
-    return (at_least("feature_inliers", feature_inliers, c.min_inliers, f"{_PNP}.min_inliers"),)
+    return (at_least("feature_inliers", feature_inliers, least, _MIN_INLIERS),)
 
 
-def of_reverse_pose(feature_inliers_reverse: int, c: PnpConfig) -> tuple[Check, ...]:
+def of_reverse_pose(feature_inliers_reverse: int, least: int) -> tuple[Check, ...]:
     """The same the other way round."""
-    return (at_least("feature_inliers_reverse", feature_inliers_reverse, c.min_inliers, f"{_PNP}.min_inliers"),)
+    return (at_least("feature_inliers_reverse", feature_inliers_reverse, least, _MIN_INLIERS),)
 
 
-def of_plane(
-    height_m: float, tilt_deg: float, reverse_m: float, reverse_deg: float, held: bool, c: PnpConfig
-) -> tuple[Check, ...]:
+def of_plane(height_m: float, tilt_deg: float, reverse_m: float, reverse_deg: float, held: bool) -> tuple[Check, ...]:
     """Of a pose by features: the robot stays on the floor, and both ways round give the same; `held`: the tilt is measured."""
     height, tilt = (HELD_HEIGHT, HELD_TILT) if held else (1.0, 1.0)
     return (
-        at_most("height_m", height_m, c.max_height_m * height, f"{_PNP}.max_height_m"),
-        at_most("tilt_deg", tilt_deg, c.max_tilt_deg * tilt, f"{_PNP}.max_tilt_deg"),
-        at_most("reverse_m", reverse_m, c.agree_m, f"{_PNP}.agree_m"),
-        at_most("reverse_deg", reverse_deg, c.agree_deg, f"{_PNP}.agree_deg"),
+        at_most("height_m", height_m, MAX_HEIGHT_M * height),
+        at_most("tilt_deg", tilt_deg, MAX_TILT_DEG * tilt),
+        at_most("reverse_m", reverse_m, REVERSE_M),
+        at_most("reverse_deg", reverse_deg, REVERSE_DEG),
     )
 
 
-def of_refinement(
-    off_m: float, off_deg: float, depth_inliers: float, pnp: PnpConfig, c: RegistrationConfig
-) -> tuple[Check, ...]:
+def of_refinement(off_m: float, off_deg: float, depth_inliers: float) -> tuple[Check, ...]:
     """Of depth registered from the features' pose: how far it leads away from it, and whether it fits."""
     return (
-        at_most("off_features_m", off_m, REFINED * pnp.agree_m, f"{_PNP}.agree_m"),
-        at_most("off_features_deg", off_deg, REFINED * pnp.agree_deg, f"{_PNP}.agree_deg"),
-        *of_depth(depth_inliers, c),
+        at_most("off_features_m", off_m, REFINED * REVERSE_M),
+        at_most("off_features_deg", off_deg, REFINED * REVERSE_DEG),
+        *of_depth(depth_inliers),
     )
 
 
-def of_features_alone(feature_inliers_both: int, c: PnpConfig) -> tuple[Check, ...]:
+def of_features_alone(feature_inliers_both: int) -> tuple[Check, ...]:
     """Of a pose by features that no depth can object to: more of them must agree, both ways round."""
-    return (at_least("feature_inliers_both", feature_inliers_both, c.min_inliers_alone, f"{_PNP}.min_inliers_alone"),)
+    return (at_least("feature_inliers_both", feature_inliers_both, MIN_INLIERS_ALONE),)
 
 
-def of_depth_alone(depth_inliers: float, overlap: float, points: int, slack_m: float, c: PnpConfig) -> tuple[Check, ...]:
+def of_depth_alone(depth_inliers: float, overlap: float, points: int, slack_m: float) -> tuple[Check, ...]:
     """Of depth registered from where the map has the two views, without features."""
     return (
-        at_least("depth_inliers", depth_inliers, c.map_inliers, f"{_PNP}.map_inliers"),
-        at_least("overlap", overlap, c.map_overlap, f"{_PNP}.map_overlap"),
-        at_least("points", points, c.map_points, f"{_PNP}.map_points"),
-        at_most("slack_m", slack_m, c.map_sigma_m, f"{_PNP}.map_sigma_m"),
+        at_least("depth_inliers", depth_inliers, MAP_INLIERS),
+        at_least("overlap", overlap, MAP_OVERLAP),
+        at_least("points", points, MAP_POINTS),
+        at_most("slack_m", slack_m, MAP_SIGMA_M),
     )
 
 
@@ -94,6 +102,6 @@ def of_map(map_sigma: float) -> tuple[Check, ...]:
     return (at_most("map_sigma", map_sigma, PLAUSIBLE_SIGMA),)
 
 
-def of_support(supporting: int, c: RgbdClosingConfig) -> tuple[Check, ...]:
+def of_support(supporting: int) -> tuple[Check, ...]:
     """Of a measured loop: another one near it must agree."""
-    return (at_least("supporting", supporting, min(c.support_nodes, 1), f"{_CLOSING}.support_nodes"),)
+    return (at_least("supporting", supporting, 1),)

@@ -8,28 +8,47 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.rgbd import RgbdConfig
-from hybridmap.config.vision import MatchingConfig, RelocalisingConfig
+from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import Array, RelativePose, between, wrap_angle
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status
 from hybridmap.metrics import StageClock
 from hybridmap.vision.base import Belief
-from hybridmap.vision.gating import Gate, Whereabouts, nodes_within
+from hybridmap.vision.gating import Chain, Gate, Whereabouts, nodes_within
 from hybridmap.vision.profile import Profile
 from hybridmap.vision.relocalising import Relocaliser
 from hybridmap.vision.rgbd import checks
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp import Candidate, Verification, Verifier
-from hybridmap.vision.rgbd.revisits import Revisits
+from hybridmap.vision.rgbd.revisits import MAP_SIGMA_DEG, MAP_SIGMA_M, Revisits
 from hybridmap.vision.rgbd.second_look import SecondLook
 from hybridmap.vision.rgbd.support import Hypothesis, Support
 from hybridmap.vision.rgbd.whole_map import RANKED, WholeMap, chain_of
 from hybridmap.vision.templates import MODERATE_THRESHOLD, Matcher
 
 Indices = NDArray[np.int64]
-DEFAULT_RELOCALISING = RelocalisingConfig()
+GATE_PER_M, GATE_GROWTH_M = 0.1, 10.0
+"""Growth of the gate per metre travelled since the last closure, and its largest growth, m: wheels drift by less."""
+HEADING_DEG, HEADING_DEG_PER_M = 50.0, 0.3
+"""Headings may differ by this much, degrees, and more per metre since the last closure; beyond a camera's field of view
+nothing is seen in common."""
+ACCEPT, SEPARATION = 2, 2
+"""Edges that may enter for a node, and nodes that its candidates lie apart."""
+PENDING_NODES = 40
+"""A verified edge without support is given up after so many nodes."""
+SHIFT_SIGMA_M, SHIFT_SIGMA_DEG = 0.7, 6.0
+"""Standard deviations of unverified edges, m and degrees: views that match were taken about so near to each other."""
+REPROPOSE_M, REPROPOSE_PER_NODE, REPROPOSE_ONLINE = 2.0, 2, 1
+"""Nodes this near on the map are tried again, m; candidates for a node; and nodes that are tried with each new one, once a
+closure has moved them."""
+SPAN_M = 0.75
+"""Travel that sightings of a lost robot must cover, m: three steps between nodes."""
+UNRECOGNISED_NODES, DOUBT_NODES = 16, 40
+"""Nodes in a row at places that the map knows, none of them recognised, after which the robot is lost; and nodes after which
+a doubt is forgotten."""
+KNOWN_M, KNOWN_RAD = 0.7, float(np.deg2rad(20.0))
+"""A node this near to an old one, looking the same way, is at a place that the map knows."""
 SURE = 4.0
-"""While driving, depth alone is trusted only where the map's own uncertainty is below this many `repropose_sigma`."""
+"""While driving, depth alone is trusted only where the map's own uncertainty is below this many times `MAP_SIGMA_M`."""
 
 
 class LoopCloser:
@@ -38,39 +57,35 @@ class LoopCloser:
     def __init__(
         self,
         keyframes: Sequence[Keyframe],
-        matching: MatchingConfig,
-        config: RgbdConfig,
+        config: VisionConfig,
         verifier: Verifier,
         yaw_of_shift: Callable[[int], float],
         new_key: Callable[[], int],
         clock: StageClock,
-        relocalising: RelocalisingConfig = DEFAULT_RELOCALISING,
     ) -> None:
         self._keyframes = keyframes
-        self._config = config
-        self._closing = config.closing
+        rgbd, matching = config.rgbd, config.matching
+        self._closing, self._unverified = rgbd.closing, rgbd.verify == "none"
+        self._may_be_lost = config.relocalising.enabled
         self._verifier = verifier
         self._yaw_of_shift = yaw_of_shift
         self._new_key = new_key
         self._clock = clock
         self._matcher = Matcher(
-            config.matching, matching.mu_r, matching.mu_d, matching.max_shift, matching.g_bar, matching.sequence
+            rgbd.matching, matching.mu_r, matching.mu_d, config.profile.max_shift, matching.g_bar, matching.sequence
         )
-        whereabouts = Whereabouts(relocalising.unrecognised_nodes, relocalising.doubt_nodes)
-        self._relocaliser = Relocaliser(relocalising, whereabouts, new_key, "vision.relocalising")
-        self._whole_map = WholeMap(keyframes, self._matcher, verifier, relocalising, new_key)
-        self._relocalising = relocalising
-        unverified = config.verify == "none"
-        self._c_t = matching.c_t if matching.c_t is not None or not unverified else MODERATE_THRESHOLD[config.matching]
-        self._support = Support(config.closing)
-        self._revisits = Revisits(config.closing)
+        whereabouts = Whereabouts(UNRECOGNISED_NODES if self._may_be_lost else 0, DOUBT_NODES)
+        self._relocaliser = Relocaliser(whereabouts, new_key, SPAN_M)
+        self._whole_map = WholeMap(keyframes, self._matcher, verifier, new_key)
+        self._c_t = matching.c_t if matching.c_t is not None or not self._unverified else MODERATE_THRESHOLD[rgbd.matching]
+        self._support = Support()
+        self._revisits = Revisits()
         self._tried: set[tuple[int, int]] = set()
         self._travel_at_closure = 0.0
         self._noted, self._gate_of_newest, self._ranking = -1, Gate(0.0, 0.0, 0, 0), np.zeros((0, 3))
-        sigma_m, sigma_rad = config.closing.repropose_sigma_m, np.deg2rad(config.closing.repropose_sigma_deg)
-        self._map_covariance = np.diag([sigma_m, sigma_m, sigma_rad]) ** 2
+        self._map_covariance = np.diag([MAP_SIGMA_M, MAP_SIGMA_M, np.deg2rad(MAP_SIGMA_DEG)]) ** 2
         self._second_look = SecondLook(keyframes, verifier, self._map_covariance)
-        self._rounds_left = config.closing.repropose_rounds
+        self._rounds_left = rgbd.closing.repropose_rounds
 
     def add_node(self, profile: Profile) -> None:
         """Store the profile of the next node."""
@@ -81,7 +96,7 @@ class LoopCloser:
         since_m = self._travel_at_closure
         gated = self._gate(node, belief)
         changed = self._try_candidates(node, self._ranked(node, gated), belief) if len(gated) else []
-        if self._config.verify != "none":
+        if not self._unverified:
             broken = self._relocaliser.whereabouts.first_break is not None
             if not broken and not any(p.status is Status.ACCEPTED for p in changed):
                 near = self._nearest(node, 1, belief)
@@ -91,23 +106,23 @@ class LoopCloser:
                 changed += self._catch_up(belief)
         if self._travel_at_closure > since_m:
             self._revisits.closed(node, since_m, belief)
-        return [*changed, *self._support.give_up(before=node - self._closing.pending_nodes)]
+        return [*changed, *self._support.give_up(before=node - PENDING_NODES)]
 
     def _catch_up(self, belief: Belief) -> list[Edge]:
         """Try a few of the nodes again that a closure has moved."""
         out: list[Edge] = []
-        for _ in range(self._closing.repropose_online):
+        for _ in range(REPROPOSE_ONLINE):
             node = self._revisits.next_moved(belief)
             if node is None:
                 break
-            if self._support.accepted(node) < self._closing.accept:
-                near = self._nearest(node, self._closing.repropose_per_node, belief)
+            if self._support.accepted(node) < ACCEPT:
+                near = self._nearest(node, REPROPOSE_PER_NODE, belief)
                 out += self._try_again(node, near, belief, {j for j in near if self._is_sure(node, j, belief)})
         return out
 
     def tracked(self, node: int, steps: list[Edge]) -> None:
         """Take notice of how a new node was registered to the ones before it."""
-        self._relocaliser.tracked(node, chain_of(steps, self._relocalising), steps)
+        self._relocaliser.tracked(node, chain_of(steps) if self._may_be_lost else Chain.HOLDS, steps)
 
     @property
     def lost_since(self) -> int | None:
@@ -126,8 +141,7 @@ class LoopCloser:
         if any(p.status is Status.ACCEPTED for p in changed):
             whereabouts.recognised()
             return self._relocaliser.dismiss(Lack.NOT_LOST)
-        near, turn = self._relocalising.known_m, np.deg2rad(self._relocalising.known_deg)
-        if len(np.intersect1d(nodes_within(belief.poses_map_node, node, near, turn), gated)):
+        if len(np.intersect1d(nodes_within(belief.poses_map_node, node, KNOWN_M, KNOWN_RAD), gated)):
             whereabouts.unrecognised()
         if not whereabouts.lost:
             return []
@@ -144,12 +158,12 @@ class LoopCloser:
     def finish(self, belief: Belief) -> list[Edge]:
         """Try pairs that the optimised map puts side by side and that are not joined yet; then settle everything."""
         out: list[Edge] = []
-        if self._rounds_left > 0 and self._closing.repropose_m > 0 and self._config.verify != "none":
+        if self._rounds_left > 0 and not self._unverified:
             self._rounds_left -= 1
             first_break = self._relocaliser.whereabouts.first_break
             for node in range(len(self._keyframes)):
-                if self._support.accepted(node) < self._closing.accept:
-                    near = self._nearest(node, self._closing.repropose_per_node, belief)
+                if self._support.accepted(node) < ACCEPT:
+                    near = self._nearest(node, REPROPOSE_PER_NODE, belief)
                     placed = first_break is None or node < first_break
                     out += self._try_again(node, near, belief, near if placed else ())
         out += self._relocaliser.dismiss()
@@ -157,7 +171,7 @@ class LoopCloser:
 
     def verify(self, doubted: Sequence[Edge], belief: Belief) -> list[Edge]:
         """Measure doubted loops again; `belief` is that of the map without them."""
-        if self._config.verify == "none":
+        if self._unverified:
             return []
         out = []
         for d in doubted:
@@ -174,13 +188,13 @@ class LoopCloser:
     def _gate(self, node: int, belief: Belief) -> Indices:
         """Nodes old enough, within reach of the drift since the last closure, and looking the same way."""
         since = float(belief.travel_m[node]) - self._travel_at_closure
-        growth = self._closing.gate_per_m * since
-        radius = self._closing.gate_m + min(growth, self._closing.gate_growth_m)
+        growth = GATE_PER_M * since
+        radius = self._closing.gate_m + min(growth, GATE_GROWTH_M)
         radii: Array = np.full(node, radius)
-        if growth > self._closing.gate_growth_m and self._closing.gate_sigma > 0:
+        if growth > GATE_GROWTH_M and self._closing.gate_sigma > 0:
             spread = np.trace(belief.covariance_from(node)[:node, :2, :2], axis1=1, axis2=2)
             radii = np.maximum(radii, self._closing.gate_m + self._closing.gate_sigma * np.sqrt(spread))
-        heading = np.deg2rad(self._closing.heading_deg + self._closing.heading_deg_per_m * since)
+        heading = np.deg2rad(HEADING_DEG + HEADING_DEG_PER_M * since)
         poses = belief.poses_map_node
         offset = poses[:node, :2] - poses[node, :2]
         turned = np.abs(wrap_angle(poses[:node, 2] - poses[node, 2]))
@@ -201,7 +215,7 @@ class LoopCloser:
         for i, target in enumerate(match.indices.tolist()):
             if self._c_t is not None and match.score[i] >= self._c_t:
                 break
-            if all(abs(target - other) >= self._closing.separation for other in chosen):
+            if all(abs(target - other) >= SEPARATION for other in chosen):
                 profile = {"profile_G": float(match.score[i])}
                 chosen[target] = Candidate(Search.GATE, int(match.shift[i]), profile)
             if len(chosen) == self._closing.candidates:
@@ -210,12 +224,12 @@ class LoopCloser:
 
     def _try_candidates(self, node: int, ranked: dict[int, Candidate], belief: Belief) -> list[Edge]:
         """Measure each candidate, the best first, until enough have entered."""
-        if self._config.verify == "none":
+        if self._unverified:
             return self._accept_unverified(node, ranked, belief)
         out: list[Edge] = []
         entered = 0
         for target, candidate in ranked.items():
-            if entered == self._closing.accept:
+            if entered == ACCEPT:
                 break
             self._tried.add((node, target))
             found = self._verifier.verify(self._keyframes[node], self._keyframes[target])
@@ -255,14 +269,14 @@ class LoopCloser:
         gap = np.hypot(*(poses[:node, :2] - poses[node, :2]).T)
         turned = np.abs(wrap_angle(poses[:node, 2] - poses[node, 2]))
         old = belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s
-        near = old & (gap <= self._closing.repropose_m) & (turned <= np.deg2rad(self._closing.heading_deg))
+        near = old & (gap <= REPROPOSE_M) & (turned <= np.deg2rad(HEADING_DEG))
         cost = gap + turned
         chosen: dict[int, Candidate] = {}
         for i in np.argsort(np.where(near, cost, np.inf), kind="stable")[: int(near.sum())]:
             target = int(i)
             if self._support.has(node, target):
                 continue
-            if all(abs(target - other) >= self._closing.separation for other in chosen):
+            if all(abs(target - other) >= SEPARATION for other in chosen):
                 chosen[target] = Candidate(Search.NEAR, figures={"map_distance_m": float(gap[i])})
             if len(chosen) == most:
                 break
@@ -272,7 +286,7 @@ class LoopCloser:
         """The seed's way: the best match is a closure; its shift gives the yaw, and nothing gives the translation."""
         for target, candidate in ranked.items():
             delta = np.array([0.0, 0.0, self._yaw_of_shift(candidate.shift)])
-            sigma = np.array([self._closing.shift_sigma_m] * 2 + [np.deg2rad(self._closing.shift_sigma_deg)])
+            sigma = np.array([SHIFT_SIGMA_M] * 2 + [np.deg2rad(SHIFT_SIGMA_DEG)])
             relative = RelativePose(delta, np.diag(sigma**2))
             self._travel_at_closure = float(belief.travel_m[node])
             asked = () if self._c_t is None else checks.of_profile(candidate.figures["profile_G"], self._c_t)

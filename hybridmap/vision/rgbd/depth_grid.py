@@ -11,11 +11,19 @@ from hybridmap.geometry import Array
 from hybridmap.streams.rgbd import Camera
 from hybridmap.vision.rgbd.stance import Stance, inverse_rigid
 
+GRID_PX, GRID_COLUMNS = 5, 48
+"""Depth is averaged over, and sampled at, cells of so many pixels; smaller ones where a picture is too narrow for so many
+columns of them."""
 MAX_JUMP = 0.05
 MAX_BEND = 0.015
 MIN_SHARE = 0.2
 """Neighbouring cells are one surface where inverse depth differs by less than a share, or bends by less than a share of itself;
 a cell is known where this share of its pixels is."""
+
+
+def cell_px(width_px: int) -> int:
+    """Side of a cell at a working width, pixels."""
+    return max(2, min(GRID_PX, width_px // GRID_COLUMNS))
 
 
 def reduced(camera: Camera, factor: int) -> Camera:

@@ -10,12 +10,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridmap.config.rgbd import RegistrationConfig
 from hybridmap.geometry import Array, RelativePose, loosest_direction
 from hybridmap.vision.rgbd.depth_grid import Surface
 from hybridmap.vision.rgbd.pairs import PointPairs
 from hybridmap.vision.rgbd.stance import LevelPair, Stance, from_planar, level_pair, rotation_of, to_floor, wrenches
 
+ITERATIONS = 10
+"""Gauss-Newton steps, at most; a good start needs half of them."""
+MAX_DISTANCE_M, MAX_NORMAL_DEG = 0.15, 30.0
+"""Points of two surfaces are a pair no farther apart than this (plus the noise of depth), m, and no more inclined, degrees."""
+MIN_POINTS = 60
+"""Fewest pairs: 3 % of a picture's cells."""
+CORRELATION = 30.0
+"""Where it is asked whether surfaces hold each other or slide, so many neighbouring points count as one: depth errs alike
+over some cells."""
 PLANAR = np.array([0, 1, 5])
 OUT_OF_PLANE = np.array([2, 3, 4])
 COARSE_POINTS = 400
@@ -96,7 +104,6 @@ def register(
     moving: Surface,
     start: Array,
     prior: RelativePose | None,
-    config: RegistrationConfig,
     pairs: PointPairs | None = None,
 ) -> Registration | None:
     """Register the moving robot to the fixed one.
@@ -105,7 +112,6 @@ def register(
         fixed, moving: surfaces in their own bases.
         start: (4, 4) first guess of the moving base in the fixed one.
         prior: planar prior (wheel odometry) of the solve; taken out of the result's covariance.
-        config: settings.
         pairs: keypoints that join the solve.
 
     Returns:
@@ -115,9 +121,9 @@ def register(
     known = _Prior.of(fixed.stance, moving.stance, prior)
     rows = np.ascontiguousarray(moving.rows[:, ::stride])
     settled: Pairing | None = None
-    for _ in range(config.iterations):
-        pairing = associate(fixed, rows, T, config)
-        if pairing.matched * stride < config.min_points:
+    for _ in range(ITERATIONS):
+        pairing = associate(fixed, rows, T)
+        if pairing.matched * stride < MIN_POINTS:
             return None
         step = _step(pairing, T, known, pairs)
         T[:3, 3] += step[:3]
@@ -128,8 +134,8 @@ def register(
             break
         if largest < NEARLY_SETTLED:
             rows, stride = moving.rows, 1
-    at_end = associate(fixed, moving.rows, T, config) if settled is None else settled
-    return _summarise(fixed.stance, moving.stance, T, at_end, known.floor, config, pairs)
+    at_end = associate(fixed, moving.rows, T) if settled is None else settled
+    return _summarise(fixed.stance, moving.stance, T, at_end, known.floor, pairs)
 
 
 def _step(pairing: Pairing, T: Array, known: _Prior, pairs: PointPairs | None) -> Array:
@@ -147,16 +153,15 @@ def _summarise(
     T: Array,
     pairing: Pairing,
     floor: Array,
-    config: RegistrationConfig,
     pairs: PointPairs | None,
 ) -> Registration | None:
-    if pairing.matched < config.min_points:
+    if pairing.matched < MIN_POINTS:
         return None
     H_depth = _information(pairing)
     H_pairs = np.zeros((6, 6)) if pairs is None else pairs.terms(T)[0]
     flat, level = to_floor(T), level_pair(T, fixed, moving)
     arm = moving.T_base_camera[2, 3] * T[:3, 2]
-    both = np.stack([H_depth + H_pairs, H_depth / config.correlation + H_pairs])
+    both = np.stack([H_depth + H_pairs, H_depth / CORRELATION + H_pairs])
     covariance, dulled = _planar_covariances(both, arm, level.delta[2], floor)
     return Registration(
         T,
@@ -250,14 +255,13 @@ class Pairing:
         return weighted @ J.T, -weighted @ self.residual
 
 
-def associate(fixed: Surface, moving: Array, T: Array, config: RegistrationConfig) -> Pairing:
+def associate(fixed: Surface, moving: Array, T: Array) -> Pairing:
     """Pair each moving point with the one in whose cell of the fixed grid it falls.
 
     Args:
         fixed: the surface in its own base.
         moving: (7, N) rows of the other surface, or some of their columns.
         T: (4, 4) the moving base in the fixed one.
-        config: how far apart, and how differently inclined, the points of a pair may be.
     """
     camera, turn = fixed.grid.camera, T[:3, :3]
     matrix = np.array([[camera.fx_px, 0.0, camera.cx_px + 0.5], [0.0, camera.fy_px, camera.cy_px + 0.5], [0.0, 0.0, 1.0]])
@@ -273,9 +277,9 @@ def associate(fixed: Surface, moving: Array, T: Array, config: RegistrationConfi
     normal, arm, turned = theirs[3:6], turn @ ours[:3], turn @ ours[3:6]
     offset = arm + (T[:3, 3:] - theirs[:3])
     residual = np.einsum("ij,ij->j", normal, offset)
-    reach = config.max_distance_m + 3.0 * (theirs[6] + ours[6])
+    reach = MAX_DISTANCE_M + 3.0 * (theirs[6] + ours[6])
     keep = np.abs(residual) < reach
-    keep &= np.einsum("ij,ij->j", turned, normal) > np.cos(np.deg2rad(config.max_normal_deg))
+    keep &= np.einsum("ij,ij->j", turned, normal) > np.cos(np.deg2rad(MAX_NORMAL_DEG))
     keep &= np.einsum("ij,ij->j", offset, offset) < 4.0 * reach * reach
     variance = np.where(keep, theirs[6] ** 2 + ours[6] ** 2, np.inf)
     return Pairing(normal, turned, arm, residual, variance, int(np.count_nonzero(keep)), moving.shape[1])

@@ -10,6 +10,12 @@ from numpy.typing import NDArray
 from hybridmap.geometry import Array
 from hybridmap.streams.rgbd import Camera
 
+COUNT = 500
+"""Largest number of ORB keypoints: what a picture of 320 x 240 holds."""
+FAST_THRESHOLD = 10
+"""Contrast that a FAST corner needs, grey levels: half of OpenCV's, for bare rooms."""
+RATIO = 0.8
+"""Lowe's ratio: the best match must be this much nearer than the second."""
 MAX_SPREAD = 0.05
 """A keypoint on a depth edge (neighbouring depths differ by more than this share) has no point in space."""
 
@@ -37,19 +43,17 @@ class Correspondences:
     second: NDArray[np.int64]
 
 
-def detect(grey: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: Camera, count: int, fast_threshold: int) -> Features:
+def detect(grey: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: Camera) -> Features:
     """Find keypoints and give each its point in space; those without depth, or on a depth edge, are dropped.
 
     Args:
         grey: (H, W) uint8.
         depth_m: (H, W) float32, m; 0 where invalid.
         camera: pinhole of both.
-        count: largest number of keypoints.
-        fast_threshold: contrast of a FAST corner, grey levels.
     """
     import cv2
 
-    orb = cv2.ORB.create(nfeatures=count, fastThreshold=fast_threshold)
+    orb = cv2.ORB.create(nfeatures=COUNT, fastThreshold=FAST_THRESHOLD)
     keypoints, descriptors = orb.detectAndCompute(grey, None)
     if descriptors is None or len(keypoints) == 0:
         return Features(np.zeros((0, 2)), np.zeros((0, 32), dtype=np.uint8), np.zeros((0, 3)))
@@ -58,7 +62,7 @@ def detect(grey: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: Camera
     return Features(pixels[known], descriptors[known], points[known])
 
 
-def match(a: Features, b: Features, ratio: float) -> Correspondences:
+def match(a: Features, b: Features) -> Correspondences:
     """Best descriptor of b for each of a that passes Lowe's ratio; of several that claim one of b the nearest keeps it."""
     import cv2
 
@@ -66,7 +70,7 @@ def match(a: Features, b: Features, ratio: float) -> Correspondences:
     if len(a.descriptors) < 2 or len(b.descriptors) < 2:
         return Correspondences(none, none)
     distance, nearest = cv2.batchDistance(a.descriptors, b.descriptors, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2)
-    passed = np.flatnonzero(distance[:, 0] < ratio * distance[:, 1])
+    passed = np.flatnonzero(distance[:, 0] < RATIO * distance[:, 1])
     passed = passed[np.argsort(distance[passed, 0], kind="stable")]
     _, keeper = np.unique(nearest[passed, 0], return_index=True)
     own = np.sort(passed[keeper])

@@ -19,7 +19,7 @@ from hybridmap.streams.rgbd import RGBD, Camera, RgbdFrame
 from hybridmap.vision.base import Belief, View
 from hybridmap.vision.profile import image_profile
 from hybridmap.vision.rgbd.closing import LoopCloser
-from hybridmap.vision.rgbd.depth_grid import make_grid, place
+from hybridmap.vision.rgbd.depth_grid import cell_px, make_grid, place
 from hybridmap.vision.rgbd.features import detect
 from hybridmap.vision.rgbd.keyframe import (
     Keyframe,
@@ -48,32 +48,28 @@ class RgbdFrontEnd:
     """
 
     def __init__(self, config: VisionConfig, camera: Camera, seed: int, clock: StageClock | None = None) -> None:
-        rgbd, matching, templates = config.rgbd, config.matching, config.templates
+        rgbd, matching = config.rgbd, config.matching
         self._config = config
         self._full_camera = camera
         self._factor = working_factor(camera, rgbd.max_width_px)
         self._camera = working_camera(camera, rgbd.max_width_px)
-        self._cell_px = rgbd.registration.cell_px(self._camera.width_px)
+        self._cell_px = cell_px(self._camera.width_px)
         self._bands = config.profile.bands if rgbd.matching == "four-band" else 1
-        self._templates = ViewTemplates(
-            templates.threshold, templates.stable_frames, templates.max_shift, matching.mu_r, matching.mu_d
-        )
+        self._templates = ViewTemplates(config.profile.width // 16, matching.mu_r, matching.mu_d)
         self._keyframes: list[Keyframe] = []
         self._images: deque[tuple[int, RgbdFrame]] = deque(maxlen=rgbd.held_images)
         keys = itertools.count()
-        level = NoiseLevel(rgbd.registration.noise_factor)
-        self._tracker = Tracker(self._keyframes, rgbd, self._camera, level, keys.__next__)
-        self._verifier = Verifier(self._camera, rgbd.pnp, rgbd.features, rgbd.registration, level, seed)
-        self._posture = Posture(rgbd.tilt, camera.T_base_camera, self._verifier.solver, rgbd.features.ratio)
+        level = NoiseLevel()
+        self._tracker = Tracker(self._keyframes, rgbd.registration, self._camera, level, keys.__next__)
+        self._verifier = Verifier(self._camera, rgbd.pnp.min_inliers, rgbd.registration.depth_sigma, level, seed)
+        self._posture = Posture(rgbd.tilt, camera.T_base_camera, self._verifier.solver)
         self._closer = LoopCloser(
             self._keyframes,
-            matching,
-            rgbd,
+            config,
             self._verifier,
             self._yaw_of_shift,
             keys.__next__,
             clock or StageClock(),
-            config.relocalising,
         )
         self._frame: RgbdFrame | None = None
         self._image: WorkingImage | None = None
@@ -102,9 +98,7 @@ class RgbdFrontEnd:
         if self._frame is None or self._image is None or node != len(self._keyframes):
             raise ValueError(f"node {node} cannot be made here: {len(self._keyframes)} nodes so far, observe a frame first")
         rgbd = self._config.rgbd
-        features = detect(
-            self._image.grey, self._image.depth_m, self._camera, rgbd.features.count, rgbd.features.fast_threshold
-        )
+        features = detect(self._image.grey, self._image.depth_m, self._camera)
         grid = make_grid(self._image.depth_m, self._camera, self._cell_px, rgbd.registration.depth_sigma)
         stance = self._posture.stance(grid, features, self._keyframes[-1] if self._keyframes else None)
         self._keyframes.append(Keyframe(view.profile, features, place(grid, stance)))

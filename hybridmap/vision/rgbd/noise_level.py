@@ -8,6 +8,8 @@ import numpy as np
 
 from hybridmap.geometry import RelativePose, between, compose_relative, log
 
+NOISE_FACTOR = 10.0
+"""What the residuals' covariance is multiplied by, until closures of registrations have shown by how much: as for a Kinect."""
 QUANTILE = 0.7
 CHI2_QUANTILE = 3.665
 """The quantile of the closures' squared error that is looked at, and what it is for three degrees of freedom: above the
@@ -27,7 +29,7 @@ class NoiseLevel:
     k-1 to k and from k-2 to k must close; how badly they do, in terms of their own covariances, is the factor.
     """
 
-    def __init__(self, initial: float) -> None:
+    def __init__(self, initial: float = NOISE_FACTOR) -> None:
         """Begin with a factor that holds until enough closures have been seen."""
         self._factor = initial
         self._squared: deque[float] = deque(maxlen=REMEMBERED)

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.rgbd import FeaturesConfig, PnpConfig, RegistrationConfig
 from hybridmap.geometry import Array, RelativePose, between, loosest_direction, wrap_angle
 from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, passed
 from hybridmap.streams.rgbd import Camera
 from hybridmap.vision.rgbd import checks
-from hybridmap.vision.rgbd.depth_registration import Registration, register
+from hybridmap.vision.rgbd.depth_registration import register
 from hybridmap.vision.rgbd.features import Correspondences, match
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.noise_level import NoiseLevel
@@ -21,6 +20,10 @@ from hybridmap.vision.rgbd.pairs import point_pairs
 from hybridmap.vision.rgbd.pnp_solver import PnpSolver
 from hybridmap.vision.rgbd.stance import FloorPose, from_planar, inverse_rigid, level_pair, to_floor
 
+FLOORS, HELD_FLOORS = (0.0001, 0.005), (0.01, 0.2)
+"""Least standard deviations of a loop edge, m and degrees: of a mounted camera, and of one whose tilt comes from the floor."""
+KEYPOINT_REACH_M = 0.3
+"""Matched keypoints farther apart than this at a guess, beside what that is off by, are no matches, m."""
 GUESSED = 2.0
 """Standard deviations of a guess over which features are looked for around it."""
 
@@ -81,31 +84,28 @@ class Verifier:
     def __init__(
         self,
         camera: Camera,
-        pnp: PnpConfig,
-        features: FeaturesConfig,
-        registration: RegistrationConfig,
+        min_inliers: int,
+        depth_sigma: float,
         level: NoiseLevel,
         seed: int,
     ) -> None:
-        self.solver = PnpSolver(camera, pnp, seed)
+        self.solver = PnpSolver(camera, min_inliers, seed)
         self._focal_px = 0.5 * (camera.fx_px + camera.fy_px)
-        self._pnp = pnp
-        self._ratio = features.ratio
-        self._registration = registration
+        self._min_inliers, self._depth_sigma = min_inliers, depth_sigma
         self._level = level
 
     def verify(self, source: Keyframe, target: Keyframe) -> Verification:
         """Measure the target's pose in the source's frame, or say why not."""
-        pairs = match(source.features, target.features, self._ratio)
-        asked = checks.of_matches(len(pairs.first), self._pnp)
+        pairs = match(source.features, target.features)
+        asked = checks.of_matches(len(pairs.first), self._min_inliers)
         if not passed(asked):
             return Verification(None, Method.FEATURES, asked)
         forward = self.solver.solve(target.features, source.features, pairs.second, pairs.first)
-        asked += checks.of_pose(len(forward.inliers) if forward else 0, self._pnp)
+        asked += checks.of_pose(len(forward.inliers) if forward else 0, self._min_inliers)
         if forward is None or not passed(asked):
             return Verification(None, Method.FEATURES, asked)
         backward = self.solver.solve(source.features, target.features, pairs.first, pairs.second)
-        asked += checks.of_reverse_pose(len(backward.inliers) if backward else 0, self._pnp)
+        asked += checks.of_reverse_pose(len(backward.inliers) if backward else 0, self._min_inliers)
         if backward is None or not passed(asked):
             return Verification(None, Method.FEATURES, asked)
         T = _between_bases(forward.T_image_points, source, target)
@@ -124,10 +124,10 @@ class Verifier:
             source, target: the keyframes.
             guess: the target in the source's frame as the map has it, and how far that may be off.
         """
-        fit = register(source.surface, target.surface, from_planar(guess.delta), guess, self._registration)
+        fit = register(source.surface, target.surface, from_planar(guess.delta), guess)
         if fit is None:
             return Verification(None, Method.DEPTH, lack=Lack.NO_DEPTH)
-        asked = checks.of_depth_alone(fit.inliers, fit.overlap, fit.points, fit.slack_m, self._pnp)
+        asked = checks.of_depth_alone(fit.inliers, fit.overlap, fit.points, fit.slack_m)
         if not passed(asked):
             return Verification(None, Method.DEPTH, asked)
         return Verification(self._calibrated(fit.relative, source, target), Method.DEPTH, asked)
@@ -142,20 +142,20 @@ class Verifier:
         pairs = point_pairs(
             source,
             target,
-            match(source.features, target.features, self._ratio),
+            match(source.features, target.features),
             self._focal_px,
-            self._registration.depth_sigma,
+            self._depth_sigma,
         )
         start = from_planar(guess.delta)
-        reach_m = self._registration.keypoint_reach_m + GUESSED * loosest_direction(guess.covariance)[0]
+        reach_m = KEYPOINT_REACH_M + GUESSED * loosest_direction(guess.covariance)[0]
         close = None if pairs is None else pairs.near(start, reach_m)
-        if close is None or len(close) < self._pnp.min_inliers:
+        if close is None or len(close) < self._min_inliers:
             return self.verify_on_map(source, target, guess)
-        fit = register(source.surface, target.surface, start, guess, self._registration, close)
+        fit = register(source.surface, target.surface, start, guess, close)
         if fit is None:
             return self.verify_on_map(source, target, guess)
-        asked = checks.of_pose(close.agreeing(fit.T_fixed_moving), self._pnp)
-        asked += checks.of_depth(fit.inliers, self._registration)
+        asked = checks.of_pose(close.agreeing(fit.T_fixed_moving), self._min_inliers)
+        asked += checks.of_depth(fit.inliers)
         if not passed(asked):
             return self.verify_on_map(source, target, guess)
         figures = {"overlap": fit.overlap, "points": float(fit.points)}
@@ -167,7 +167,7 @@ class Verifier:
         gap = between(flat.delta, reverse.delta)
         apart_m, apart_deg = float(np.hypot(gap[0], gap[1])), float(np.rad2deg(abs(gap[2])))
         tilt_deg = float(np.rad2deg(flat.tilt_rad))
-        return checks.of_plane(abs(flat.height_m), tilt_deg, apart_m, apart_deg, held, self._pnp)
+        return checks.of_plane(abs(flat.height_m), tilt_deg, apart_m, apart_deg, held)
 
     def _refined(
         self,
@@ -178,32 +178,29 @@ class Verifier:
         second: NDArray[np.int64],
         asked: tuple[Check, ...],
     ) -> Verification:
-        pairs = point_pairs(source, target, Correspondences(first, second), self._focal_px, self._registration.depth_sigma)
+        pairs = point_pairs(source, target, Correspondences(first, second), self._focal_px, self._depth_sigma)
         rough = RelativePose(flat.delta, np.diag([0.1, 0.1, np.deg2rad(3.0)]) ** 2)
-        fit: Registration | None = None
-        if self._pnp.refine:
-            start = from_planar(flat.delta)
-            fit = register(source.surface, target.surface, start, rough, self._registration, pairs)
+        fit = register(source.surface, target.surface, from_planar(flat.delta), rough, pairs)
         if fit is None:
             return self._features_alone(flat, len(first), asked)
         gap = between(flat.delta, fit.relative.delta)
         off_m, off_deg = float(np.hypot(gap[0], gap[1])), float(np.rad2deg(abs(wrap_angle(gap[2]))))
-        asked += checks.of_refinement(off_m, off_deg, fit.inliers, self._pnp, self._registration)
+        asked += checks.of_refinement(off_m, off_deg, fit.inliers)
         relative = self._calibrated(fit.relative, source, target) if passed(asked) else None
         figures = {"depth_residual_m": fit.residual_m, "overlap": fit.overlap}
         return Verification(relative, Method.FEATURES_AND_DEPTH, asked, figures=figures)
 
     def _features_alone(self, flat: FloorPose, inliers: int, asked: tuple[Check, ...]) -> Verification:
         """No depth to refine on or to object: many features must agree, and the edge is looser."""
-        asked += checks.of_features_alone(inliers, self._pnp)
+        asked += checks.of_features_alone(inliers)
         if not passed(asked):
             return Verification(None, Method.FEATURES, asked)
-        sigma = 0.1 * np.sqrt(self._pnp.min_inliers_alone / inliers)
+        sigma = 0.1 * np.sqrt(checks.MIN_INLIERS_ALONE / inliers)
         loose = RelativePose(flat.delta, np.diag([sigma, sigma, np.deg2rad(1.5)]) ** 2)
         return Verification(loose, Method.FEATURES, asked)
 
     def _calibrated(self, relative: RelativePose, source: Keyframe, target: Keyframe) -> RelativePose:
-        return self._level.applied(relative, *self._pnp.floors(source.held or target.held))
+        return self._level.applied(relative, *(HELD_FLOORS if source.held or target.held else FLOORS))
 
 
 def _flat(T_source_target: Array, source: Keyframe, target: Keyframe) -> FloorPose:

@@ -7,10 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.rgbd import PnpConfig
 from hybridmap.geometry import Array
 from hybridmap.streams.rgbd import Camera
 from hybridmap.vision.rgbd.features import Features
+
+ITERATIONS = 200
+"""RANSAC draws at most: enough for 30 % of inliers with certainty of 99 %."""
+REPROJECTION_PX = 3.0
+"""An inlier's largest reprojection error, pixels at the working width."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +33,9 @@ class Pnp:
 class PnpSolver:
     """PnP-RANSAC for one camera; its random draws are seeded anew for every call."""
 
-    def __init__(self, camera: Camera, config: PnpConfig, seed: int) -> None:
+    def __init__(self, camera: Camera, min_inliers: int, seed: int) -> None:
         self._matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1.0]])
-        self._config = config
+        self._min_inliers = min_inliers
         self._seed = seed % 2**31
 
     def solve(self, points: Features, image: Features, of_points: NDArray[np.int64], of_image: NDArray[np.int64]) -> Pnp | None:
@@ -43,7 +47,7 @@ class PnpSolver:
         """
         import cv2
 
-        if len(of_points) < self._config.min_inliers:
+        if len(of_points) < self._min_inliers:
             return None
         space, pixels = points.points[of_points], image.pixels[of_image]
         cv2.setRNGSeed(self._seed)
@@ -52,8 +56,8 @@ class PnpSolver:
             pixels,
             self._matrix,
             None,
-            iterationsCount=self._config.iterations,
-            reprojectionError=self._config.reprojection_px,
+            iterationsCount=ITERATIONS,
+            reprojectionError=REPROJECTION_PX,
             confidence=0.999,
             flags=cv2.SOLVEPNP_AP3P,
         )

@@ -40,13 +40,12 @@ MIN_FOLLOWED = 15
 class Posture:
     """Decides how the camera is held, keyframe by keyframe."""
 
-    def __init__(self, mode: Literal["auto", "level", "floor"], T_base_camera: Array, solver: PnpSolver, ratio: float) -> None:
+    def __init__(self, mode: Literal["auto", "level", "floor"], T_base_camera: Array, solver: PnpSolver) -> None:
         self._mounting = T_base_camera
         self._as_mounted = Stance(T_base_camera, *MOUNTED, False)
         self._held = mode == "floor"
         self._watching = mode == "auto"
         self._solver = solver
-        self._ratio = ratio
         self._heights: deque[float] = deque(maxlen=REMEMBERED_FLOORS)
         self._agreed = 0
         self._unwatched = 0
@@ -104,7 +103,7 @@ class Posture:
 
     def _followed(self, last: Keyframe, features: Features) -> Array | None:
         """The camera's pose by its turn since the last keyframe, where enough features agree on it."""
-        pairs = match(last.features, features, self._ratio)
+        pairs = match(last.features, features)
         pose = self._solver.solve(last.features, features, pairs.first, pairs.second)
         if pose is None or len(pose.inliers) < MIN_FOLLOWED:
             return None

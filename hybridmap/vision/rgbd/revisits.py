@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybridmap.config.rgbd import RgbdClosingConfig
 from hybridmap.geometry import Array, wrap_angle
 from hybridmap.vision.base import Belief
+
+MAP_SIGMA_M, MAP_SIGMA_DEG = 0.15, 3.0
+"""How far an optimised map may be off between nodes that lie side by side (one standard deviation), m and degrees."""
 
 
 class Revisits:
     """The nodes between one closure and the next: where that moved them, what was out of reach may lie near them now."""
 
-    def __init__(self, config: RgbdClosingConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self._waiting: list[tuple[int, Array]] = []
 
     def closed(self, node: int, since_m: float, belief: Belief) -> None:
@@ -27,6 +28,6 @@ class Revisits:
             node, before = self._waiting.pop()
             now = belief.poses_map_node[node]
             moved_m, turned = float(np.hypot(*(now - before)[:2])), float(abs(wrap_angle(now[2] - before[2])))
-            if moved_m > self._config.repropose_sigma_m or turned > np.deg2rad(self._config.repropose_sigma_deg):
+            if moved_m > MAP_SIGMA_M or turned > np.deg2rad(MAP_SIGMA_DEG):
                 return node
         return None

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridmap.config.rgbd import RgbdClosingConfig
 from hybridmap.geometry import RelativePose
 from hybridmap.graph.agreement import Loops, agrees
 from hybridmap.graph.edges import Edge, Lack, Status, passed
 from hybridmap.vision.base import Belief
 from hybridmap.vision.rgbd import checks
+
+SUPPORT_NODES = 12
+"""Loops support each other from nodes no farther apart than this to nodes no farther apart, by number."""
 
 
 @dataclass(slots=True)
@@ -41,8 +43,7 @@ class Hypothesis:
 class Support:
     """Keeps hypotheses by their source and lets those enter that agree with each other."""
 
-    def __init__(self, config: RgbdClosingConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self._of_source: defaultdict[int, list[Hypothesis]] = defaultdict(list)
         self._pending: list[Hypothesis] = []
         self._filed: set[tuple[int, int]] = set()
@@ -65,7 +66,7 @@ class Support:
         loops = Loops.measured([(h.source, h.target, h.relative) for h in (new, *near)])
         agreeing = [near[i] for i in np.flatnonzero(agrees(loops, 0, np.arange(1, len(near) + 1), belief.ways)).tolist()]
         friends = [h for h in agreeing if h.proposal.status is Status.PENDING]
-        asked = checks.of_support(len(agreeing), self._config)
+        asked = checks.of_support(len(agreeing))
         self._of_source[new.source].append(new)
         self._pending.append(new)
         self._filed.add((new.source, new.target))
@@ -73,7 +74,7 @@ class Support:
             return [new.proposal]
         changed = [new, *friends]
         for h in changed:
-            h.proposal = h.proposal.settled(*(asked if h is new else checks.of_support(1, self._config)))
+            h.proposal = h.proposal.settled(*(asked if h is new else checks.of_support(1)))
         return [h.proposal for h in changed]
 
     def replace(self, proposal: Edge) -> None:
@@ -95,6 +96,6 @@ class Support:
 
     def _beside(self, new: Hypothesis) -> list[Hypothesis]:
         """Edges from other nodes near its source, to nodes near its target."""
-        reach = self._config.support_nodes
+        reach = SUPPORT_NODES
         sources = (source for source in range(new.source - reach, new.source + reach + 1) if source != new.source)
         return [h for source in sources for h in self._of_source.get(source, ()) if abs(h.target - new.target) <= reach]

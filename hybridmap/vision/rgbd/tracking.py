@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hybridmap.config.rgbd import RgbdConfig
+from hybridmap.config.vision import RegistrationConfig
 from hybridmap.geometry import Array, RelativePose, between, compose, compose_relative, log, loosest_direction
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status, passed
 from hybridmap.streams.rgbd import Camera
@@ -21,6 +21,13 @@ from hybridmap.vision.rgbd.noise_level import NoiseLevel
 from hybridmap.vision.rgbd.pairs import PointPairs, point_pairs
 from hybridmap.vision.rgbd.stance import Stance, from_planar
 
+BACK = 2
+"""How many earlier nodes a new one is registered to: three registrations of three nodes show how well they close."""
+KEYPOINT_REACH_M = 0.3
+"""Matched keypoints farther apart than this at the first guess are no matches, m: wheels err less over a step."""
+FLOORS, HELD_FLOORS = (0.0001, 0.005), (0.002, 0.06)
+"""Least standard deviations of a consecutive edge, m and degrees: of a mounted camera, and of one whose tilt comes from the
+floor plane."""
 STRAIGHTENED_RAD = float(np.deg2rad(0.4))
 STRAIGHTENED_M = 0.01
 """What a registration adds to the uncertainty of a posture that it hands on."""
@@ -30,11 +37,15 @@ class Tracker:
     """Registers node k to nodes k-1, k-2, ...; keeps the odometry between consecutive nodes."""
 
     def __init__(
-        self, keyframes: list[Keyframe], config: RgbdConfig, camera: Camera, level: NoiseLevel, new_key: Callable[[], int]
+        self,
+        keyframes: list[Keyframe],
+        config: RegistrationConfig,
+        camera: Camera,
+        level: NoiseLevel,
+        new_key: Callable[[], int],
     ) -> None:
         self._keyframes = keyframes
-        self._config = config.registration
-        self._ratio = config.features.ratio
+        self._enabled, self._depth_sigma = config.enabled, config.depth_sigma
         self._focal_px = 0.5 * (camera.fx_px + camera.fy_px)
         self._level = level
         self._new_key = new_key
@@ -48,9 +59,9 @@ class Tracker:
             return []
         self._steps.append(odometry)
         self._refined.append(odometry.delta)
-        if not self._config.enabled:
+        if not self._enabled:
             return []
-        proposals = [self._register_back(node, back) for back in range(1, min(self._config.back, node) + 1)]
+        proposals = [self._register_back(node, back) for back in range(1, min(BACK, node) + 1)]
         first = proposals[0]
         if first.status is Status.ACCEPTED and first.relative is not None:
             self._refined[-1] = first.relative.delta
@@ -73,8 +84,8 @@ class Tracker:
             start = compose(start, refined)
         fixed, moving = self._keyframes[node - back], self._keyframes[node]
         guess = from_planar(start)
-        pairs = self._pairs(fixed, moving, guess) if self._config.keypoints else None
-        fit = register(fixed.surface, moving.surface, guess, prior, self._config, pairs)
+        pairs = self._pairs(fixed, moving, guess)
+        fit = register(fixed.surface, moving.surface, guess, prior, pairs)
         proposal = self._judge(node - back, node, fit, prior)
         if fit is not None and proposal.status is Status.ACCEPTED:
             if back <= 2:
@@ -84,20 +95,20 @@ class Tracker:
         return proposal
 
     def _pairs(self, fixed: Keyframe, moving: Keyframe, guess: Array) -> PointPairs | None:
-        matches = match(fixed.features, moving.features, self._ratio)
-        pairs = point_pairs(fixed, moving, matches, self._focal_px, self._config.depth_sigma)
-        return None if pairs is None else pairs.near(guess, self._config.keypoint_reach_m)
+        matches = match(fixed.features, moving.features)
+        pairs = point_pairs(fixed, moving, matches, self._focal_px, self._depth_sigma)
+        return None if pairs is None else pairs.near(guess, KEYPOINT_REACH_M)
 
     def _judge(self, source: int, target: int, fit: Registration | None, prior: RelativePose) -> Edge:
         registered: dict[str, Any] = {"method": Method.DEPTH, "search": Search.CHAIN, "key": self._new_key()}
         if fit is None:
             return Edge.decided(source, target, EdgeKind.REGISTRATION, None, lack=Lack.NO_DEPTH, **registered)
         held = self._keyframes[source].held or self._keyframes[target].held
-        relative = self._level.applied(fit.relative, *self._config.floors(held))
+        relative = self._level.applied(fit.relative, *(HELD_FLOORS if held else FLOORS))
         error = log(between(prior.delta, relative.delta))
         distance = float(np.sqrt(error @ np.linalg.solve(prior.covariance + relative.covariance, error)))
-        asked = checks.of_step(fit.inliers, fit.slack_m, distance, self._config)
-        far = passed(asked) and distance > self._config.contradiction_sigma
+        asked = checks.of_step(fit.inliers, fit.slack_m, distance)
+        far = passed(asked) and distance > checks.CONTRADICTION_SIGMA
         figures = {
             "points": float(fit.points),
             "depth_residual_m": fit.residual_m,

@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import pytest
 
-from hybridmap.config.laser import CommitmentConfig, LaserRelocalisingConfig, ProbeConfig, TrackingConfig
 from hybridmap.vision.laser import checks
 
-TRACKING, PROBES, COMMITMENT, LOST = TrackingConfig(), ProbeConfig(), CommitmentConfig(), LaserRelocalisingConfig()
 HAIR = 1e-6
 RULES = {
-    "step": (lambda **f: checks.of_step(c=TRACKING, **f), {"inliers": TRACKING.inliers_weak, "off_odometry_m": 0.4}),
-    "way": (lambda **f: checks.of_way(c=LOST, **f), {"odometry_sigma": LOST.contradiction_sigmas, "violation": LOST.violation}),
-    "fit": (lambda **f: checks.of_fit(c=PROBES, **f), {"near": PROBES.near_min, "fit": PROBES.fit_min}),
+    "step": (checks.of_step, {"inliers": checks.INLIERS_WEAK, "off_odometry_m": checks.TRANSLATION_MAX_M}),
+    "way": (checks.of_way, {"odometry_sigma": checks.CONTRADICTION_SIGMAS, "violation": checks.WAY_VIOLATION}),
+    "fit": (lambda **f: checks.of_fit(fit_min=0.7, **f), {"near": checks.NEAR_MIN, "fit": 0.7}),
     "gate": (lambda **f: checks.of_gate(radius_m=3.0, heading_deg=20.0, **f), {"off_m": 3.0, "off_deg": 20.0}),
-    "place": (
-        lambda **f: checks.of_place(c=PROBES, **f),
-        {"loosest_m": PROBES.loosest_max_m, "ambiguity": PROBES.ambiguity_max},
-    ),
-    "free space": (lambda **f: checks.of_free_space(c=PROBES, **f), {"violation": PROBES.violation_max}),
+    "place": (checks.of_place, {"loosest_m": checks.LOOSEST_MAX_M, "ambiguity": checks.AMBIGUITY_MAX}),
+    "free space": (checks.of_free_space, {"violation": checks.VIOLATION_MAX}),
     "cluster": (
-        lambda **f: checks.of_cluster(least=3, least_m=2.0, c=COMMITMENT, **f),
-        {"probes": 3, "span_m": 2.0, "rival": COMMITMENT.rival},
+        lambda **f: checks.of_cluster(least=3, least_m=2.0, **f),
+        {"probes": 3, "span_m": 2.0, "rival": checks.RIVAL},
     ),
 }
 ARGUMENT = {"off_odometry_m": "off_m"}
@@ -47,4 +42,4 @@ def test_a_figure_just_beyond_its_limit_fails_by_name(rule, figure):
 
 
 def test_a_good_registration_may_lie_far_from_the_odometry():
-    assert [check.figure for check in checks.of_step(TRACKING.inliers_min, 9.0, TRACKING)] == ["inliers"]
+    assert [check.figure for check in checks.of_step(checks.INLIERS_MIN, 9.0)] == ["inliers"]

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from laser_worlds import LASER, cast, corridor, room
 
-from hybridmap.config.laser import LaserConfig, ScanConfig
 from hybridmap.geometry import IDENTITY
 from hybridmap.vision.laser.cloud import EMPTY, Cloud, cloud_of_scan, merged
 from hybridmap.vision.laser.submap import Atlas
@@ -12,7 +11,7 @@ from hybridmap.vision.laser.visibility import violation
 
 
 def test_points_lie_on_the_walls_and_normals_face_the_robot():
-    cloud = cloud_of_scan(cast(corridor(), np.zeros(3)), LASER, ScanConfig())
+    cloud = cloud_of_scan(cast(corridor(), np.zeros(3)), LASER)
     np.testing.assert_allclose(np.abs(cloud.points[:, 1]), 1.2, atol=1e-3)
     has = (cloud.normals**2).sum(axis=1) > 0.5
     assert has.mean() > 0.9
@@ -23,10 +22,10 @@ def test_points_lie_on_the_walls_and_normals_face_the_robot():
 
 def test_invalid_and_far_returns_are_left_out():
     ranges = np.full(len(LASER.bearings_rad), np.nan, np.float32)
-    assert len(cloud_of_scan(ranges, LASER, ScanConfig())) == 0
+    assert len(cloud_of_scan(ranges, LASER)) == 0
     ranges[100:150] = 25.0
     ranges[10:60] = 3.0
-    cloud = cloud_of_scan(ranges, LASER, ScanConfig(range_max_m=20.0))
+    cloud = cloud_of_scan(ranges, LASER)
     assert np.hypot(*(cloud.points - LASER.pose_base_laser[:2]).T).max() == pytest.approx(3.0, abs=0.02)
 
 
@@ -41,9 +40,9 @@ def test_merging_averages_a_cell_and_forgets_the_order():
 
 
 def _submap(world, pose):
-    atlas = Atlas(LaserConfig())
+    atlas = Atlas()
     ranges = cast(world, pose)
-    atlas.add(cloud_of_scan(ranges, LASER, ScanConfig()), ranges, IDENTITY.copy(), np.zeros((3, 3)))
+    atlas.add(cloud_of_scan(ranges, LASER), ranges, IDENTITY.copy(), np.zeros((3, 3)))
     return atlas.submap(0, [0]), [ranges]
 
 

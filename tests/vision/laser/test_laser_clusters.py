@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from hybridmap.config.laser import CommitmentConfig
 from hybridmap.geometry import RelativePose, between, compose
 from hybridmap.graph.edges import Lack, Search
 from hybridmap.vision.base import Belief
@@ -33,7 +32,7 @@ def hypothesis(probe, anchor, where=(2.0, 5.0, 0.3), quality=0.7, sigma_m=5.0):
 
 @pytest.fixture
 def commitment():
-    return Commitment(CommitmentConfig(), TRAVEL.__getitem__)
+    return Commitment(TRAVEL.__getitem__)
 
 
 def test_waits_until_enough_probes_over_enough_travel_agree(commitment):
@@ -51,7 +50,7 @@ def test_waits_until_enough_probes_over_enough_travel_agree(commitment):
 
 def test_a_wider_gate_asks_for_more_travel():
     def travel_needed(sigma_m):
-        commitment = Commitment(CommitmentConfig(), TRAVEL.__getitem__)
+        commitment = Commitment(TRAVEL.__getitem__)
         for key, probe in enumerate(range(200, 240, 2)):
             commitment.add(key, hypothesis(probe, 20, sigma_m=sigma_m))
             if commitment.settle(TRAVEL[probe], BELIEF):

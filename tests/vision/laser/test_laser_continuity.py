@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from laser_worlds import LASER, box, cast, ring, ring_drive, room
 
-from hybridmap.config.laser import LaserConfig, LaserRelocalisingConfig, ScanConfig
+from hybridmap.config.vision import RelocalisingConfig, VisionConfig
 from hybridmap.geometry import IDENTITY, RelativePose, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.streams.laser import LaserScan
@@ -25,14 +25,14 @@ class Chain:
 
     def __init__(self, taken, believed, world, config=None):
         rng = np.random.default_rng(4)
-        config = config or LaserConfig()
-        self.atlas, self.poses = Atlas(config), np.asarray(believed, float)
+        config = config or VisionConfig()
+        self.atlas, self.poses = Atlas(), np.asarray(believed, float)
         for at, pose in zip(taken, self.poses, strict=True):
             self.add(cast(world, at, rng), pose)
-        self.continuity = Continuity(config, self.atlas, LASER, Tracker(config, self.atlas))
+        self.continuity = Continuity(config, self.atlas, LASER, Tracker(self.atlas))
 
     def add(self, ranges, pose):
-        self.atlas.add(cloud_of_scan(ranges, LASER, ScanConfig()), ranges, pose, np.zeros((3, 3)))
+        self.atlas.add(cloud_of_scan(ranges, LASER), ranges, pose, np.zeros((3, 3)))
 
     def belief(self, sigma_m=0.05):
         n = len(self.poses)
@@ -86,7 +86,7 @@ def test_people_who_step_into_view_while_the_wheels_drop_out_are_no_carry():
 
 
 def test_it_can_be_switched_off():
-    config = LaserConfig(relocalising=LaserRelocalisingConfig(violation=1.0))
+    config = VisionConfig(relocalising=RelocalisingConfig(enabled=False))
     assert stepped([OTHER_ROOM], STRAIGHT, STRAIGHT, measured=False, config=config) == ()
 
 

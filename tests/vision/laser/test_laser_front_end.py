@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from laser_worlds import LASER, Run, cast, corridor, drifting, ring, ring_drive, room
 
-from hybridmap.config.laser import LaserConfig, ScanConfig
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, between, compose, log
@@ -150,10 +149,9 @@ def test_two_runs_give_the_same_bytes():
 
 
 def test_without_refined_self_motion_the_chain_is_the_odometry():
-    tracking = VisionConfig().laser.tracking.model_copy(update={"enabled": False})
     truth = ring_drive(0.4)
     odometry = drifting(truth, np.random.default_rng(2))
-    run = Run(ring(), truth, odometry, config=VisionConfig(laser=LaserConfig(tracking=tracking)))
+    run = Run(ring(), truth, odometry, config=VisionConfig.model_validate({"laser": {"tracking": {"enabled": False}}}))
     assert [p for p in run.proposals if p.kind is EdgeKind.REGISTRATION] == []
     last = run.node_at[-1]
     np.testing.assert_allclose(log(between(run.poses[-1], between(odometry[0], odometry[last]))), 0.0, atol=1e-9)
@@ -165,7 +163,7 @@ def test_scans_found_view_templates_and_are_recognised():
     scans = [LaserScan(i, cast(ring(), pose, rng)) for i, pose in enumerate(truth)]
     views = {}
     for on in (True, False):
-        config = VisionConfig(laser=LaserConfig(scan=ScanConfig(templates=on)))
+        config = VisionConfig.model_validate({"laser": {"scan": {"templates": on}}})
         front_end = LaserFrontEnd(config, LASER)
         views[on] = [front_end.observe(scan, IDENTITY) for scan in scans]
     numbers, lap = np.array([view.template for view in views[True]]), len(truth) // 2
@@ -186,7 +184,7 @@ def test_frames_of_another_kind_are_refused():
 
 
 def test_a_keyframe_holds_profile_and_ranges():
-    front_end = LaserFrontEnd(VisionConfig(laser=LaserConfig()), LASER)
+    front_end = LaserFrontEnd(VisionConfig(), LASER)
     ranges = cast(room(), IDENTITY)
     front_end.add_node(0, front_end.observe(LaserScan(5, ranges), IDENTITY))
     assert front_end.track(0, None) == []

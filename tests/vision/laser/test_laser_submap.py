@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from hybridmap.config.laser import LaserConfig
 from hybridmap.vision.laser.cloud import EMPTY
 from hybridmap.vision.laser.submap import Atlas
 
@@ -12,7 +11,7 @@ ALONG = np.column_stack([0.5 * np.arange(20), np.zeros(20), np.zeros(20)])
 
 @pytest.fixture
 def atlas():
-    out = Atlas(LaserConfig())
+    out = Atlas()
     for pose in ALONG:
         out.add(EMPTY, np.zeros(0, np.float32), pose, np.zeros((3, 3)))
     return out

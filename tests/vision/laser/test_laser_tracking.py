@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from laser_worlds import LASER, cast, corridor, ring, ring_drive, room
 
-from hybridmap.config.laser import LaserConfig, ScanConfig
 from hybridmap.geometry import IDENTITY, RelativePose, between, compose
 from hybridmap.vision.laser.cloud import cloud_of_scan
 from hybridmap.vision.laser.submap import Atlas
@@ -20,13 +19,13 @@ class Drive:
 
     def __init__(self, world, start, seed=0):
         self.world, self.pose, self.rng = world, start, np.random.default_rng(seed)
-        self.atlas = Atlas(LaserConfig())
-        self.tracker = Tracker(LaserConfig(), self.atlas)
+        self.atlas = Atlas()
+        self.tracker = Tracker(self.atlas)
         ranges = cast(world, start, self.rng)
         self.atlas.add(self.cloud(ranges), ranges, IDENTITY.copy(), np.zeros((3, 3)))
 
     def cloud(self, ranges):
-        return cloud_of_scan(ranges, LASER, ScanConfig())
+        return cloud_of_scan(ranges, LASER)
 
     def step(self, truth, odometry, between_nodes=()):
         self.pose = compose(self.pose, truth)

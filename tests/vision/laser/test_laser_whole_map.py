@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 from laser_worlds import LASER, Run, drifting, ring, ring_drive
 
-from hybridmap.config.laser import LaserConfig, LaserRelocalisingConfig
+from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind, Lack, Method, Search, Status
+from hybridmap.vision import relocalising
+from hybridmap.vision.laser import whole_map
+from hybridmap.vision.laser.hypotheses import WINDOW_M
 from hybridmap.vision.laser.whole_map import WholeMap
 
 EVERY = 5
@@ -57,7 +60,7 @@ def test_it_is_found_within_five_metres_by_loops_that_are_right(found):
     run, down = found
     way = np.hypot(*np.diff(run.truth[run.node_at[down] :, :2], axis=0).T).cumsum()
     loops = [p for p in across(run, down) if p.search is Search.WHOLE_MAP]
-    assert len({p.source for p in loops}) >= LaserRelocalisingConfig().support
+    assert len({p.source for p in loops}) >= relocalising.SUPPORT
     newest = max(p.source for p in loops)
     assert way[run.node_at[newest] - run.node_at[down] - 1] < 5.0
     errors = np.array([run.error(p) for p in across(run, down)])
@@ -76,7 +79,7 @@ def test_what_was_sought_on_the_whole_map_stays_with_its_figures(found):
 def test_mismatch_is_held_against_how_well_the_scans_of_the_drive_fit(found):
     run, down = found
     steps = {p.target: 1.0 - p.figures["fit"] for p in run.proposals if p.method is Method.SCANS and p.search is Search.CHAIN}
-    usual = LaserRelocalisingConfig().misfit
+    usual = whole_map.MISFIT
     sightings = [p for p in last_words(run) if "mismatch" in p.figures]
     assert len(sightings) >= 4
     for p in sightings:
@@ -106,21 +109,21 @@ def test_scans_are_traced_on_either_side_of_the_carry(found):
     assert np.percentile(np.hypot(off[:, 0], off[:, 1]), 95) < 0.03
 
 
-def test_of_many_submaps_those_with_the_likeliest_views_are_searched(found):
+def test_of_many_submaps_those_with_the_likeliest_views_are_searched(found, monkeypatch):
     run, down = found
     front_end, prober = run.front_end, run.front_end._prober
-    config = LaserConfig(relocalising=LaserRelocalisingConfig(submaps=3))
-    few = WholeMap(config, front_end._atlas, prober, LASER, front_end._profiles, int)
     anchors = prober.anchors_before(down)
+    assert front_end._whole_map._likeliest(down + 2, anchors) == anchors
+    monkeypatch.setattr(whole_map, "SUBMAPS", 3)
+    few = WholeMap(VisionConfig(), front_end._atlas, prober, LASER, front_end._profiles, int)
     places = run.truth[run.node_at]
     near = []
     for node in range(down + 2, down + 8):
         chosen = few._likeliest(node, anchors)
         assert chosen == sorted(chosen)
         assert len(chosen) == 3 < len(anchors)
-        near.append(np.hypot(*(places[chosen, :2] - places[node, :2]).T).min() < config.probes.window_m)
+        near.append(np.hypot(*(places[chosen, :2] - places[node, :2]).T).min() < WINDOW_M)
     assert np.mean(near) > 0.6
-    assert front_end._whole_map._likeliest(down + 2, anchors) == anchors
 
 
 def test_in_a_place_that_it_does_not_know_it_is_not_found():

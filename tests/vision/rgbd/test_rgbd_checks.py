@@ -4,49 +4,53 @@ from __future__ import annotations
 
 import pytest
 
-from hybridmap.config.rgbd import PnpConfig, RegistrationConfig, RgbdClosingConfig
 from hybridmap.vision.rgbd import checks
 
-PNP, REGISTRATION, CLOSING = PnpConfig(), RegistrationConfig(), RgbdClosingConfig()
 HAIR = 1e-6
-PLANE = {"height_m": PNP.max_height_m, "tilt_deg": PNP.max_tilt_deg, "reverse_m": PNP.agree_m, "reverse_deg": PNP.agree_deg}
+LEAST = 12
+PLANE = {
+    "height_m": checks.MAX_HEIGHT_M,
+    "tilt_deg": checks.MAX_TILT_DEG,
+    "reverse_m": checks.REVERSE_M,
+    "reverse_deg": checks.REVERSE_DEG,
+}
 RULES = {
     "step": (
-        lambda **f: checks.of_step(slack_m=0.0, c=REGISTRATION, **f),
-        {"depth_inliers": REGISTRATION.min_inliers, "odometry_sigma": REGISTRATION.contradiction_sigma},
+        lambda **f: checks.of_step(slack_m=0.0, **f),
+        {"depth_inliers": checks.DEPTH_INLIERS_MIN, "odometry_sigma": checks.CONTRADICTION_SIGMA},
     ),
-    "depth": (lambda **f: checks.of_depth(c=REGISTRATION, **f), {"depth_inliers": REGISTRATION.min_inliers}),
+    "depth": (checks.of_depth, {"depth_inliers": checks.DEPTH_INLIERS_MIN}),
     "profile": (lambda **f: checks.of_profile(c_t=0.4, **f), {"profile_G": 0.4}),
-    "matches": (lambda **f: checks.of_matches(c=PNP, **f), {"matches": PNP.min_inliers}),
-    "pose": (lambda **f: checks.of_pose(c=PNP, **f), {"feature_inliers": PNP.min_inliers}),
-    "reverse pose": (lambda **f: checks.of_reverse_pose(c=PNP, **f), {"feature_inliers_reverse": PNP.min_inliers}),
-    "plane": (lambda **f: checks.of_plane(held=False, c=PNP, **f), PLANE),
+    "matches": (lambda **f: checks.of_matches(least=LEAST, **f), {"matches": LEAST}),
+    "pose": (lambda **f: checks.of_pose(least=LEAST, **f), {"feature_inliers": LEAST}),
+    "reverse pose": (lambda **f: checks.of_reverse_pose(least=LEAST, **f), {"feature_inliers_reverse": LEAST}),
+    "plane": (lambda **f: checks.of_plane(held=False, **f), PLANE),
     "plane, held": (
-        lambda **f: checks.of_plane(held=True, c=PNP, **f),
-        PLANE | {"height_m": 3.0 * PNP.max_height_m, "tilt_deg": 2.0 * PNP.max_tilt_deg},
+        lambda **f: checks.of_plane(held=True, **f),
+        PLANE | {"height_m": 3.0 * checks.MAX_HEIGHT_M, "tilt_deg": 2.0 * checks.MAX_TILT_DEG},
     ),
     "refinement": (
         lambda off_features_m, off_features_deg, depth_inliers: checks.of_refinement(
-            off_features_m, off_features_deg, depth_inliers, PNP, REGISTRATION
+            off_features_m, off_features_deg, depth_inliers
         ),
         {
-            "off_features_m": 3.0 * PNP.agree_m,
-            "off_features_deg": 3.0 * PNP.agree_deg,
-            "depth_inliers": REGISTRATION.min_inliers,
+            "off_features_m": 3.0 * checks.REVERSE_M,
+            "off_features_deg": 3.0 * checks.REVERSE_DEG,
+            "depth_inliers": checks.DEPTH_INLIERS_MIN,
         },
     ),
-    "features alone": (lambda **f: checks.of_features_alone(c=PNP, **f), {"feature_inliers_both": PNP.min_inliers_alone}),
+    "features alone": (checks.of_features_alone, {"feature_inliers_both": checks.MIN_INLIERS_ALONE}),
     "depth alone": (
-        lambda **f: checks.of_depth_alone(c=PNP, **f),
+        checks.of_depth_alone,
         {
-            "depth_inliers": PNP.map_inliers,
-            "overlap": PNP.map_overlap,
-            "points": PNP.map_points,
-            "slack_m": PNP.map_sigma_m,
+            "depth_inliers": checks.MAP_INLIERS,
+            "overlap": checks.MAP_OVERLAP,
+            "points": checks.MAP_POINTS,
+            "slack_m": checks.MAP_SIGMA_M,
         },
     ),
-    "map": (lambda **f: checks.of_map(**f), {"map_sigma": checks.PLAUSIBLE_SIGMA}),
-    "support": (lambda **f: checks.of_support(c=CLOSING, **f), {"supporting": 1}),
+    "map": (checks.of_map, {"map_sigma": checks.PLAUSIBLE_SIGMA}),
+    "support": (checks.of_support, {"supporting": 1}),
 }
 DOWN = {
     *("depth_inliers", "matches", "feature_inliers", "feature_inliers_reverse", "feature_inliers_both"),
@@ -73,11 +77,7 @@ def test_a_figure_just_beyond_its_limit_fails_by_name(rule, figure):
 
 
 def test_a_sure_registration_may_contradict_the_odometry():
-    sure = checks.of_step(0.9, 0.01, 99.0, REGISTRATION)
+    sure = checks.of_step(0.9, 0.01, 99.0)
     assert [check.figure for check in sure] == ["depth_inliers"]
     for inliers, slack_m in ((checks.SURE_INLIERS, 0.01), (0.9, checks.SURE_SLACK_M)):
-        assert not checks.of_step(inliers, slack_m, 99.0, REGISTRATION)[-1].passed
-
-
-def test_no_support_is_asked_where_none_is_configured():
-    assert all(check.passed for check in checks.of_support(0, RgbdClosingConfig(support_nodes=0)))
+        assert not checks.of_step(inliers, slack_m, 99.0)[-1].passed

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from rgbd_room import camera, render
 
-from hybridmap.config.rgbd import PnpConfig
 from hybridmap.streams.rgbd import Camera
 from hybridmap.vision.rgbd.depth_grid import make_grid
 from hybridmap.vision.rgbd.features import detect
@@ -13,11 +12,11 @@ from hybridmap.vision.rgbd.posture import Posture, find_floor, vertical_of_struc
 def look(view: Camera, pose):
     frame = render(view, pose)
     grid = make_grid(frame.depth_m, view, 5, 0.003)
-    return grid, detect(frame.color[..., 0], frame.depth_m, view, 300, 10)
+    return grid, detect(frame.color[..., 0], frame.depth_m, view)
 
 
 def posture(mode, mounting):
-    return Posture(mode, mounting.T_base_camera, PnpSolver(mounting, PnpConfig(), 0), 0.8)
+    return Posture(mode, mounting.T_base_camera, PnpSolver(mounting, 12, 0))
 
 
 def angle_deg(a, b):

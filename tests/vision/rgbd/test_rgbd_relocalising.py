@@ -10,14 +10,12 @@ from rgbd_room import camera, render
 
 from hybridmap.backends import create
 from hybridmap.config import Config
-from hybridmap.config.rgbd import PnpConfig
-from hybridmap.config.vision import RelocalisingConfig
 from hybridmap.geometry import RelativePose, align, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import Rig
 from hybridmap.vision.gating import Chain
-from hybridmap.vision.rgbd import checks
+from hybridmap.vision.rgbd import checks, whole_map
 from hybridmap.vision.rgbd.pnp import Verification
 from hybridmap.vision.rgbd.whole_map import WholeMap, chain_of
 from hybridmap.vision.templates import Matcher
@@ -101,7 +99,7 @@ def test_every_back_end_survives_it(carried, found, name):
 
 
 def test_it_stays_lost_where_the_whole_map_is_not_searched(carried):
-    mapper, found_at = mapped(carried, **{"vision.relocalising.candidates": 0})
+    mapper, found_at = mapped(carried, **{"vision.relocalising.enabled": False})
     assert found_at is None
     assert off_m(mapper.poses(), carried[0]).max() > 0.5
 
@@ -127,10 +125,10 @@ class FakeVerifier:
     def verify(self, source, target):
         delta = self.found.get((source.number, target.number))
         relative = None if delta is None else RelativePose(np.array(delta, float), np.eye(3) * 1e-4)
-        return Verification(relative, Method.FEATURES, checks.of_pose(0 if delta is None else 20, PnpConfig()))
+        return Verification(relative, Method.FEATURES, checks.of_pose(0 if delta is None else 20, 12))
 
 
-def test_the_likeliest_views_some_nodes_apart_are_verified():
+def test_the_likeliest_views_some_nodes_apart_are_verified(monkeypatch):
     rng = np.random.default_rng(0)
     profiles = rng.normal(size=(31, 2, 16)).astype(np.float32)
     profiles[30] = profiles[12] + 0.1 * profiles[20]
@@ -140,8 +138,8 @@ def test_the_likeliest_views_some_nodes_apart_are_verified():
     for profile in profiles:
         matcher.add(profile)
     verifier = FakeVerifier({(30, 12): (0.1, 0.0, 0.0)})
-    config = RelocalisingConfig(candidates=3, separation=4)
-    found = WholeMap(keyframes, matcher, verifier, config, iter(range(99)).__next__).search(30, np.arange(25))
+    monkeypatch.setattr(whole_map, "CANDIDATES", 3)
+    found = WholeMap(keyframes, matcher, verifier, iter(range(99)).__next__).search(30, np.arange(25))
     assert len(found) == 3
     assert (found[0].target, found[0].status) == (12, Status.PENDING)
     assert (found[0].search, found[0].lack) == (Search.WHOLE_MAP, Lack.WAITING)
@@ -165,5 +163,4 @@ def step(status, sigma_m=0.01):
     ],
 )
 def test_one_wall_fits_any_other(steps, chain):
-    assert chain_of(steps, RelocalisingConfig(doubtful_m=0.1)) is chain
-    assert chain_of(steps, RelocalisingConfig(candidates=0)) is Chain.HOLDS
+    assert chain_of(steps) is chain

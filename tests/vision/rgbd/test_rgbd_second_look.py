@@ -8,13 +8,13 @@ from rgbd_room import camera, render
 from test_rgbd_front_end import NOT_CARRIED, PER_LAP, VIEW, belief_of, drive, errors, lap_poses
 
 from hybridmap.config import Config
-from hybridmap.config.rgbd import RgbdClosingConfig, RgbdConfig
-from hybridmap.config.vision import VisionConfig
+from hybridmap.config.vision import RgbdClosingConfig, RgbdConfig, VisionConfig
 from hybridmap.geometry import RelativePose, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import Rig
 from hybridmap.vision.base import VerifyingFrontEnd
+from hybridmap.vision.rgbd import checks, closing
 from hybridmap.vision.rgbd.front_end import RgbdFrontEnd
 from hybridmap.vision.rgbd.pnp import Verification, Verifier
 from hybridmap.vision.rgbd.revisits import Revisits
@@ -176,7 +176,7 @@ def test_a_mapper_mends_one_loop_and_retracts_another(poses, frames, monkeypatch
 def test_nodes_that_a_closure_has_moved_come_up_again_newest_first():
     poses = np.array([[0.5 * i, 0.0, 0.0] for i in range(8)])
     before, after = belief_of(poses), belief_of(moved(poses, 5, np.array([0.0, 0.4, 0.0])))
-    revisits = Revisits(RgbdClosingConfig())
+    revisits = Revisits()
     revisits.closed(7, 1.6, before)
     assert [revisits.next_moved(after) for _ in range(3)] == [6, 5, None]
     revisits.closed(7, 1.6, before)
@@ -184,10 +184,13 @@ def test_nodes_that_a_closure_has_moved_come_up_again_newest_first():
 
 
 @pytest.mark.parametrize("online", [0, 2])
-def test_while_driving_nodes_are_tried_again_once_the_map_has_moved_them(online, poses, frames):
+def test_while_driving_nodes_are_tried_again_once_the_map_has_moved_them(online, poses, frames, monkeypatch):
     """Odometry is so wrong that the second lap begins out of reach; when one view has closed it, the others follow."""
-    closing = RgbdClosingConfig(gate_m=0.6, gate_per_m=0.0, repropose_online=online, support_nodes=0, candidates=1, accept=1)
-    config = VisionConfig(rgbd=RgbdConfig(closing=closing), relocalising=NOT_CARRIED)
+    for name, value in (("GATE_PER_M", 0.0), ("REPROPOSE_ONLINE", online), ("ACCEPT", 1)):
+        monkeypatch.setattr(closing, name, value)
+    monkeypatch.setattr(checks, "of_support", lambda _: ())
+    narrow = RgbdClosingConfig(gate_m=0.6, candidates=1)
+    config = VisionConfig(rgbd=RgbdConfig(closing=narrow), relocalising=NOT_CARRIED)
     front_end, _, _ = drive(config, poses[:1], 0.0, frames[:1])
     drifted = moved(poses, PER_LAP - 4, np.array([0.0, 4.0, 0.0]))
     found = {}
