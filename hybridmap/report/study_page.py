@@ -126,6 +126,7 @@ def _render(study: Study) -> str:
         others=[_HEADS.get(name, name.replace("_", " ")) for name in others],
         bars=[_bar(verdict) for verdict in study.verdicts],
         missed=len(study.missed),
+        solves=any(result.figures.get("own_lost") is not None for _, result in study.rows),
         ate=study_figures.merit_figure(study, plan, f"{_HEADS[measure]} (m)", error, logarithmic=True),
         by_false_loops=any(share is not None for share in kept),
         kept=_shares(study, plan, "false loops kept (%)", _kept) if any(share not in (None, 100.0) for share in kept) else "",
@@ -158,7 +159,7 @@ def _tiles(study: Study) -> list[tuple[str, str]]:
         (len(config.settings), "setting(s)"),
         (len(config.backends), "back-end(s)"),
         (len({(cell.kind, cell.rate) for cell in study.grid.cells}), "mix(es) of false loops"),
-        (len(config.seeds), "seed(s)"),
+        (len({cell.seed for cell in study.grid.cells}), "seed(s)"),
     ]
     return [(str(count), re.sub(r"\((\w+)\)", "" if count == 1 else r"\1", label)) for count, label in counts]
 
