@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from hybridmap.config import Config, gone, named_configs
 from hybridmap.errors import ConfigError
-from tools.configuration_page import tables
+from tools.configuration_page import PAGE, count, page, tables
 
 
 def test_overrides_win_over_the_file_which_wins_over_defaults(tmp_path):
@@ -71,11 +71,18 @@ def test_a_refusal_names_the_file_or_who_overrode_it(tmp_path):
     [
         ("simulation.wheels.slip_m", 0.1, "it is the constant SLIP_M in hybridmap/simulation/wheels.py"),
         ("neural.dtype", "float32", "every population has double precision"),
+        ("vision.laser.probes", {"points": 3}, "it is the constant POINTS in hybridmap/vision/laser/hypotheses.py"),
     ],
 )
 def test_a_setting_that_has_gone_says_what_became_of_it(key, value, said):
-    with pytest.raises(ConfigError, match=f"^command line: {key} is no longer a setting: {said}$"):
+    with pytest.raises(ConfigError, match=rf"^command line: {key}(\.\w+)? is no longer a setting: {said}$"):
         Config.load(None, {key: value})
+
+
+def test_a_setting_that_was_renamed_says_its_new_name():
+    with pytest.raises(ConfigError, match="vision.laser.retrace.enabled is now called vision.laser.dense_trajectory"):
+        Config.load(None, {"vision.laser.retrace.enabled": False})
+    assert not Config.stored("vision: {laser: {retrace: {enabled: false}}}", "session").vision.laser.dense_trajectory
 
 
 def test_what_became_of_a_setting_is_true():
@@ -92,10 +99,19 @@ def test_a_stored_configuration_is_read_without_what_has_gone():
     assert Config.stored(old, "session") == Config.load(None, {"nodes.distance_m": 0.4, "neural.gain": 1.5})
 
 
+def test_the_page_of_settings_is_current():
+    assert PAGE.read_text(encoding="utf-8") == page(), "write it anew: python tools/configuration_page.py"
+
+
+def test_there_are_few_settings_and_none_lies_deep():
+    assert count(Config().model_dump()) <= 110
+    assert max(setting.key.count(".") for table in tables() for setting in table.settings) <= 3
+
+
 def test_every_setting_says_what_it_does_and_in_which_unit():
     for table in tables():
         for setting in table.settings:
-            assert setting.does, setting.key
+            assert setting.does.endswith("."), setting.key
             assert setting.unit or not setting.type.startswith(("number", "integer")), setting.key
 
 

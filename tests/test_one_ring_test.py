@@ -4,12 +4,12 @@ from itertools import count
 
 import numpy as np
 import pytest
-
-from hybridmap.backends.judging.clusters import rejected_clusters
-from hybridmap.backends.judging.consistency import consistent_loops
 from hybridmap.config.agreement import AgreementConfig
 from hybridmap.config.laser import CommitmentConfig
 from hybridmap.config.rgbd import RgbdClosingConfig
+
+from hybridmap.backends.judging.clusters import rejected_clusters
+from hybridmap.backends.judging.consistency import consistent_loops
 from hybridmap.geometry import RelativePose
 from hybridmap.graph.agreement import BOUND, Ring
 from hybridmap.graph.edges import Edge, EdgeKind, Search, Status

@@ -92,7 +92,7 @@ def test_an_accepted_loop_shows_no_figure_that_would_have_refused_it(finished):
 
 def test_scans_between_nodes_are_put_right_on_the_final_map(finished, tmp_path):
     off = session.run(
-        RoomDrive(laps=2.2), Config.load("laser", OVERRIDES | {"vision.laser.retrace.enabled": False}), tmp_path / "s"
+        RoomDrive(laps=2.2), Config.load("laser", OVERRIDES | {"vision.laser.dense_trajectory": False}), tmp_path / "s"
     )
     truth = RoomDrive(laps=2.2).groundtruth
     error = {}

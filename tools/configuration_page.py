@@ -47,8 +47,8 @@ A configuration is a YAML file of sections, as in `configs/`. `--config NAME_OR_
 An unknown key is refused; one that has gone says what became of it. The resolved configuration is saved with every
 session as `config.yaml`.
 
-There are {count} settings. Whatever else decides something is a named constant beside the code that uses it, with the
-reason for its value. This page is written by `python tools/configuration_page.py`.
+There are {count} settings; a mounting or calibration, which is given as a whole or not at all, counts as one. Whatever else
+decides something is a named constant beside the code that uses it, with the reason for its value. This page is written by `python tools/configuration_page.py`.
 """
 
 
@@ -97,10 +97,15 @@ def section_of(annotation: Any) -> type[Section] | None:
     return next((found for part in typing.get_args(annotation) if (found := section_of(part))), None)
 
 
+def count(tree: dict[str, Any]) -> int:
+    """How many settings a configuration has; one section that is given as a whole or not at all counts as one."""
+    return sum(count(value) if isinstance(value, dict) else 1 for value in tree.values())
+
+
 def page() -> str:
     """The whole page."""
     found = list(tables())
-    parts = [INTRODUCTION.format(count=sum(len(table.settings) for table in found))]
+    parts = [INTRODUCTION.format(count=count(Config().model_dump()))]
     for table in found:
         parts.append(f"## {f'`{table.key}`: ' if table.key else ''}{table.title}\n")
         parts.append("| setting | unit | type | default | what it does | what to watch |\n|---|---|---|---|---|---|")

@@ -11,8 +11,8 @@ _CONSTANTS = """
 simulation simulation/stream.py speed_m_s turn_rate_rad_s odometry_rate_hz
 simulation.wheels simulation/wheels.py translation_m_per_sqrt_m rotation_deg_per_sqrt_m rotation_per_turn
 simulation.wheels simulation/wheels.py slips_per_m slip_m slip_deg
-simulation.camera simulation/camera.py forward_m height_m range_min_m depth_noise_m depth_noise_per_m depth_noise_width_px
-simulation.camera simulation/camera.py hole_fraction exposure_change color_noise
+simulation.camera simulation/camera.py forward_m height_m range_min_m range_max_m depth_noise_m depth_noise_per_m
+simulation.camera simulation/camera.py depth_noise_width_px hole_fraction exposure_change color_noise
 simulation.laser simulation/laser.py forward_m height_m range_min_m noise_m drop_fraction
 neural neural/grid.py softplus_sharpness fourier_modes kernel_gain_first kernel_gain_zero kernel_widths
 neural neural/band.py band_cells band_width
@@ -74,7 +74,15 @@ vision.rgbd.closing vision/rgbd/revisits.py repropose_sigma_m:MAP_SIGMA_M reprop
 vision.rgbd.closing vision/rgbd/support.py support_nodes
 """
 
-RENAMED: dict[str, str] = {}
+RENAMED: dict[str, str] = {
+    "vision.laser.tracking.enabled": "vision.tracking.enabled",
+    "vision.rgbd.registration.enabled": "vision.tracking.enabled",
+    "vision.laser.probes.gate_sigmas": "vision.closing.gate_sigmas",
+    "vision.rgbd.closing.gate_sigma": "vision.closing.gate_sigmas",
+    "vision.laser.revisits.rounds": "vision.closing.revisit_rounds",
+    "vision.rgbd.closing.repropose_rounds": "vision.closing.revisit_rounds",
+    "vision.laser.retrace.enabled": "vision.laser.dense_trajectory",
+}
 """Old dotted key -> the key that has taken its place, with the same meaning."""
 
 _RING = "loops agree by the covariances of the map and of their own"

@@ -145,8 +145,6 @@ class CameraConfig(Section):
     """Horizontal field of view, degrees."""
     rate_hz: float = Field(default=5.0, gt=0, le=60)
     """Frames a second."""
-    range_max_m: float = Field(default=5.0, gt=0, lt=13)
-    """No depth beyond this, m along the optical axis."""
 
 
 class LaserScannerConfig(Section):

@@ -20,8 +20,8 @@ FORWARD_M = 0.1
 """The camera stands this far in front of `base_link`, as on the head of a small robot."""
 HEIGHT_M = 1.0
 """Height above the floor, m: furniture and pictures on the walls are both in view."""
-RANGE_MIN_M = 0.4
-"""No depth nearer than this, m along the optical axis: the limit of a structured-light camera."""
+RANGE_MIN_M, RANGE_MAX_M = 0.4, 5.0
+"""No depth nearer or farther than this, m along the optical axis: the limits of a structured-light camera."""
 DEPTH_NOISE_M, DEPTH_NOISE_PER_M = 0.0012, 0.0019
 """Standard deviation of depth at 0.4 m, and its growth with the square of the distance beyond (Nguyen et al. 2012)."""
 DEPTH_NOISE_WIDTH_PX = 1.0
@@ -96,7 +96,7 @@ class CameraModel:
         return RgbdFrame(stamp_ns, color, self._depth(hits, cosine, rng))
 
     def _color(self, hits: Hits, cosine: NDArray[np.float32], gain: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-        depth = np.where(hits.hit, hits.length, np.float32(self._config.range_max_m))
+        depth = np.where(hits.hit, hits.length, np.float32(RANGE_MAX_M))
         # between the widths of the pixel's footprint along and across the slant
         slant = 1.0 / np.sqrt(np.maximum(cosine, np.float32(0.03)))
         footprint = (self._scene.px_per_m[hits.surface] * depth * slant / self.camera.fx_px).astype(np.float32)
@@ -117,7 +117,7 @@ class CameraModel:
             | (cosine < _GRAZING_COSINE * rng.random(z.shape, dtype=np.float32) ** 0.5)
         )
         lost |= self._shadow(z, rng) | self._patches(z.shape, rng)
-        lost |= (noisy < RANGE_MIN_M) | (noisy > self._config.range_max_m)
+        lost |= (noisy < RANGE_MIN_M) | (noisy > RANGE_MAX_M)
         millimetres = np.where(lost, 0.0, np.rint(noisy.astype(np.float64) * _MM_PER_M))
         return (millimetres / _MM_PER_M).astype(np.float32)
 

@@ -41,7 +41,7 @@ class Continuity:
     """Judges the chain of the atlas."""
 
     def __init__(self, config: VisionConfig, atlas: Atlas, laser: Laser, tracker: Tracker) -> None:
-        self._may_be_lost, self._gate_sigmas = config.relocalising.enabled, config.laser.probes.gate_sigmas
+        self._may_be_lost, self._gate_sigmas = config.relocalising.enabled, config.closing.gate_sigmas
         self._atlas = atlas
         self._laser = laser
         self._tracker = tracker

@@ -40,12 +40,12 @@ class LaserFrontEnd:
 
     def __init__(self, config: VisionConfig, laser: Laser) -> None:
         """Start without a node."""
-        self._config, self._profile_width = config.laser, config.profile.width
+        self._config, self._refines, self._profile_width = config.laser, config.tracking.enabled, config.profile.width
         self._laser = laser
         self._atlas = Atlas()
         self._tracker = Tracker(self._atlas)
-        self._prober = Prober(self._config.probes, self._atlas, laser)
-        self._reviser = Reviser(self._config, self._atlas, laser)
+        self._prober = Prober(config, self._atlas, laser)
+        self._reviser = Reviser(config, self._atlas, laser)
         self._commitment = Commitment(self._atlas.travel_m.__getitem__)
         self._templates = ViewTemplates(config.profile.width // 16, config.matching.mu_r, config.matching.mu_d)
         self._profiles: list[NDArray[np.float32]] = []
@@ -94,7 +94,7 @@ class LaserFrontEnd:
         if odometry is None:
             self._atlas.add(cloud, scan.ranges_m, IDENTITY.copy(), np.zeros((3, 3)))
             return []
-        if not self._config.tracking.enabled:
+        if not self._refines:
             self._atlas.add(cloud, scan.ranges_m, compose(self._atlas.chain[-1], odometry.delta), odometry.covariance)
             return []
         step = self._tracker.step(cloud, odometry, self._clouds_between)
@@ -142,7 +142,7 @@ class LaserFrontEnd:
 
     def retrace(self, belief: Belief) -> Anchors:
         """Register every scan to the final map."""
-        scans = [s for s in self._scans if s.node >= 0] if self._config.retrace.enabled else []
+        scans = [s for s in self._scans if s.node >= 0] if self._config.dense_trajectory else []
         return self._retracer.retrace(scans, np.array(self._steps), belief.poses_map_node)
 
     @property

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridmap.config.vision import ProbeConfig
+from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, invert_relative, wrap_angle
 from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, passed
 from hybridmap.streams.laser import Laser
@@ -127,8 +127,8 @@ class _Mode:
 class Prober:
     """Proposes and measures hypotheses."""
 
-    def __init__(self, config: ProbeConfig, atlas: Atlas, laser: Laser) -> None:
-        self._config = config
+    def __init__(self, config: VisionConfig, atlas: Atlas, laser: Laser) -> None:
+        self._gate_sigmas, self._fit_min = config.closing.gate_sigmas, config.laser.probes.fit_min
         self._atlas = atlas
         self._laser = laser
         self._anchors: list[int] = []
@@ -188,8 +188,8 @@ class Prober:
             return []
         covariance = GATE_INFLATION**2 * np.nan_to_num(belief.covariance_from(center)[anchors], posinf=UNKNOWN)
         sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:, :2, :2])[:, 1])
-        radius = self._config.gate_sigmas * sigma_m + GATE_M
-        heading = self._config.gate_sigmas * np.sqrt(covariance[:, 2, 2]) + np.deg2rad(GATE_DEG)
+        radius = self._gate_sigmas * sigma_m + GATE_M
+        heading = self._gate_sigmas * np.sqrt(covariance[:, 2, 2]) + np.deg2rad(GATE_DEG)
         expected = between(belief.poses_map_node[anchors], belief.poses_map_node[center])
         inside = np.hypot(expected[:, 0], expected[:, 1]) <= radius + WINDOW_M
         return [
@@ -225,7 +225,7 @@ class Prober:
         covariance = alignment.covariance(0, FLOOR_M, np.deg2rad(FLOOR_DEG))
         loosest_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1]))
         figures = {"start": mode.score, "inliers": float(alignment.inliers[0]), "rms_m": float(alignment.rms_m[0])}
-        asked, seen = checks.of_fit(near, fit, self._config.fit_min), 0.0
+        asked, seen = checks.of_fit(near, fit, self._fit_min), 0.0
         fits = passed(asked)
         if search is Search.GATE:
             figures["gate_sigma_m"] = gate.sigma_m

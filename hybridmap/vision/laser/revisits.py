@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.vision import LaserConfig
+from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import Array, between, invert_relative, wrap_angle
 from hybridmap.graph.edges import Search, passed
 from hybridmap.streams.laser import Laser
@@ -36,8 +36,8 @@ FLOOR_M, FLOOR_DEG = 0.002, 0.025
 class Reviser:
     """Rounds of re-proposal."""
 
-    def __init__(self, config: LaserConfig, atlas: Atlas, laser: Laser) -> None:
-        self._config = config
+    def __init__(self, config: VisionConfig, atlas: Atlas, laser: Laser) -> None:
+        self._most_rounds, self._fit_min = config.closing.revisit_rounds, config.laser.probes.fit_min
         self._atlas = atlas
         self._laser = laser
         self._rounds = 0
@@ -50,7 +50,7 @@ class Reviser:
             belief: where the nodes lie.
             since: how the map lies about this node and later ones with that about earlier ones is not known.
         """
-        if self._rounds >= self._config.revisits.rounds or len(self._atlas) == 0:
+        if self._rounds >= self._most_rounds or len(self._atlas) == 0:
             return []
         self._rounds += 1
         grid = self._grid()
@@ -101,7 +101,7 @@ class Reviser:
         if ambiguity > checks.AMBIGUITY_MAX:
             weakest = alignment.weakest_direction(0)
             covariance[:2, :2] += AMBIGUOUS_M**2 * np.outer(weakest, weakest)
-        asked, seen = checks.of_fit(near, fit, self._config.probes.fit_min), 0.0
+        asked, seen = checks.of_fit(near, fit, self._fit_min), 0.0
         fits = passed(asked)
         off_deg = float(np.rad2deg(abs(wrap_angle(off[2]))))
         asked += checks.of_gate(np.hypot(*off[:2]), off_deg, checks.OFF_MAX_M, checks.OFF_MAX_DEG)

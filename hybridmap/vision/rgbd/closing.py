@@ -66,6 +66,7 @@ class LoopCloser:
         self._keyframes = keyframes
         rgbd, matching = config.rgbd, config.matching
         self._closing, self._unverified = rgbd.closing, rgbd.verify == "none"
+        self._gate_sigmas = config.closing.gate_sigmas
         self._may_be_lost = config.relocalising.enabled
         self._verifier = verifier
         self._yaw_of_shift = yaw_of_shift
@@ -85,7 +86,7 @@ class LoopCloser:
         self._noted, self._gate_of_newest, self._ranking = -1, Gate(0.0, 0.0, 0, 0), np.zeros((0, 3))
         self._map_covariance = np.diag([MAP_SIGMA_M, MAP_SIGMA_M, np.deg2rad(MAP_SIGMA_DEG)]) ** 2
         self._second_look = SecondLook(keyframes, verifier, self._map_covariance)
-        self._rounds_left = rgbd.closing.repropose_rounds
+        self._rounds_left = config.closing.revisit_rounds
 
     def add_node(self, profile: Profile) -> None:
         """Store the profile of the next node."""
@@ -191,9 +192,9 @@ class LoopCloser:
         growth = GATE_PER_M * since
         radius = self._closing.gate_m + min(growth, GATE_GROWTH_M)
         radii: Array = np.full(node, radius)
-        if growth > GATE_GROWTH_M and self._closing.gate_sigma > 0:
+        if growth > GATE_GROWTH_M:
             spread = np.trace(belief.covariance_from(node)[:node, :2, :2], axis1=1, axis2=2)
-            radii = np.maximum(radii, self._closing.gate_m + self._closing.gate_sigma * np.sqrt(spread))
+            radii = np.maximum(radii, self._closing.gate_m + self._gate_sigmas * np.sqrt(spread))
         heading = np.deg2rad(HEADING_DEG + HEADING_DEG_PER_M * since)
         poses = belief.poses_map_node
         offset = poses[:node, :2] - poses[node, :2]

@@ -60,7 +60,7 @@ class RgbdFrontEnd:
         self._images: deque[tuple[int, RgbdFrame]] = deque(maxlen=rgbd.held_images)
         keys = itertools.count()
         level = NoiseLevel()
-        self._tracker = Tracker(self._keyframes, rgbd.registration, self._camera, level, keys.__next__)
+        self._tracker = Tracker(self._keyframes, config, self._camera, level, keys.__next__)
         self._verifier = Verifier(self._camera, rgbd.pnp.min_inliers, rgbd.registration.depth_sigma, level, seed)
         self._posture = Posture(rgbd.tilt, camera.T_base_camera, self._verifier.solver)
         self._closer = LoopCloser(

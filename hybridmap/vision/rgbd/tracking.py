@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hybridmap.config.vision import RegistrationConfig
+from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import Array, RelativePose, between, compose, compose_relative, log, loosest_direction
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status, passed
 from hybridmap.streams.rgbd import Camera
@@ -39,13 +39,13 @@ class Tracker:
     def __init__(
         self,
         keyframes: list[Keyframe],
-        config: RegistrationConfig,
+        config: VisionConfig,
         camera: Camera,
         level: NoiseLevel,
         new_key: Callable[[], int],
     ) -> None:
         self._keyframes = keyframes
-        self._enabled, self._depth_sigma = config.enabled, config.depth_sigma
+        self._enabled, self._depth_sigma = config.tracking.enabled, config.rgbd.registration.depth_sigma
         self._focal_px = 0.5 * (camera.fx_px + camera.fy_px)
         self._level = level
         self._new_key = new_key

@@ -71,7 +71,7 @@ def test_re_proposal_on_the_right_map_is_right_and_ends(two_laps):
     assert all([check.figure for check in p.checks] == every for p in near if p.search is Search.NEAR)
     errors = np.array([two_laps.error(p) for p in near])
     assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.15
-    for _ in range(VisionConfig().laser.revisits.rounds):
+    for _ in range(VisionConfig().closing.revisit_rounds):
         proposals = two_laps.front_end.finish(two_laps.belief(final))
     assert proposals == []
 
@@ -151,7 +151,7 @@ def test_two_runs_give_the_same_bytes():
 def test_without_refined_self_motion_the_chain_is_the_odometry():
     truth = ring_drive(0.4)
     odometry = drifting(truth, np.random.default_rng(2))
-    run = Run(ring(), truth, odometry, config=VisionConfig.model_validate({"laser": {"tracking": {"enabled": False}}}))
+    run = Run(ring(), truth, odometry, config=VisionConfig.model_validate({"tracking": {"enabled": False}}))
     assert [p for p in run.proposals if p.kind is EdgeKind.REGISTRATION] == []
     last = run.node_at[-1]
     np.testing.assert_allclose(log(between(run.poses[-1], between(odometry[0], odometry[last]))), 0.0, atol=1e-9)

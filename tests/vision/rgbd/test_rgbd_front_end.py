@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from rgbd_room import camera, render, textures
 
-from hybridmap.config.vision import RegistrationConfig, RelocalisingConfig, RgbdClosingConfig, RgbdConfig, VisionConfig
+from hybridmap.config.vision import (
+    ClosingConfig,
+    RelocalisingConfig,
+    RgbdClosingConfig,
+    RgbdConfig,
+    TrackingConfig,
+    VisionConfig,
+)
 from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import RelativePose, between, compose
 from hybridmap.graph.edges import EdgeKind, Method, Search, Status
@@ -125,7 +132,7 @@ def test_same_input_same_proposals(driven, poses, frames):
 
 def test_a_lone_closure_waits_and_is_given_up(poses, frames, monkeypatch):
     monkeypatch.setattr(closing, "PENDING_NODES", 2)
-    config = VisionConfig(rgbd=RgbdConfig(closing=RgbdClosingConfig(repropose_rounds=0)))
+    config = VisionConfig(closing=ClosingConfig(revisit_rounds=0))
     there = PER_LAP + 1
     kept = [*range(there), there, 3, 4, 5]  # one revisit, then views too young to close on
     front_end, proposals, odometry = drive(config, poses[kept[: there + 1]], 0.0, [frames[i] for i in kept[: there + 1]])
@@ -214,7 +221,7 @@ def test_frames_without_depth_make_nodes_and_no_edges():
 
 @pytest.mark.parametrize("mode", ["literal", "ratio", "signed", "plain", "four-band"])
 def test_seed_modes_close_by_the_shift_alone(mode, poses, frames):
-    config = VisionConfig(rgbd=RgbdConfig(matching=mode, verify="none", registration=RegistrationConfig(enabled=False)))
+    config = VisionConfig(rgbd=RgbdConfig(matching=mode, verify="none"), tracking=TrackingConfig(enabled=False))
     _, proposals, _ = drive(config, poses, 0.0, frames)
     loops = [p for p in proposals.values() if p.kind is EdgeKind.LOOP]
     assert loops
