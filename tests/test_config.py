@@ -80,7 +80,7 @@ def test_a_setting_that_has_gone_says_what_became_of_it(key, value, said):
 
 
 def test_a_setting_that_was_renamed_says_its_new_name():
-    with pytest.raises(ConfigError, match="vision.laser.retrace.enabled is now called vision.laser.dense_trajectory"):
+    with pytest.raises(ConfigError, match=r"vision\.laser\.retrace\.enabled is now called vision\.laser\.dense_trajectory$"):
         Config.load(None, {"vision.laser.retrace.enabled": False})
     assert not Config.stored("vision: {laser: {retrace: {enabled: false}}}", "session").vision.laser.dense_trajectory
 

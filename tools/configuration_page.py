@@ -48,7 +48,8 @@ An unknown key is refused; one that has gone says what became of it. The resolve
 session as `config.yaml`.
 
 There are {count} settings; a mounting or calibration, which is given as a whole or not at all, counts as one. Whatever else
-decides something is a named constant beside the code that uses it, with the reason for its value. This page is written by `python tools/configuration_page.py`.
+decides something is a named constant beside the code that uses it, with the reason for its value.
+This page is written by `python tools/configuration_page.py`.
 """
 
 
