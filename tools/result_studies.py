@@ -288,7 +288,7 @@ TOPICS = (
         ),
         _asked(
             ("chi2, held against 1.001 of the best known", "chi2/gtsam-lm"),
-            ("proved gap to the optimum (one is without a bar)", "certificate_gap/gtsam-lm"),
+            ("proved gap to the optimum", "certificate_gap/gtsam-lm"),
             ("process time", "cpu_s/gtsam-lm"),
         ),
         needs="posegraphs/city10000.g2o",
