@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
+
+import numpy as np
 
 from hybridmap.backends.base import SolveReport
 from hybridmap.config.mapping import EdgesConfig
-from hybridmap.graph.edges import Edge, EdgeKind, Lack
+from hybridmap.geometry import Array, RelativePose
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search
 from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.graph.uncertainty import relative_covariances
+from hybridmap.trajectory import NS_PER_S
+from hybridmap.vision.base import Belief
 
 
 class EdgeBook:
@@ -37,6 +45,28 @@ class EdgeBook:
             if proposal.contradicts_odometry and self._config.drop_contradicted:
                 changed += self._drop_odometry(proposal)
         return changed
+
+    def join(self, source: int, target: int, odometry: RelativePose) -> int:
+        """Hang a new node on the one that the robot was at; returns the edge."""
+        edge = Edge.decided(source, target, EdgeKind.ODOMETRY, odometry, method=Method.ODOMETRY, search=Search.CHAIN)
+        return self._map.add_edge(edge)
+
+    def belief(self, poses_of: Callable[[PoseGraph], Array], doubted: Sequence[int] = ()) -> Belief:
+        """What the map believes, for vision.
+
+        Args:
+            poses_of: poses (N, 3) of the nodes by the primary back-end, of a graph.
+            doubted: numbers of edges that hold nothing together.
+        """
+        own, nodes = self._config.gate == "odometry", self._map.nodes
+        graph = self._map.pose_graph().only(EdgeKind.ODOMETRY) if own else self._map.pose_graph()
+        graph = graph.with_edges(~np.isin(graph.edge_ids, doubted)) if len(doubted) else graph
+        return Belief(
+            poses_map_node=graph.initial if own else poses_of(graph),
+            stamps_s=np.array([node.stamp_ns for node in nodes]) / NS_PER_S,
+            travel_m=np.array([node.travel_m for node in nodes]),
+            covariance_from=cache(lambda node: relative_covariances(graph, node)),
+        )
 
     def without_weight(self, report: SolveReport) -> list[Edge]:
         """The proposed loops that a back-end gave no weight."""

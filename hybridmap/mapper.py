@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,47 +13,21 @@ from hybridmap.backends.ensemble import Ensemble
 from hybridmap.calibration.online import OnlineCalibration
 from hybridmap.config import Config
 from hybridmap.edge_book import EdgeBook
-from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, inverse
-from hybridmap.graph.edges import Edge, EdgeKind, Method, Search, Status
+from hybridmap.geometry import IDENTITY, Array, between, compose, inverse
+from hybridmap.graph.edges import Edge, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node, Novelty
-from hybridmap.graph.uncertainty import odometry_covariance, relative_covariances
 from hybridmap.metrics import StageClock
 from hybridmap.neural.path_integrator import PathIntegrator, Reanchoring
 from hybridmap.odometry_model import Gains
+from hybridmap.position import Position, Update
 from hybridmap.streams.base import Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
 from hybridmap.streams.sensors import rig_of
 from hybridmap.streams.synchronise import Ready, Synchroniser
-from hybridmap.trajectory import NO_ANCHORS, NS_PER_S, stamp_ns_from_s
+from hybridmap.trajectory import NO_ANCHORS, stamp_ns_from_s
 from hybridmap.vision import create_front_end
 from hybridmap.vision.base import Belief, RetracingFrontEnd, VerifyingFrontEnd, View
-
-
-@dataclass(frozen=True, slots=True)
-class Update:
-    """What one instant did to the map, and why.
-
-    Attributes:
-        stamp_ns: of the sample.
-        pose_odom_robot: (3,) decoded from the path integrator's activity; `odom` begins where the drive begins.
-        pose_map_robot: (3,) by the primary back-end.
-        poses_map_robot: the same by every back-end, by name.
-        at_node, delta_node_robot: the node that the robot is at (-1 before the first) and its pose (3,) seen from it.
-        new_node: the experience made here, None if none was.
-        edges: numbers of the edges that are new or changed their verdict.
-        reason: why a node was made, or why not.
-    """
-
-    stamp_ns: int
-    pose_odom_robot: Array
-    pose_map_robot: Array
-    poses_map_robot: Mapping[str, Array]
-    at_node: int
-    delta_node_robot: Array
-    reason: str
-    new_node: int | None = None
-    edges: tuple[int, ...] = ()
 
 
 class Mapper:
@@ -91,13 +64,7 @@ class Mapper:
         self.anchors = NO_ANCHORS
         self._synchroniser = Synchroniser(latency_s=config.sensors.latency_s, odometry_delay_s=config.sensors.odometry_delay_s)
         self._novelty = Novelty(config.nodes)
-        self._stamp_ns = 0
-        self._pose_odom_given: Array = IDENTITY
-        self._travel_m = 0.0
-        self._at_node = -1
-        self._pose_odom_at_node: Array = IDENTITY
-        self._pose_map_at_node: dict[str, Array] = {}
-        self._since_node = (0.0, 0.0)
+        self._position = Position(config.edges, self.backends.primary)
 
     def add_odometry(self, stamp_s: float, pose_odom_robot: ArrayLike) -> Update | None:
         """Take in a pose (3,) of `base_link` in `odom`; returns the newest update, None while nothing is ready."""
@@ -130,45 +97,33 @@ class Mapper:
 
     def step(self, ready: Ready) -> Update:
         """One instant through the paper's figure: cells, view, experience, closure, correction."""
-        pose_odom = self._path_integrate(ready)
-        moved = between(self._pose_odom_at_node, pose_odom)
-        view = self._look(ready, moved)
+        self._path_integrate(ready)
+        view = self._look(ready)
         if view is None and self.vision is not None:
-            return self._update(pose_odom, "no view at this instant")
-        reason = self._novelty.reason(moved, lambda: self.integrator.place_code, view is not None and view.new_template)
+            return self._position.update("no view at this instant")
+        new_view = view is not None and view.new_template
+        reason = self._novelty.reason(self._position.moved, lambda: self.integrator.place_code, new_view)
         if reason is None:
-            return self._update(pose_odom, "nothing new")
+            return self._position.update("nothing new")
         with self.clock.stage("graph"):
-            node = self._make_node(pose_odom, moved, view)
-            edges = self._join_to_chain(node)
+            node, edges = self._make_node(view)
             if view is not None:
                 edges += self._refine_self_motion(node, view)
                 edges += self._close_loops(node)
-            self._since_node = (0.0, 0.0)
+            self._position.rest()
             self._correct()
-        return self._update(pose_odom, reason + self._calibrate(), node, edges)
+        return self._position.update(reason + self._calibrate(), node, edges)
 
     def finish(self) -> list[Update]:
-        """End of the drive: settle what waits, propose loops again on the optimised map, let every back-end finish."""
+        """End of the drive, phase by phase: propose loops again, solve for good, look again, refine the trajectory."""
         updates = [self.step(ready) for ready in self._synchroniser.flush()]
-        pose_odom = self.cells.pose_odom_robot
-        while self.vision is not None and len(self.map):
-            with self.clock.stage("matching"):
-                proposals = self.vision.finish(self.belief())
-            edges = self.book.enter(proposals)
-            if not edges:
-                break
-            self._correct()
-            updates.append(self._update(pose_odom, "loops proposed again on the optimised map", None, edges))
-            if not any(proposal.status is Status.ACCEPTED for proposal in proposals):
-                break
+        self._position.pose_odom = self.cells.pose_odom_robot
         if len(self.map):
+            updates += self._propose_again()
             self._correct(final=True)
-            if edges := self._verify_again():
-                self._correct(final=True)
-                updates.append(self._update(pose_odom, "loops without weight measured again", None, edges))
+            updates += self._verify_again()
             self._retrace()
-            updates.append(self._update(pose_odom, "end of the drive"))
+            updates.append(self._position.update("end of the drive"))
         return updates
 
     @property
@@ -179,12 +134,12 @@ class Mapper:
     @property
     def pose_map_robot(self) -> Array:
         """(3,) where the robot is, by the primary back-end."""
-        return self._update(self.cells.pose_odom_robot, "").pose_map_robot
+        return self._position.pose_map(self.cells.pose_odom_robot)
 
     @property
     def pose_map_odom(self) -> Array:
         """(3,) the correction `map -> odom` (REP-105) for the odometry as it came in."""
-        return compose(self.pose_map_robot, inverse(self._pose_odom_given))
+        return compose(self.pose_map_robot, inverse(self._position.pose_odom_given))
 
     def poses(self, backend: str | None = None) -> Array:
         """(N, 3) current poses of all nodes by a back-end (default: the primary)."""
@@ -192,26 +147,28 @@ class Mapper:
 
     def belief(self, doubted: Sequence[int] = ()) -> Belief:
         """What the map believes, for the gating of loop closures; edges of the numbers `doubted` hold nothing together."""
-        own = self.config.edges.gate == "odometry"
-        graph = self.map.pose_graph().only(EdgeKind.ODOMETRY) if own else self.map.pose_graph()
-        graph = graph.with_edges(~np.isin(graph.edge_ids, doubted)) if len(doubted) else graph
-        return Belief(
-            poses_map_node=graph.initial if own else self.backends.poses(graph),
-            stamps_s=np.array([node.stamp_ns for node in self.map.nodes]) / NS_PER_S,
-            travel_m=np.array([node.travel_m for node in self.map.nodes]),
-            covariance_from=cache(lambda node: relative_covariances(graph, node)),
-        )
+        return self.book.belief(self.backends.poses, doubted)
 
     def _correct(self, final: bool = False) -> None:
         """Give the graph to every back-end."""
         graph = self.map.pose_graph()
-        if final:
-            self.backends.finish(graph)
-        else:
-            self.backends.update(graph)
-        self._pose_map_at_node = {name: self.backends.poses(graph, name)[self._at_node] for name in self.backends.names}
+        (self.backends.finish if final else self.backends.update)(graph)
+        self._position.correct({name: self.backends.poses(graph, name) for name in self.backends.names})
 
-    def _verify_again(self) -> list[int]:
+    def _propose_again(self) -> list[Update]:
+        """Let vision settle what waits and propose loops on the optimised map, as long as that brings something."""
+        updates: list[Update] = []
+        accepted = True
+        while accepted and self.vision is not None:
+            with self.clock.stage("matching"):
+                proposals = self.vision.finish(self.belief())
+            if edges := self.book.enter(proposals):
+                self._correct()
+                updates.append(self._position.update("loops proposed again on the optimised map", None, edges))
+            accepted = any(proposal.status is Status.ACCEPTED for proposal in proposals)
+        return updates
+
+    def _verify_again(self) -> list[Update]:
         """Have the loops that the primary back-end gave no weight measured again, from where they lie on its map."""
         solution = self.backends.solutions.get(self.backends.primary)
         if solution is None or not isinstance(self.vision, VerifyingFrontEnd) or self.config.edges.gate == "odometry":
@@ -219,7 +176,10 @@ class Mapper:
         doubted = self.book.without_weight(solution.report)
         with self.clock.stage("matching"):
             proposals = self.vision.verify(doubted, self.belief(solution.report.rejected_edge_ids)) if doubted else []
-        return self.book.enter_again(proposals)
+        if not (edges := self.book.enter_again(proposals)):
+            return []
+        self._correct(final=True)
+        return [self._position.update("loops without weight measured again", None, edges)]
 
     def _retrace(self) -> None:
         """Once the map is final, measure on it where the robot was between nodes."""
@@ -229,57 +189,42 @@ class Mapper:
 
     def _calibrate(self) -> str:
         """Let the gains follow the map, where the map is sure; returns what to add to the reason."""
-        change = self.calibration.follow(self._stamp_ns, self.map.pose_graph, self.poses)
+        change = self.calibration.follow(self._position.stamp_ns, self.map.pose_graph, self.poses)
         if change is None:
             return ""
         self.integrator.gains = change.gains
         return f"; {change}"
 
-    def _path_integrate(self, ready: Ready) -> Array:
+    def _path_integrate(self, ready: Ready) -> None:
         self.calibration.observe(ready.stamp_ns, ready.delta_robot)
         with self.clock.stage("neural"):
             self.integrator.step(ready.delta_robot, ready.dt_s)
-            pose_odom = self.cells.pose_odom_robot
-        self._stamp_ns, self._pose_odom_given = ready.stamp_ns, ready.pose_odom_robot
-        travel_m, turn_rad = float(np.hypot(ready.delta_robot[0], ready.delta_robot[1])), abs(float(ready.delta_robot[2]))
-        self._travel_m += travel_m
-        self._since_node = (self._since_node[0] + travel_m, self._since_node[1] + turn_rad)
-        return pose_odom
+            self._position.drive(ready, self.cells.pose_odom_robot)
 
-    def _look(self, ready: Ready, moved: Array) -> View | None:
+    def _look(self, ready: Ready) -> View | None:
         if self.vision is None or ready.observation is None:
             return None
         with self.clock.stage("profile"):
-            return self.vision.observe(ready.observation, moved if len(self.map) else IDENTITY)
+            return self.vision.observe(ready.observation, self._position.moved if len(self.map) else IDENTITY)
 
-    def _make_node(self, pose_odom: Array, moved: Array, view: View | None) -> int:
-        code = self.integrator.place_code
-        template = view.template if view is not None else -1
-        initial = compose(self.map.initial[self._at_node], moved) if len(self.map) else pose_odom
-        node = self.map.add_node(Node(self._stamp_ns, pose_odom, code, template, self._travel_m), initial)
+    def _make_node(self, view: View | None) -> tuple[int, list[int]]:
+        """Make an experience and join it to the node that the robot was at; from now on the robot is at the new one."""
+        at, code = self._position, self.integrator.place_code
+        initial = compose(self.map.initial[at.at_node], at.moved) if len(self.map) else at.pose_odom
+        node = self.map.add_node(
+            Node(at.stamp_ns, at.pose_odom, code, -1 if view is None else view.template, at.travel_m), initial
+        )
         self._novelty.remember(code)
         self.cells.remember(node)
-        return node
-
-    def _join_to_chain(self, node: int) -> list[int]:
-        """Join the new node to the one that the robot was at; from now on the robot is at the new one."""
-        edges = []
-        if node > 0:
-            relative = self._odometry_from(self._pose_odom_at_node, node)
-            edge = Edge.decided(self._at_node, node, EdgeKind.ODOMETRY, relative, method=Method.ODOMETRY, search=Search.CHAIN)
-            edges.append(self.map.add_edge(edge))
-        self._at_node, self._pose_odom_at_node = node, self.map.node(node).pose_odom
-        return edges
-
-    def _odometry_from(self, pose_odom_before: Array, node: int) -> RelativePose:
-        covariance = odometry_covariance(self.config.edges, *self._since_node)
-        return RelativePose(between(pose_odom_before, self.map.node(node).pose_odom), covariance)
+        edges = [self.book.join(at.at_node, node, at.odometry(at.pose_odom_at_node))] if node > 0 else []
+        at.hang(node, at.pose_odom)
+        return node, edges
 
     def _refine_self_motion(self, node: int, view: View) -> list[int]:
         assert self.vision is not None
         with self.clock.stage("tracking"):
             self.vision.add_node(node, view)
-            odometry = self._odometry_from(self.map.node(node - 1).pose_odom, node) if node > 0 else None
+            odometry = self._position.odometry(self.map.node(node - 1).pose_odom) if node > 0 else None
             proposals = self.vision.track(node, odometry)
         return self.book.enter(proposals) if self.config.edges.hanging == "chain" else []
 
@@ -288,27 +233,17 @@ class Mapper:
         with self.clock.stage("matching"):
             proposals = self.vision.close(node, self.belief())
         edges = self.book.enter(proposals)
-        closed = [proposal for proposal in proposals if proposal.status is Status.ACCEPTED]
-        if closed:
+        if closed := [proposal for proposal in proposals if proposal.status is Status.ACCEPTED]:
             self._recalibrate(max(closed, key=lambda proposal: proposal.source))
         return edges
 
     def _recalibrate(self, matched: Edge) -> None:
-        """Bring the cells back to the matched node, which lies in `odom` where the match has it, and hang the robot on it.
-
-        Both as configured: `neural.reanchor_weight` (paper eq. 16) and `edges.hanging: ratslam` (OpenRatSLAM).
-        """
+        """Bring the cells back to the matched node (paper eq. 16), and hang the robot on it if so configured (OpenRatSLAM)."""
         assert matched.relative is not None
         pose_odom_matched = compose(self.map.node(matched.source).pose_odom, matched.relative.delta)
         self.cells.recalibrate(matched.target, between(pose_odom_matched, self.cells.pose_odom_robot))
         if self.config.edges.hanging == "ratslam":
-            self._at_node, self._pose_odom_at_node = matched.target, pose_odom_matched
-
-    def _update(self, pose_odom: Array, reason: str, node: int | None = None, edges: list[int] | None = None) -> Update:
-        moved = between(self._pose_odom_at_node, pose_odom)
-        on_map = {name: compose(pose, moved) for name, pose in self._pose_map_at_node.items()}
-        primary = on_map.get(self.backends.primary, pose_odom)
-        return Update(self._stamp_ns, pose_odom, primary, on_map, self._at_node, moved, reason, node, tuple(edges or ()))
+            self._position.hang(matched.target, pose_odom_matched)
 
 
 def _newest(updates: list[Update]) -> Update | None:

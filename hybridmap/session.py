@@ -20,8 +20,9 @@ from hybridmap.graph.carries import carries
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.io import graph_hash
 from hybridmap.graph.observability import unobserved
-from hybridmap.mapper import Mapper, Update
+from hybridmap.mapper import Mapper
 from hybridmap.metrics import Metric, figure
+from hybridmap.position import Update
 from hybridmap.store import MapStore
 from hybridmap.store.session_folder import SessionFolder
 from hybridmap.store.track import trajectory_of

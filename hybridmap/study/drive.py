@@ -22,8 +22,9 @@ from hybridmap.evaluate.trajectory import absolute_error
 from hybridmap.geometry import Array, between
 from hybridmap.graph.carries import grounded
 from hybridmap.graph.edges import EdgeKind, Status
-from hybridmap.mapper import Mapper, Update
+from hybridmap.mapper import Mapper
 from hybridmap.metrics import StageClock
+from hybridmap.position import Update
 from hybridmap.simulation import SimulatedStream
 from hybridmap.store.track import Track, trajectory_of
 from hybridmap.streams import open_stream

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hybridmap.geometry import Array, RelativePose, between, compose, inverse
 from hybridmap.graph.agreement import Loops, agreement, largest_consistent_set
-from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status, at_least
+from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, Status, at_least, at_most, passed
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import Chain, Whereabouts
 
@@ -29,8 +29,18 @@ REHUNG_M, REHUNG_RAD = 0.5, float(np.deg2rad(10.0))
 """Standard deviations of the edge in the place of the broken one: it holds the chain together, the closures place it."""
 WHERE_IT_WAS = 2.0
 """A robot that is found within so many of these deviations of where the chain has it was not carried."""
+BELOW_HALF = float(np.nextafter(0.5, 0.0))
+"""The sightings that contradict those that agree must count for less than half as much."""
 KEPT_STEPS = 1000
 """The newest registrations, which are taken back where they reach across a break."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """A pair of views that was compared while the robot was lost, and how badly it fits: 0 for perfectly."""
+
+    edge: Edge
+    mismatch: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +64,7 @@ class Relocaliser:
     Sightings wait until `SUPPORT` of them, of distinct nodes over `span_m` of travel, put the robot at one and the same pose,
     and those that contradict them count for less than half as much. Then all of them enter the map together, and the odometry
     edge at which the chain broke gives way to one that leads to where they have it; registrations across the break are taken
-    back. A sighting may say how badly it fits (its figure `mismatch`, 0 for perfectly): the worse those that agree best, the
-    more travel is needed, and of one node's sightings the worse count less.
+    back. The worse those that agree best fit, the more travel is needed, and of one node's sightings the worse count less.
     """
 
     def __init__(self, whereabouts: Whereabouts, new_key: Callable[[], int], span_m: float) -> None:
@@ -63,7 +72,7 @@ class Relocaliser:
         self.whereabouts = whereabouts
         self._span_m = span_m
         self._new_key = new_key
-        self._waiting: list[Edge] = []
+        self._waiting: list[Sighting] = []
         self._agree: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
         self._steps: deque[Edge] = deque(maxlen=KEPT_STEPS)
 
@@ -72,25 +81,26 @@ class Relocaliser:
         self.whereabouts.tracked(node, chain)
         self._steps += [step for step in steps if step.status is Status.ACCEPTED]
 
-    def settle(self, found: list[Edge], belief: Belief) -> Settlement:
+    def settle(self, found: Sequence[Sighting], belief: Belief) -> Settlement:
         """Let new sightings wait; accept the largest set of them that agree through the chain, if it is good enough.
 
         Args:
             found: what was looked at, in any state; those that are pending are sightings.
             belief: the map's; poses on either side of the break are right among themselves.
         """
-        out = found + self._expired(belief)
-        self._waiting += [p for p in found if p.status is Status.PENDING and p.relative is not None]
+        out = [sighting.edge for sighting in found] + self._expired(belief)
+        self._waiting += [s for s in found if s.edge.status is Status.PENDING]
         if not self._waiting:
             return Settlement(out)
-        loops = Loops.measured([(s.source, s.target, s.relative) for s in self._waiting if s.relative is not None])
+        edges = [sighting.edge for sighting in self._waiting]
+        loops = Loops.measured([(e.source, e.target, e.relative) for e in edges if e.relative is not None])
         self._agree = agreement(loops, belief.ways, known=self._agree)
         weights = self._weights()
         chosen = np.flatnonzero(largest_consistent_set(self._agree, weights))
-        if not self._enough(chosen, weights, belief):
+        asked = self._asked(chosen, weights, belief)
+        if not passed(asked):
             return Settlement(out)
-        agreeing = at_least("agreeing", len(chosen), SUPPORT)
-        friends = tuple(self._waiting[i].settled(agreeing) for i in chosen.tolist())
+        friends = tuple(edges[i].settled(*asked) for i in chosen.tolist())
         self._waiting = [s for i, s in enumerate(self._waiting) if i not in set(chosen.tolist())]
         out += [*friends, *self.dismiss(Lack.CONTRADICTED)]
         broken_at = self.whereabouts.break_before(min(s.source for s in friends))
@@ -102,7 +112,7 @@ class Relocaliser:
 
     def dismiss(self, lack: Lack = Lack.UNSUPPORTED) -> list[Edge]:
         """Refuse all sightings that wait."""
-        out = [s.settled(lack=lack) for s in self._waiting]
+        out = [s.edge.settled(lack=lack) for s in self._waiting]
         self._waiting, self._agree = [], self._agree[:0, :0]
         return out
 
@@ -126,8 +136,8 @@ class Relocaliser:
     def _expired(self, belief: Belief) -> list[Edge]:
         """Refuse sightings that have waited too long."""
         old_nodes = belief.travel_m < belief.travel_m[-1] - WAIT_M
-        old = [s for s in self._waiting if old_nodes[s.source]]
-        kept = [i for i, s in enumerate(self._waiting) if not old_nodes[s.source]]
+        old = [s.edge for s in self._waiting if old_nodes[s.edge.source]]
+        kept = [i for i, s in enumerate(self._waiting) if not old_nodes[s.edge.source]]
         self._waiting, self._agree = [self._waiting[i] for i in kept], self._agree[np.ix_(kept, kept)]
         return [s.settled(lack=Lack.UNSUPPORTED) for s in old]
 
@@ -137,20 +147,25 @@ class Relocaliser:
         best = np.array([mismatch[sources == source].min() for source in sources])
         return np.asarray(np.exp((best - mismatch) / MISMATCH_SCALE))
 
-    def _enough(self, chosen: Indices, weights: Array, belief: Belief) -> bool:
-        """Whether the chosen ones, or the best fitting of them, cover enough travel, and hardly any contradict them."""
-        if 2.0 * (weights.sum() - weights[chosen].sum()) >= weights[chosen].sum():
-            return False
+    def _asked(self, chosen: Indices, weights: Array, belief: Belief) -> tuple[Check, ...]:
+        """What sightings that agree are held against: nodes, travel (less where they fit badly), and the weight of the rest.
+
+        The travel is that of the best fitting of them, of as many as make the most of it.
+        """
         mismatch = self._mismatch()[chosen]
         order = np.argsort(mismatch, kind="stable")
-        sources, worst = self._sources()[chosen[order]], MISMATCH_MAX
+        sources, span_m = self._sources()[chosen[order]], -1.0
         for count in range(SUPPORT, len(chosen) + 1):
-            fits = 1.0 - float(mismatch[order[:count]].mean()) / worst
+            fits = 1.0 - float(mismatch[order[:count]].mean()) / MISMATCH_MAX
             seen = np.unique(sources[:count])
-            span_m = float(belief.travel_m[seen[-1]] - belief.travel_m[seen[0]])
-            if fits > 0.0 and len(seen) >= SUPPORT and span_m * fits >= self._span_m:
-                return True
-        return False
+            if fits > 0.0 and len(seen) >= SUPPORT:
+                span_m = max(span_m, float(belief.travel_m[seen[-1]] - belief.travel_m[seen[0]]) * fits)
+        own = weights[chosen].sum()
+        return (
+            at_least("agreeing", len(np.unique(sources)), SUPPORT),
+            at_least("span_m", span_m, self._span_m),
+            at_most("rival", (weights.sum() - own) / own, BELOW_HALF),
+        )
 
     def _carried(self, broken_at: int, friends: tuple[Edge, ...], belief: Belief) -> bool:
         off = between(belief.poses_map_node[broken_at], placed_by(friends, broken_at, belief.poses_map_node))
@@ -176,10 +191,10 @@ class Relocaliser:
         )
 
     def _sources(self) -> Indices:
-        return np.array([s.source for s in self._waiting], dtype=np.int64)
+        return np.array([s.edge.source for s in self._waiting], dtype=np.int64)
 
     def _mismatch(self) -> Array:
-        return np.array([s.figures.get("mismatch", 0.0) for s in self._waiting])
+        return np.array([s.mismatch for s in self._waiting])
 
 
 def placed_by(sightings: Sequence[Edge], at: int, poses: Array) -> Array:

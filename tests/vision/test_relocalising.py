@@ -10,7 +10,7 @@ from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
 from hybridmap.vision import relocalising
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import Chain, Whereabouts
-from hybridmap.vision.relocalising import Relocaliser
+from hybridmap.vision.relocalising import Relocaliser, Sighting
 
 STEP_M = 0.3
 X = STEP_M * np.arange(200)
@@ -34,9 +34,9 @@ class Search:
         """Each sighting: the old node, and how badly it fits or None."""
         found = []
         for target, mismatch in sightings:
-            figures = {} if mismatch is None else {"mismatch": mismatch}
             relative = RelativePose(np.zeros(3), np.eye(3) * 1e-4)
-            found.append(Edge(node, target, EdgeKind.LOOP, Status.PENDING, relative, figures=figures, key=next(self.keys)))
+            edge = Edge(node, target, EdgeKind.LOOP, Status.PENDING, relative, key=next(self.keys))
+            found.append(Sighting(edge, mismatch or 0.0))
         self.settlements.append(self.relocaliser.settle(found, seen_until(node)))
         self.proposals |= {p.key: p for p in self.settlements[-1].proposals}
         return self
@@ -98,6 +98,20 @@ def test_a_robot_found_where_the_chain_has_it_was_not_carried():
     assert search.verdicts() == [Status.ACCEPTED] * 4
     assert search.verdicts(EdgeKind.REGISTRATION) == []
     assert search.settlements[-1].carried_to is None
+    assert not search.lost
+
+
+def test_sightings_that_enter_have_passed_what_they_are_held_against():
+    friends = Search().drive(range(40, 44), THERE).settlements[-1].friends
+    assert {tuple(check.figure for check in edge.checks) for edge in friends} == {("agreeing", "span_m", "rival")}
+
+
+def test_rivals_that_count_for_half_as_much_keep_it_waiting():
+    search = Search(span_m=0.0)
+    for node in range(40, 44):
+        search.see(node, (THERE + node - 40, None), *([(ELSEWHERE + node - 40, None)] if node < 42 else []))
+    assert search.lost
+    search.see(44, (THERE + 4, None))
     assert not search.lost
 
 
@@ -166,7 +180,7 @@ def test_sightings_of_a_chain_that_holds_hang_nothing_anew():
     for node in range(40, 44):
         delta = between(BELIEF.poses_map_node[node], BELIEF.poses_map_node[node] + [0.0, 3.0, 0.0])
         relative = RelativePose(delta, np.eye(3) * 1e-4)
-        found.append(Edge(node, THERE + node - 40, EdgeKind.LOOP, Status.PENDING, relative, key=node))
+        found.append(Sighting(Edge(node, THERE + node - 40, EdgeKind.LOOP, Status.PENDING, relative, key=node)))
     settlement = relocaliser.settle(found, seen_until(43))
     assert len(settlement.friends) == 4
     assert settlement.carried_to is None

@@ -15,7 +15,7 @@ from hybridmap.vision.laser.continuity import RECENT_M, Continuity
 from hybridmap.vision.laser.hypotheses import LENGTH_M, Hypothesis, Prober
 from hybridmap.vision.laser.submap import Atlas
 from hybridmap.vision.profile import Profile
-from hybridmap.vision.relocalising import Relocaliser, Settlement
+from hybridmap.vision.relocalising import Relocaliser, Settlement, Sighting
 from hybridmap.vision.templates import Matcher
 
 UNRECOGNISED_PROBES = 2
@@ -156,13 +156,13 @@ class WholeMap:
         likeliest = list(dict.fromkeys(following.tolist()))[:most]
         return [anchors[i] for i in sorted(likeliest)]
 
-    def _sighting(self, h: Hypothesis) -> Edge:
+    def _sighting(self, h: Hypothesis) -> Sighting:
         """What fits is a sighting; it fits the worse, the better the scans of this drive fit one another."""
-        sighting = h.proposed(self._new_key(), Lack.WAITING)
+        edge = h.proposed(self._new_key(), Lack.WAITING)
         if not h.passed:
-            return sighting
-        worse = max(1.0, MISFIT / (self._misfits / self._steps))
-        return replace(sighting, figures={**h.figures, "mismatch": worse * h.misfit})
+            return Sighting(edge)
+        mismatch = max(1.0, MISFIT / (self._misfits / self._steps)) * h.misfit
+        return Sighting(replace(edge, figures={**h.figures, "mismatch": mismatch}), mismatch)
 
     def _found(self, settlement: Settlement, belief: Belief) -> Settlement:
         """The robot knows where it is; where nothing had shown when it was carried, find that out."""

@@ -15,7 +15,7 @@ from hybridmap.metrics import StageClock
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import Chain, Gate, Whereabouts, nodes_within
 from hybridmap.vision.profile import Profile
-from hybridmap.vision.relocalising import Relocaliser
+from hybridmap.vision.relocalising import Relocaliser, Sighting
 from hybridmap.vision.rgbd import checks
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp import Candidate, Verification, Verifier
@@ -149,7 +149,7 @@ class LoopCloser:
         self._gate_of_newest = replace(self._gate_of_newest, whole_map=True)
         old = np.flatnonzero(belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s)
         seen = self._whole_map.search(node, np.setdiff1d(old, gated).astype(np.int64))
-        found = self._relocaliser.settle(seen, belief)
+        found = self._relocaliser.settle([Sighting(edge) for edge in seen], belief)
         if found.friends:
             for sighting in found.friends:
                 self._support.join(sighting.source, sighting.target)

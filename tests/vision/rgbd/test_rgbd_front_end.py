@@ -96,6 +96,7 @@ def test_consecutive_nodes_are_registered_better_than_odometry(driven, poses):
     accepted = [p for p in driven[1].values() if p.kind is EdgeKind.REGISTRATION and p.status is Status.ACCEPTED]
     assert len(accepted) > 1.6 * len(poses)
     assert all(p.source in (p.target - 1, p.target - 2) for p in accepted)
+    assert all(p.checks[0].figure == "depth_inliers" for p in accepted)
     found = errors(accepted, poses)
     assert np.median(found[:, 0]) < 0.004
     assert np.median(found[:, 1]) < 0.1
@@ -114,6 +115,14 @@ def test_the_second_lap_closes_on_the_first_and_only_rightly(driven, poses):
     asked = [[check.figure for check in p.checks] for p in accepted if p.method is Method.FEATURES_AND_DEPTH]
     assert len(asked) > 10
     assert all(figures == every for figures in asked)
+
+
+def test_features_that_no_depth_confirms_must_be_many(poses, frames, monkeypatch):
+    monkeypatch.setattr("hybridmap.vision.rgbd.pnp.register", lambda *_: None)
+    _, proposals, _ = drive(VisionConfig(), poses[: PER_LAP + 5], 0.0, frames[: PER_LAP + 5])
+    alone = [p for p in proposals.values() if p.method is Method.FEATURES and p.status is Status.ACCEPTED]
+    assert alone
+    assert all([check.figure for check in p.checks][-2:] == ["feature_inliers_both", "supporting"] for p in alone)
 
 
 def test_every_refusal_has_a_reason(driven):
@@ -225,6 +234,8 @@ def test_seed_modes_close_by_the_shift_alone(mode, poses, frames):
     _, proposals, _ = drive(config, poses, 0.0, frames)
     loops = [p for p in proposals.values() if p.kind is EdgeKind.LOOP]
     assert loops
+    assert all((p.method, p.search) == (Method.PROFILE, Search.GATE) for p in loops)
+    assert all([check.figure for check in p.checks] == ["profile_G"] for p in loops)
     assert all(p.relative.delta[:2] == pytest.approx([0.0, 0.0]) for p in loops)
     assert np.sqrt(np.diag(loops[0].relative.covariance)) == pytest.approx([0.7, 0.7, np.deg2rad(6.0)])
     if mode in ("plain", "four-band"):
