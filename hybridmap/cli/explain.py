@@ -135,7 +135,9 @@ def _decisions(decisions: Iterable[Decision], node: int) -> Iterator[str]:
         if edge.otherwise:
             yield _indented("otherwise", edge.otherwise)
         if any(weight < 1.0 for weight in decision.weights.values()):
-            yield _indented("weight", ", ".join(f"{name} {weight:.2g}" for name, weight in decision.weights.items()))
+            weights = ", ".join(f"{name} {weight:.2g}" for name, weight in decision.weights.items())
+            against = f"; contradicts the other loops by {', '.join(decision.inconsistent)}" if decision.inconsistent else ""
+            yield _indented("weight", weights + against)
         if decision.error is not None:
             yield _indented("off by", f"{decision.error[0]:.3f} m, {decision.error[1]:.2f} deg from the truth")
 

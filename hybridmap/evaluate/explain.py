@@ -35,12 +35,14 @@ class Decision:
         number: of the edge in the map file.
         edge: itself, with the record of the decision.
         weights: back-end -> weight of an accepted loop there (0: it has none).
+        inconsistent: the back-ends that gave it none because it contradicts the other loops.
         error: (m, deg) of its measurement against the truth, where that is known.
     """
 
     number: int
     edge: Edge
     weights: Mapping[str, float] = field(default_factory=dict)
+    inconsistent: tuple[str, ...] = ()
     error: tuple[float, float] | None = None
 
     def to_json(self) -> dict[str, Any]:
@@ -65,6 +67,7 @@ class Decision:
             "contradicts_odometry": e.contradicts_odometry,
             "otherwise": e.otherwise,
             "weights": dict(self.weights),
+            "inconsistent": list(self.inconsistent),
             "error_m": None if self.error is None else self.error[0],
             "error_deg": None if self.error is None else self.error[1],
         }
@@ -342,13 +345,14 @@ class Explainer:
         return int(old[best]), float(metres[best]), float(np.degrees(turned[best]))
 
     def _decision(self, number: int, edge: Edge) -> Decision:
-        weights = {}
+        weights, inconsistent = {}, []
         if edge.kind is EdgeKind.LOOP and edge.status is Status.ACCEPTED:
             for name, solution in self._store.solutions().items():
-                rejected = number in solution.report.rejected_edge_ids
-                weights[name] = 0.0 if rejected else solution.report.weights.get(number, 1.0)
+                report = solution.report
+                weights[name] = 0.0 if number in report.rejected_edge_ids else report.weights.get(number, 1.0)
+                inconsistent += [name] if number in report.inconsistent_edge_ids else []
             weights.pop("odometry", None)
-        return Decision(number, edge, weights, self._error(edge))
+        return Decision(number, edge, weights, tuple(inconsistent), self._error(edge))
 
     def _error(self, edge: Edge) -> tuple[float, float] | None:
         if self._truth is None or edge.relative is None:

@@ -173,7 +173,7 @@ class LaserFrontEnd:
             step.checks,
             method=Method.SCANS,
             search=Search.CHAIN,
-            figures={"inliers": step.inliers, "fit": step.fit},
+            figures={"fit": step.fit},
             key=self._next_key(),
             contradicts_odometry=step.contradicts_odometry,
         )

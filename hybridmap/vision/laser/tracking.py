@@ -56,8 +56,8 @@ class Step:
 
     Attributes:
         relative: pose of the new node in the frame of the one before; the odometry's where nothing was measured.
-        contradicts_odometry: a good registration says that the odometry is wrong.
         checks: that the registration was held against; the motion is the odometry's if one failed.
+        contradicts_odometry: a good registration says that the odometry is wrong.
         inliers, fit: of the registration.
         scatter: covariance (3, 3) of the new node's place in the submap.
     """
