@@ -13,8 +13,8 @@ from hybridmap.config.mapping import EdgesConfig
 from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search
 from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.graph.paths import relative_covariances
 from hybridmap.graph.pose_graph import PoseGraph
-from hybridmap.graph.uncertainty import relative_covariances
 from hybridmap.trajectory import NS_PER_S
 from hybridmap.vision.base import Belief
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from hybridmap.config.mapping import EdgesConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose
-from hybridmap.graph.uncertainty import odometry_covariance
+from hybridmap.graph.paths import odometry_covariance
 from hybridmap.streams.synchronise import Ready
 
 

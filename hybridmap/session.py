@@ -16,10 +16,9 @@ from hybridmap.calibration.sessions import GAIN_CHANGES
 from hybridmap.config import Config
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, between, compose
-from hybridmap.graph.carries import carries
 from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.graph.gaps import carries, unobserved
 from hybridmap.graph.io import graph_hash
-from hybridmap.graph.observability import unobserved
 from hybridmap.mapper import Mapper
 from hybridmap.metrics import Metric, figure
 from hybridmap.position import Update

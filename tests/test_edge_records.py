@@ -9,9 +9,9 @@ import pytest
 from hybridmap import session
 from hybridmap.cli.choose import choose
 from hybridmap.config import Config
-from hybridmap.graph.carries import carries
 from hybridmap.graph.edges import EdgeKind, Method, Search, Status
 from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.graph.gaps import carries
 from hybridmap.simulation import SimulatedStream
 from hybridmap.store import MapStore
 from tests.streams_for_tests import RoomDrive

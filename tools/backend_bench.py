@@ -35,9 +35,9 @@ from hybridmap.backends.relaxation import sweeps
 from hybridmap.backends.relaxation.sweeps import relax_links
 from hybridmap.config.backends import RelaxationConfig
 from hybridmap.geometry import Array, between, compose, exp, wrap_angle
-from hybridmap.graph.connectivity import chain
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.io import read_graph
+from hybridmap.graph.paths import chain
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.metrics import Metric, to_json
 from hybridmap.study.false_loops import inject

@@ -15,8 +15,8 @@ from hybridmap.backends.base import Backend, Solution
 from hybridmap.backends.gtsam.batch import run
 from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph
 from hybridmap.geometry import Array, between
-from hybridmap.graph.connectivity import chain
 from hybridmap.graph.io import read_graph
+from hybridmap.graph.paths import chain
 from hybridmap.graph.pose_graph import PoseGraph, prefix
 from hybridmap.metrics import Metric
 from hybridmap.study.false_loops import inject

@@ -16,7 +16,7 @@ from hybridmap.backends.objective import chi2, gate_of, squared_norms, total, un
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, between, compose
-from hybridmap.graph.connectivity import extend, require_connected
+from hybridmap.graph.paths import extend, require_connected
 from hybridmap.graph.pose_graph import Change, PoseGraph, difference, prefix
 
 _ROUNDING = 1e-9  # of chi2: a chain without loops has none, and no solver finds less

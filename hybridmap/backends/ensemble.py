@@ -10,7 +10,7 @@ from hybridmap.backends.registry import create
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array
-from hybridmap.graph.connectivity import extend
+from hybridmap.graph.paths import extend
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.metrics import StageClock
 

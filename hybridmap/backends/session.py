@@ -15,8 +15,8 @@ from hybridmap.backends.registry import LEAST_SQUARES, create
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError, GraphError
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, compose_relative, invert_relative
-from hybridmap.graph.connectivity import extend, require_connected
 from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.paths import extend, require_connected
 from hybridmap.graph.pose_graph import PoseGraph
 
 _EMPTY = PoseGraph(

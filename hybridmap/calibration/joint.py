@@ -29,7 +29,7 @@ from hybridmap.calibration.regression import CAUCHY, Sighting, require_told_by
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, between, compose, inverse
-from hybridmap.graph.connectivity import chain, own_odometry
+from hybridmap.graph.paths import chain, own_odometry
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.odometry_model import NEUTRAL, Gains
 

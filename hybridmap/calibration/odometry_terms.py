@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from hybridmap.calibration.legs import Legs, Motion
 from hybridmap.calibration.regression import leg_length, leg_sigmas
 from hybridmap.geometry import Array
-from hybridmap.graph.connectivity import own_odometry
 from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.paths import own_odometry
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.odometry_model import Gains
 

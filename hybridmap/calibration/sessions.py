@@ -19,8 +19,8 @@ from hybridmap.config import Config
 from hybridmap.config.gone import without_gone
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array, between
-from hybridmap.graph.connectivity import own_odometry
 from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.paths import own_odometry
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.odometry_model import GAIN_KEYS, Gains, remove
 from hybridmap.store import MapStore, SessionFolder

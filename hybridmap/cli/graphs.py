@@ -12,7 +12,7 @@ from hybridmap.config.backends import BackendsConfig
 from hybridmap.config.gone import without_gone
 from hybridmap.config.section import read_mapping
 from hybridmap.errors import GraphError
-from hybridmap.graph.carries import Carry, carries
+from hybridmap.graph.gaps import Carry, carries
 from hybridmap.graph.io import graph_hash, read_graph
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.store import MapStore, SessionFolder

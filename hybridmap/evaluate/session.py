@@ -13,7 +13,7 @@ from hybridmap.evaluate.edges import EdgeErrors, edge_errors
 from hybridmap.evaluate.loops import evaluate_loops
 from hybridmap.evaluate.relations import Relations, relation_errors, relations_of
 from hybridmap.evaluate.trajectory import absolute_error_of, drift_percent, relative_error_of
-from hybridmap.graph.carries import grounded
+from hybridmap.graph.gaps import grounded
 from hybridmap.metrics import ONLINE, Metric, figure
 from hybridmap.store import MapStore, SessionFolder, trajectory_of
 from hybridmap.trajectory import Trajectory, read_tum

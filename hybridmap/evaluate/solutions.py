@@ -11,7 +11,7 @@ from hybridmap.evaluate.relations import relations_of
 from hybridmap.evaluate.session import against_relations, against_truth
 from hybridmap.evaluate.trajectory import absolute_error
 from hybridmap.geometry import Array, compose, inverse
-from hybridmap.graph.carries import grounded, pieces
+from hybridmap.graph.gaps import grounded, pieces
 from hybridmap.metrics import Metric
 from hybridmap.store import MapStore, SessionFolder, trajectory_of
 from hybridmap.trajectory import read_tum

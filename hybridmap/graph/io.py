@@ -11,9 +11,9 @@ import numpy as np
 
 from hybridmap.errors import GraphError
 from hybridmap.geometry import Array, between, compose
-from hybridmap.graph.connectivity import chain
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.graph.paths import chain
 from hybridmap.graph.pose_graph import GraphFile, PoseGraph
 from hybridmap.output import write_text
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from hybridmap.neural.torus import Metric
-
+Metric = Literal["hexagonal", "square"]
 BAND_CELLS = 32
 """Cells of a band ring (three rings a module): a stripe is then some three cells wide."""
 BAND_WIDTH = 0.1

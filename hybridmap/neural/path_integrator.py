@@ -13,10 +13,19 @@ from hybridmap.config.mapping import NeuralConfig
 from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import Array, compose, inverse
 from hybridmap.neural.band import BandRings
-from hybridmap.neural.grid import FOURIER_MODES, Decoded, GridModules, PhaseDecoder, kernel_spectrum, relu, softplus
+from hybridmap.neural.grid import (
+    FOURIER_MODES,
+    Decoded,
+    GridModules,
+    LowModes,
+    PhaseDecoder,
+    kernel_spectrum,
+    relu,
+    shift_sheets,
+    softplus,
+)
 from hybridmap.neural.head_direction import HeadDirectionRing
 from hybridmap.neural.place import PlaceAttractor, PlaceCells, PlaceProjection
-from hybridmap.neural.torus import LowModes, shift_sheets
 from hybridmap.odometry_model import Gains, step_of
 
 log = logging.getLogger(__name__)
@@ -111,11 +120,6 @@ class PathIntegrator:
         if translates:
             self._translate(c * forward - s * left, s * forward + c * left, dt_s)
 
-    def step_velocity(self, v_m_s: float, omega_rad_s: float, dt_s: float) -> None:
-        """Integrate constant speed and turn rate over `dt_s`, by the mid-point heading."""
-        ds, dyaw = v_m_s * dt_s, omega_rad_s * dt_s
-        self.step((ds * np.cos(0.5 * dyaw), ds * np.sin(0.5 * dyaw), dyaw), dt_s)
-
     @property
     def pose(self) -> Array:
         """Pose (3,) decoded from activity, m and rad, in the frame in which the integrator started."""
@@ -140,10 +144,6 @@ class PathIntegrator:
         self._last_decoded_m = decoded.position_m
         self._since_decoding_m = 0.0
         return decoded
-
-    def module_phases(self) -> NDArray[np.float64]:
-        """Phases (M, 2) of the sheets' activity along the 0 and 120 degree bands, cycles in [0, 1)."""
-        return self.grid.phases()
 
     def module_errors(self, position_m: ArrayLike) -> Array:
         """Distance (M,) between what each module's sheet says and a true position (2,), in units of its spacing."""

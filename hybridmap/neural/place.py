@@ -10,7 +10,6 @@ from numpy.typing import DTypeLike, NDArray
 
 from hybridmap.config.mapping import PlaceConfig
 from hybridmap.geometry import Array
-from hybridmap.neural.torus import split_shift
 
 GRID_INPUTS_SIDE = 4
 """Grid cells along a side of each sheet that project to place cells; it divides every sheet's side."""
@@ -239,3 +238,9 @@ def _circulants(line: NDArray[np.floating], side: int) -> NDArray[np.floating]:
     """View (2 N, N) of a line laid end to end three times (3 N,): rows w to w + N are its circulant, moved by -w cells."""
     stride = line.strides[0]
     return np.lib.stride_tricks.as_strided(line[side:], shape=(2 * side, side), strides=(stride, -stride))
+
+
+def split_shift(shift_cells: float) -> tuple[int, float]:
+    """Split a shift into whole cells by floor and the residual in [0, 1) (paper eq. 10): -0.3 gives -1 and 0.7."""
+    whole = math.floor(shift_cells)
+    return whole, shift_cells - whole

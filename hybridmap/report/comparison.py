@@ -16,8 +16,8 @@ from hybridmap.backends.comparison import Row
 from hybridmap.backends.objective import squared_norms
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
-from hybridmap.graph.carries import Carry
 from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.gaps import Carry
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.output import Held, Kind, write_bytes, write_text
 from hybridmap.report import comparison_figures as figures

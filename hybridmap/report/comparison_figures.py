@@ -12,7 +12,7 @@ from hybridmap.backends.base import ODOMETRY
 from hybridmap.backends.comparison import Row, Way
 from hybridmap.backends.objective import squared_norms
 from hybridmap.geometry import Array
-from hybridmap.graph.carries import Carry, parted, through_the_air
+from hybridmap.graph.gaps import Carry, parted, through_the_air
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.report import style
 

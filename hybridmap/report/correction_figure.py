@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hybridmap.geometry import Array
-from hybridmap.graph.carries import Carry, parted
+from hybridmap.graph.gaps import Carry, parted
 from hybridmap.report import style
 from hybridmap.report.outline import raster
 from hybridmap.report.scene import Correction

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from hybridmap.backends.base import ODOMETRY
-from hybridmap.graph.carries import carries, pieces
 from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.gaps import carries, pieces
 from hybridmap.report import style
 from hybridmap.report.outline import Raster
 from hybridmap.report.scene import Scene

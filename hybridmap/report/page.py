@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridmap.backends.base import ODOMETRY
-from hybridmap.graph.carries import carries
+from hybridmap.graph.gaps import carries
 from hybridmap.metrics import Metric
 from hybridmap.output import write_text
 from hybridmap.report import tables

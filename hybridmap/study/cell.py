@@ -19,7 +19,7 @@ from hybridmap.backends.registry import create
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError, HybridMapError
 from hybridmap.geometry import Array, align, between, compose
-from hybridmap.graph.connectivity import chain
+from hybridmap.graph.paths import chain
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.study import provenance
 from hybridmap.study.false_loops import Kind, with_drift, with_false_loops

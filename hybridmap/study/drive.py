@@ -20,8 +20,8 @@ from hybridmap.evaluate.edges import edge_errors, normalised_errors
 from hybridmap.evaluate.relations import Relations, relation_errors, relations_of
 from hybridmap.evaluate.trajectory import absolute_error
 from hybridmap.geometry import Array, between
-from hybridmap.graph.carries import grounded
 from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.graph.gaps import grounded
 from hybridmap.mapper import Mapper
 from hybridmap.metrics import StageClock
 from hybridmap.position import Update

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from hybridmap.errors import GraphError
 from hybridmap.geometry import Array, between, compose, exp
-from hybridmap.graph.connectivity import chain
 from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.paths import chain
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.study.model import DriftConfig
 

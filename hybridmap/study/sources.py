@@ -15,9 +15,9 @@ from hybridmap.backends.registry import LEAST_SQUARES, create
 from hybridmap.config import Config
 from hybridmap.errors import HybridMapError, StreamError
 from hybridmap.geometry import Array, between, compose, exp
-from hybridmap.graph.connectivity import chain
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.io import read_graph
+from hybridmap.graph.paths import chain
 from hybridmap.graph.pose_graph import PoseGraph, prefix
 from hybridmap.study import disturb, provenance
 from hybridmap.study.drive import Drive, truth_at

@@ -10,7 +10,7 @@ import numpy as np
 from hybridmap.config.mapping import NeuralConfig
 from hybridmap.geometry import Array
 from hybridmap.neural import PathIntegrator
-from hybridmap.neural.torus import shift_sheets
+from hybridmap.neural.grid import shift_sheets
 from hybridmap.verification.drives import Drive, wander
 
 Cells = Literal["sheets", "rings", "both"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hybridmap.geometry import between, compose, exp
-from hybridmap.graph.connectivity import chain
 from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.paths import chain
 from hybridmap.graph.pose_graph import PoseGraph
 
 SIGMA = np.array([0.03, 0.02, 0.01])

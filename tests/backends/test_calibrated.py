@@ -9,9 +9,9 @@ from test_robust import ate
 
 from hybridmap import backends
 from hybridmap.geometry import between
-from hybridmap.graph.connectivity import chain
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.io import read_graph
+from hybridmap.graph.paths import chain
 from hybridmap.study.false_loops import inject
 
 BIAS = 0.12

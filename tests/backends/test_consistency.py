@@ -15,8 +15,8 @@ from hybridmap.backends.judging.consistency import Consistent, consistent_loops
 from hybridmap.config.backends import BackendsConfig, ConsistencyConfig
 from hybridmap.geometry import adjoint, align, inverse, transform_points
 from hybridmap.graph.agreement import ring
+from hybridmap.graph.paths import chain_of
 from hybridmap.graph.pose_graph import prefix
-from hybridmap.graph.uncertainty import chain_of
 from hybridmap.store.codec import report_from_json, report_to_json
 from hybridmap.study.false_loops import inject
 

@@ -12,8 +12,8 @@ from hybridmap import backends
 from hybridmap.backends.relaxation.linear import LinearRule, lambda_max, relax
 from hybridmap.config.backends import BackendsConfig, RelaxationConfig
 from hybridmap.geometry import align, transform_points, wrap_angle
-from hybridmap.graph.connectivity import chain
 from hybridmap.graph.io import read_graph
+from hybridmap.graph.paths import chain
 from hybridmap.study.false_loops import inject
 
 

@@ -12,7 +12,7 @@ from hybridmap.calibration.odometry_terms import terms_of
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import align, transform_points
-from hybridmap.graph.connectivity import own_odometry
+from hybridmap.graph.paths import own_odometry
 from hybridmap.odometry_model import Gains
 from tests.calibration.drives import circle, drive, experience_map
 

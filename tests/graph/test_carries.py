@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from hybridmap.geometry import RelativePose
-from hybridmap.graph.carries import carries, grounded, parted, pieces, through_the_air
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node
+from hybridmap.graph.gaps import carries, grounded, parted, pieces, through_the_air
 from hybridmap.trajectory import Trajectory
 
 SECOND = 10**9

@@ -5,9 +5,9 @@ import pytest
 
 from hybridmap.errors import GraphError
 from hybridmap.geometry import between, compose, exp
-from hybridmap.graph.connectivity import chain, require_connected
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.io import held, read_graph, write_g2o
+from hybridmap.graph.paths import chain, require_connected
 from hybridmap.graph.pose_graph import PoseGraph
 from tests.narrowing import known
 

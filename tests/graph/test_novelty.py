@@ -7,7 +7,7 @@ import numpy as np
 from hybridmap.config.mapping import EdgesConfig, NodesConfig
 from hybridmap.geometry import compose, exp
 from hybridmap.graph.experience_map import Novelty
-from hybridmap.graph.uncertainty import odometry_covariance
+from hybridmap.graph.paths import odometry_covariance
 
 HERE, ELSEWHERE = np.array([1.0, 0.0], np.float32), np.array([0.0, 2.0], np.float32)
 

@@ -3,8 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridmap.neural.grid import GridModules, combine_bands, kernel_spectrum, relu, softplus
-from hybridmap.neural.torus import LowModes, shift_sheets
+from hybridmap.neural.grid import GridModules, LowModes, combine_bands, kernel_spectrum, relu, shift_sheets, softplus
 
 SQUARED = LowModes(32, 4).squared_wave_number()
 GAINS = kernel_spectrum(SQUARED, 1.4, -1.0, (1.5, 0.3))

@@ -8,7 +8,7 @@ from hybridmap.config.mapping import NeuralConfig
 from hybridmap.errors import StreamError
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.band import BandMotion
-from hybridmap.neural.torus import shift_sheets
+from hybridmap.neural.grid import shift_sheets
 from tests.neural.neural_drives import arc, wander
 
 
@@ -123,11 +123,11 @@ def test_there_is_no_position_beside_the_network():
 
 def test_sheets_stop_when_the_bands_do(monkeypatch):
     integrator = PathIntegrator(NeuralConfig(band_drive=0.0))
-    before = integrator.module_phases()
+    before = integrator.grid.phases()
     still = BandMotion(np.zeros((8, 3)), np.ones((8, 3), complex))
     monkeypatch.setattr(integrator.bands, "step", lambda displacement_m: still)
     integrator.step((0.05, 0.0, 0.0), 0.1)
-    assert integrator.module_phases() == pytest.approx(before, abs=1e-9)
+    assert integrator.grid.phases() == pytest.approx(before, abs=1e-9)
 
 
 def test_a_jump_of_many_wraps_is_followed():
@@ -173,13 +173,6 @@ def test_modules_that_disagree_are_reported(caplog):
     integrator.grid.activity = shift_sheets(integrator.grid.activity, rng.uniform(size=(8, 2)))
     assert not integrator.decode().agreed
     assert "agree on no position" in caplog.text
-
-
-def test_velocities_are_integrated_by_the_midpoint():
-    one, other = PathIntegrator(NeuralConfig()), PathIntegrator(NeuralConfig())
-    one.step_velocity(0.5, 1.2, 0.1)
-    other.step(arc(0.5, 1.2, 0.1), 0.1)
-    assert one.pose == pytest.approx(other.pose)
 
 
 def test_gains_and_heading_bias():

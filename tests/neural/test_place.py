@@ -4,8 +4,8 @@ import pytest
 from hybridmap.config.mapping import NeuralConfig, PlaceConfig
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural import place as place_cells
+from hybridmap.neural.grid import shift_sheets
 from hybridmap.neural.place import PlaceCells
-from hybridmap.neural.torus import shift_sheets
 
 
 @pytest.fixture(scope="module")

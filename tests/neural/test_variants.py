@@ -11,9 +11,8 @@ from hybridmap import geometry
 from hybridmap.config.mapping import NeuralConfig
 from hybridmap.errors import ConfigError
 from hybridmap.neural import PathIntegrator
-from hybridmap.neural.grid import GridModules, kernel_spectrum, relu
+from hybridmap.neural.grid import GridModules, LowModes, kernel_spectrum, relu
 from hybridmap.neural.place import PlaceProjection
-from hybridmap.neural.torus import LowModes
 from tests.neural.neural_drives import wander
 
 

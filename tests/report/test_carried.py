@@ -14,8 +14,8 @@ from hybridmap.cli import main
 from hybridmap.cli.graphs import open_graph
 from hybridmap.evaluate.solutions import judge_solutions
 from hybridmap.geometry import RelativePose, between
-from hybridmap.graph.carries import carries
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
+from hybridmap.graph.gaps import carries
 from hybridmap.report import comparison_figures, correction_figure, map_figure, style
 from hybridmap.report.scene import Correction, Scene, load_scene
 from hybridmap.store import MapStore, SessionFolder

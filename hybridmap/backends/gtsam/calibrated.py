@@ -23,7 +23,7 @@ from hybridmap.backends.judging.weak import softened, truncated_cost
 from hybridmap.backends.objective import gate_of, residuals
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array, adjoint, between, log
-from hybridmap.graph.connectivity import own_odometry
+from hybridmap.graph.paths import own_odometry
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.odometry_model import NEUTRAL, Gains, apply
 

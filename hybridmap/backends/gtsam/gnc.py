@@ -26,7 +26,7 @@ from hybridmap.backends.judging.weak import softened, truncated_cost, weak_edges
 from hybridmap.backends.objective import SLACK, gate_of, squared_norms, unit_variance
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
-from hybridmap.graph.connectivity import extend
+from hybridmap.graph.paths import extend
 from hybridmap.graph.pose_graph import PoseGraph, prefix
 
 CHUNK_NODES = 500

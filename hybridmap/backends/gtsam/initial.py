@@ -11,7 +11,7 @@ from scipy.sparse.linalg import splu
 
 from hybridmap.backends.objective import chi2, truncated_cost
 from hybridmap.geometry import Array
-from hybridmap.graph.connectivity import extend
+from hybridmap.graph.paths import extend
 from hybridmap.graph.pose_graph import PoseGraph
 
 _NEAR = 100.0  # mean squared Mahalanobis residual from which another start is looked for

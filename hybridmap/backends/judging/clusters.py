@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 
 from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.agreement import Loops, ring
+from hybridmap.graph.paths import chain_of
 from hybridmap.graph.pose_graph import PoseGraph
-from hybridmap.graph.uncertainty import chain_of
 
 NEIGHBOURS = 10
 """Loops are neighbours where both of their ends lie within so many nodes of each other."""

@@ -8,7 +8,7 @@ from hybridmap.evaluate.closures import ClosureLimits, closure_errors
 from hybridmap.evaluate.edges import edge_errors
 from hybridmap.geometry import align, transform_points
 from hybridmap.graph.edges import EdgeKind
-from hybridmap.graph.observability import unobserved
+from hybridmap.graph.gaps import unobserved
 from hybridmap.mapper import Mapper
 from hybridmap.streams.open import open_stream
 

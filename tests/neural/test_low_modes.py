@@ -4,7 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from hybridmap.neural.torus import LowModes, shift_sheets, split_shift
+from hybridmap.neural.grid import LowModes, shift_sheets
+from hybridmap.neural.place import split_shift
 
 
 def stack_of(sheets):

@@ -8,8 +8,8 @@ import pytest
 from hybridmap.errors import GraphError
 from hybridmap.geometry import RelativePose, compose, compose_relative, invert_relative
 from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.paths import chain_of, relative_covariances
 from hybridmap.graph.pose_graph import PoseGraph
-from hybridmap.graph.uncertainty import chain_of, relative_covariances
 
 
 def graph_of(pairs, rng, nodes):

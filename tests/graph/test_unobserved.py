@@ -4,7 +4,7 @@ import pytest
 from hybridmap.geometry import RelativePose, loosest_direction
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node
-from hybridmap.graph.observability import unobserved
+from hybridmap.graph.gaps import unobserved
 from tests.narrowing import known
 
 ODOMETRY = np.diag([0.02, 0.02, 0.01]) ** 2
