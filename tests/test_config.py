@@ -69,7 +69,7 @@ def test_a_refusal_names_the_file_or_who_overrode_it(tmp_path):
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("simulation.wheels.slip_m", 0.1, "it is the constant SLIP_M in hybridmap/simulation/wheels.py"),
+        ("simulation.wheels.slip_m", 0.1, "it is the constant SLIP_M in hybridmap/simulation/motion.py"),
         ("neural.dtype", "float32", "every population has double precision"),
         ("vision.laser.probes", {"points": 3}, "it is the constant POINTS in hybridmap/vision/laser/hypotheses.py"),
     ],

@@ -17,7 +17,7 @@ import pytest
 
 from hybridmap.errors import OutputError
 from hybridmap.output import Kind, held, is_held, staged, write_bytes, write_text
-from hybridmap.report.comparison import COMPARISON
+from hybridmap.report.comparison_page import COMPARISON
 from hybridmap.simulation.writers.messages import RECORDING
 from hybridmap.store import SessionFolder
 from hybridmap.study.folder import STUDY_FOLDER

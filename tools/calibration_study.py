@@ -25,7 +25,7 @@ from hybridmap.calibration.legs import Motion
 from hybridmap.calibration.sessions import Drive, estimate_of, read_drive
 from hybridmap.cli.choose import choose
 from hybridmap.evaluate.association import Pairs, known_at, travel
-from hybridmap.evaluate.trajectory import motion_errors
+from hybridmap.evaluate.trajectory_errors import motion_errors
 from hybridmap.geometry import Array
 from hybridmap.metrics import Metric, to_json
 from hybridmap.odometry_model import NEUTRAL, Gains

@@ -24,7 +24,7 @@ from hybridmap import session
 from hybridmap.config import Config
 from hybridmap.errors import ConfigError
 from hybridmap.evaluate.relations import relation_errors, relations_of
-from hybridmap.evaluate.trajectory import absolute_error
+from hybridmap.evaluate.trajectory_errors import absolute_error
 from hybridmap.streams.open import open_stream
 from hybridmap.trajectory import read_tum
 

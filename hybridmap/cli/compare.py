@@ -12,7 +12,7 @@ import typer
 if TYPE_CHECKING:
     from hybridmap.backends.comparison import Row, Way
     from hybridmap.cli.graphs import GraphSource
-    from hybridmap.evaluate.solutions import Judged
+    from hybridmap.evaluate.session_errors import Judged
     from hybridmap.metrics import Metric
 
 _DEFAULT = "odometry,relaxation-ratslam,gtsam-lm,gtsam-cauchy,gtsam-gnc"
@@ -56,7 +56,7 @@ def compare(
     from hybridmap.cli.show import progress
     from hybridmap.errors import EvaluationError
     from hybridmap.output import held
-    from hybridmap.report.comparison import COMPARISON, Compared, write_comparison
+    from hybridmap.report.comparison_page import COMPARISON, Compared, write_comparison
 
     opened = open_graph(source)
     settings = settings_of(opened, config, setting)
@@ -91,7 +91,7 @@ def _names(backends: str) -> list[str]:
 
 def _judged(opened: GraphSource, rows: Sequence[Row], reference: Path | None, relations: Path | None) -> Judged:
     """Errors of the rows that have a map; none of a graph file."""
-    from hybridmap.evaluate.solutions import Judged, judge_solutions
+    from hybridmap.evaluate.session_errors import Judged, judge_solutions
 
     if not opened.is_session:
         return Judged(())
@@ -131,7 +131,7 @@ def _done(opened: GraphSource, ways: Sequence[Way]) -> str:
 
 def _table(rows: Sequence[Row], judged: Sequence[Metric]) -> list[list[str]]:
     """Column titles, then a line of text a row."""
-    from hybridmap.report.tables import number
+    from hybridmap.report.page_tables import number
 
     by_name = {metric.name: f"{metric.value:.4f}" for metric in judged}
     errors = {name: title for name, title in _ERRORS.items() if any(key.startswith(f"{name}/") for key in by_name)}

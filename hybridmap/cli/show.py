@@ -60,7 +60,7 @@ def _stage(row: Metric) -> str:
 def _plain_table(rows: list[Metric]) -> Table:
     from rich.table import Table
 
-    from hybridmap.report.tables import shown
+    from hybridmap.report.page_tables import shown
 
     table = Table()
     table.add_column("figure", no_wrap=True)
@@ -75,7 +75,7 @@ def _plain_table(rows: list[Metric]) -> Table:
 def _table_by_backend(rows: list[Metric], columns: list[str]) -> Table:
     from rich.table import Table
 
-    from hybridmap.report.tables import shown
+    from hybridmap.report.page_tables import shown
 
     table = Table()
     table.add_column("figure", no_wrap=True)

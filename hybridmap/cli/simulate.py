@@ -72,7 +72,7 @@ def _write(stream: SimulatedStream, out: Path, chosen: Format, *, overwrite: boo
 
 def _figures(stream: SimulatedStream, written: dict[str, int]) -> list[Metric]:
     from hybridmap.evaluate.association import travel
-    from hybridmap.evaluate.trajectory import absolute_error
+    from hybridmap.evaluate.trajectory_errors import absolute_error
     from hybridmap.metrics import Metric
 
     truth, carry = stream.groundtruth, stream.carry

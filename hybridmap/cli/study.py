@@ -109,7 +109,7 @@ def _known(done: Study, measure: str) -> bool:
 
 
 def _lines(done: Study, measure: str, others: list[str]) -> list[list[str]]:
-    from hybridmap.report.tables import interval, number
+    from hybridmap.report.page_tables import interval, number
 
     by_row: dict[tuple[str, str], dict[str, Summary]] = {}
     for one in done.summaries:

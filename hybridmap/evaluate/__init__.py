@@ -1,10 +1,9 @@
 """Estimates against the truth: trajectories, verified relations, loop closures, whole sessions."""
 
-from hybridmap.evaluate.closures import ClosureErrors, ClosureLimits, closure_errors
-from hybridmap.evaluate.edges import EdgeErrors, edge_errors
+from hybridmap.evaluate.edge_errors import ClosureErrors, ClosureLimits, EdgeErrors, closure_errors, edge_errors
 from hybridmap.evaluate.relations import RelationErrors, Relations, read_relations, relation_errors
-from hybridmap.evaluate.session import evaluate_session, session_trajectories
-from hybridmap.evaluate.trajectory import AbsoluteError, RelativeError, absolute_error, relative_error
+from hybridmap.evaluate.session_errors import evaluate_session, session_trajectories
+from hybridmap.evaluate.trajectory_errors import AbsoluteError, RelativeError, absolute_error, relative_error
 
 __all__ = [
     "AbsoluteError",

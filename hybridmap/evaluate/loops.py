@@ -1,32 +1,237 @@
-"""How well the views of a session tell its places apart: from the profiles that it stored, or made again from its keyframes."""
+"""How well the views of a session tell its places apart: from the profiles that it stored, or made again from its keyframes.
+
+Two nodes show *the same* place when they lie within `same_m` and `same_deg` of each other, *different* ones when they lie
+beyond `other_m` or `other_deg`; pairs between the two are not judged. Only nodes at least `gap_s` older count.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridmap.config.gone import without_gone
 from hybridmap.config.vision import MatchingConfig, ProfileConfig
 from hybridmap.errors import EvaluationError
-from hybridmap.evaluate.candidates import (
-    DEFAULT_LIMITS,
-    FROM_ANY_SIDE,
-    CandidateErrors,
-    Reading,
-    all_readings,
-    candidate_errors,
-    judge_pairs,
-    score_matrix,
-)
+from hybridmap.evaluate.association import MAX_GAP_S, known_at
+from hybridmap.geometry import Array, wrap_angle
 from hybridmap.metrics import Metric, figure
 from hybridmap.store import MapStore, SessionFolder
-from hybridmap.trajectory import Trajectory, read_tum
+from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
 from hybridmap.vision.profile import Profile, sees_all_around
-from hybridmap.vision.templates import Mode
+from hybridmap.vision.templates import GBar, Mode, ProfileStore, band_weights, combine, in_sequence
+
+Indices = NDArray[np.int64]
+
+MOST_QUERIES = 400
+"""Views that are compared with all older ones; of longer sessions so many, evenly spread."""
+
+
+@dataclass(frozen=True, slots=True)
+class CandidateLimits:
+    """When two nodes show the same place, and when different ones; see the head of the module."""
+
+    same_m: float = 1.0
+    same_deg: float = 30.0
+    other_m: float = 2.0
+    other_deg: float = 60.0
+    gap_s: float = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One way of scoring.
+
+    Attributes:
+        mode: the reading of G.
+        mu_r, mu_d: weights of intensity and depth.
+        max_shift: largest shift tried, columns.
+        g_bar: see `vision.templates.combine`.
+        sequence: views in a row that must match.
+        circular: the profiles go full circle.
+    """
+
+    mode: Mode
+    mu_r: float = 0.7
+    mu_d: float = 0.3
+    max_shift: int = 16
+    g_bar: GBar = "templates"
+    sequence: int = 1
+    circular: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class CandidateErrors:
+    """How well one reading tells places apart.
+
+    Attributes:
+        pair_auc: share of (same, different) pairs of pairs that are in the right order; 0.5 by chance, below it inverted.
+        top1: share of the revisits whose best match, of all older nodes, is the same place.
+        average_precision: area under precision over recall as the threshold on the best match is loosened.
+        recall_full_precision: largest recall of the revisits at a threshold without any false match.
+        queries, revisits, pairs: views compared, those of them that come back to a place, and pairs judged.
+    """
+
+    pair_auc: float
+    top1: float
+    average_precision: float
+    recall_full_precision: float
+    queries: int
+    revisits: int
+    pairs: int
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """Which pairs of nodes are the same place: rows are the queries, columns all nodes.
+
+    Attributes:
+        queries: (Q,) node numbers, ascending.
+        same, different: (Q, N); False where a pair is not judged.
+    """
+
+    queries: Indices
+    same: NDArray[np.bool_]
+    different: NDArray[np.bool_]
+
+
+DEFAULT_LIMITS = CandidateLimits()
+FROM_ANY_SIDE = CandidateLimits(same_deg=180.0, other_deg=180.0)
+"""For views that go full circle: a place is the same from whichever side it is entered."""
+
+
+def judge_pairs(
+    stamps_ns: NDArray[np.int64],
+    truth: Trajectory,
+    limits: CandidateLimits = DEFAULT_LIMITS,
+    max_gap_s: float = MAX_GAP_S,
+) -> Truth:
+    """Say of the nodes made at some stamps (N,) which show the same place and which do not."""
+    known = known_at(truth, stamps_ns, max_gap_s)
+    poses: Array = truth.at(stamps_ns) if known.any() else np.zeros((len(stamps_ns), 3))
+    candidates = np.flatnonzero(known & (stamps_ns - stamps_ns[0] >= limits.gap_s * NS_PER_S))
+    spread = np.linspace(0, len(candidates) - 1, min(len(candidates), MOST_QUERIES)).round().astype(np.int64)
+    queries = candidates[spread]
+    offset = poses[None, :] - poses[queries, None]
+    distance = np.hypot(offset[..., 0], offset[..., 1])
+    turned = np.degrees(np.abs(wrap_angle(offset[..., 2])))
+    judged = known[None] & (stamps_ns[queries, None] - stamps_ns[None] >= limits.gap_s * NS_PER_S)
+    same = judged & (distance <= limits.same_m) & (turned <= limits.same_deg)
+    different = judged & ((distance > limits.other_m) | (turned > limits.other_deg))
+    return Truth(queries, same, different)
+
+
+def score_matrix(profiles: Sequence[Profile], queries: Indices, readings: Sequence[Reading]) -> list[Array]:
+    """Scores of views against all older ones, for readings that share the profiles.
+
+    Args:
+        profiles: of all nodes, (bands, width) each.
+        queries: (Q,) the views, ascending.
+        readings: how to score; their largest shifts, and whether they are circular, must be one and the same.
+
+    Returns:
+        For each reading (Q, N), smaller for a better match; infinite where a node is not older than the view.
+    """
+    store = ProfileStore(readings[0].max_shift, readings[0].circular)
+    for profile in profiles:
+        store.add(profile)
+    wanted = _with_predecessors(queries, max(reading.sequence for reading in readings))
+    rows = [np.full((len(wanted), len(profiles)), np.inf) for _ in readings]
+    for at, number in enumerate(wanted):
+        if number == 0:
+            continue
+        g = store.differences(profiles[number], np.arange(number))
+        for row, r in zip(rows, readings, strict=True):
+            weights = band_weights(g.shape[1], r.mu_r, r.mu_d)
+            row[at, :number] = combine(g, store.shifts, r.mode, weights, r.g_bar)[0]
+    row_of = {int(number): at for at, number in enumerate(wanted)}
+    out = []
+    for row, r in zip(rows, readings, strict=True):
+        ordered = [_sequence(row, row_of, int(number), r) for number in queries]
+        out.append(np.stack(ordered) if ordered else np.zeros((0, len(profiles))))
+    return out
+
+
+def candidate_errors(scores: Array, truth: Truth) -> CandidateErrors:
+    """Judge scores (Q, N), smaller for a better match."""
+    same, different = scores[truth.same], scores[truth.different]
+    pool = np.where(truth.same | truth.different, scores, np.inf)
+    asked = np.flatnonzero(np.isfinite(pool).any(axis=1))
+    best = np.argmin(pool[asked], axis=1) if len(asked) else np.zeros(0, dtype=np.int64)
+    right = truth.same[asked, best]
+    revisits = truth.same[asked].any(axis=1)
+    precision, recall = _curve(pool[asked, best], right, int(revisits.sum()))
+    return CandidateErrors(
+        pair_auc=_auc(same, different),
+        top1=float(right[revisits].mean()) if revisits.any() else float("nan"),
+        average_precision=_average_precision(precision, recall) if revisits.any() else float("nan"),
+        recall_full_precision=float(recall[precision == 1.0].max(initial=0.0)) if revisits.any() else float("nan"),
+        queries=len(asked),
+        revisits=int(revisits.sum()),
+        pairs=len(same) + len(different),
+    )
+
+
+def _with_predecessors(queries: Indices, sequence: int) -> Indices:
+    before = queries[:, None] - np.arange(sequence)[None]
+    return np.unique(before[before >= 0])
+
+
+def _sequence(rows: Array, row_of: dict[int, int], number: int, reading: Reading) -> Array:
+    """Scores (N,) of one view with those before it."""
+    scores: Array = rows[row_of[number]]
+    if reading.sequence == 1:
+        return scores
+
+    def earlier(back: int, partners: Indices) -> Array:
+        return np.asarray(rows[row_of[number - back], partners])
+
+    out: Array = scores.copy()
+    out[:number] = in_sequence(scores[:number], np.arange(number), number, reading.sequence, earlier, reading.circular)
+    return out
+
+
+def _auc(same: Array, different: Array) -> float:
+    """Chance that a pair of the same place scores less than one of different places; ties count half."""
+    if len(same) == 0 or len(different) == 0:
+        return float("nan")
+    ordered = np.sort(different)
+    below = np.searchsorted(ordered, same, side="left")
+    tied = np.searchsorted(ordered, same, side="right") - below
+    return float(1.0 - np.mean((below + 0.5 * tied) / len(ordered)))
+
+
+def _curve(scores: Array, right: NDArray[np.bool_], revisits: int) -> tuple[Array, Array]:
+    """Precision and recall at each threshold at which the set of accepted matches changes."""
+    order = np.argsort(scores, kind="stable")
+    hits = np.cumsum(right[order])
+    last_of_tie = np.append(np.diff(scores[order]) > 0, True) if len(order) else np.zeros(0, dtype=np.bool_)
+    accepted = np.arange(1, len(order) + 1)
+    return (hits / accepted)[last_of_tie], (hits / max(revisits, 1))[last_of_tie]
+
+
+def _average_precision(precision: Array, recall: Array) -> float:
+    return float(np.sum(np.diff(recall, prepend=0.0) * precision))
+
+
+def all_readings(max_shift: int = 16) -> Iterable[tuple[str, int, Reading]]:
+    """Name, row bands (1 or 4) and reading of every mode: the seed's, RGB, depth, both, four bands, sequences."""
+    seed: tuple[Mode, ...] = ("literal", "ratio", "signed", "plain")
+    for mode in seed:
+        yield mode, 1, Reading(mode, max_shift=max_shift)
+    for name, mu_r in (("RGB", 1.0), ("depth", 0.0)):
+        yield f"plain, {name}", 1, Reading("plain", mu_r, 1.0 - mu_r, max_shift)
+    yield "four-band", 4, Reading("four-band", max_shift=max_shift)
+    for name, mu_r in (("RGB", 1.0), ("depth", 0.0)):
+        yield f"four-band, {name}", 4, Reading("four-band", mu_r, 1.0 - mu_r, max_shift)
+    for bands, sequenced in ((1, "plain"), (4, "four-band")):
+        mode = "plain" if sequenced == "plain" else "four-band"
+        yield f"{sequenced}, 5 in a row", bands, Reading(mode, max_shift=max_shift, sequence=5)
+
 
 Progress = Callable[[int, int | None], None]
 

@@ -1,6 +1,5 @@
 """Sessions for other tools: trajectories, graphs, clouds, grids."""
 
-from hybridmap.export.formats import FORMATS, Exported, export_session
-from hybridmap.export.view import ExportOptions
+from hybridmap.export.formats import FORMATS, Exported, ExportOptions, export_session
 
 __all__ = ["FORMATS", "ExportOptions", "Exported", "export_session"]

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.errors import ExportError
-from hybridmap.export.graphs import planar_matrix
-from hybridmap.export.view import ExportOptions, SessionView
+from hybridmap.export.formats import ExportOptions, SessionView
+from hybridmap.export.poses import planar_matrix
 from hybridmap.geometry import Array, compose, transform_points
 from hybridmap.metrics import Metric
 from hybridmap.output import write_text

@@ -11,9 +11,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 from hybridmap.output import write_text
-from hybridmap.report import study_figures, tables
+from hybridmap.report import page_tables as tables
+from hybridmap.report import study_figures
+from hybridmap.report.page_tables import rendered
 from hybridmap.report.study_figures import FLOOR_M, MOST_PANELS
-from hybridmap.report.template import rendered
 from hybridmap.study.bars import Verdict
 from hybridmap.study.cell import CellResult
 from hybridmap.study.folder import PAGE

@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from hybridmap.config.inputs import SimulationConfig
 from hybridmap.errors import ConfigError
 from hybridmap.geometry import Array
-from hybridmap.simulation.carry import Carry, carry
-from hybridmap.simulation.drive import DriveLimits, drive
+from hybridmap.simulation.motion import Carry, DriveLimits, as_transmitted, carry, drive, wheel_odometry
 from hybridmap.simulation.surfaces import World
-from hybridmap.simulation.wheels import as_transmitted, wheel_odometry
 from hybridmap.simulation.worlds import build_world
 from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion, StreamReport
 from hybridmap.trajectory import NS_PER_S, Trajectory
@@ -76,8 +74,7 @@ class SimulatedStream:
     @cached_property
     def rig(self) -> Rig:
         """The sensors that the configuration asks for."""
-        from hybridmap.simulation.camera import camera_of
-        from hybridmap.simulation.laser import laser_of
+        from hybridmap.simulation.sensor_models import camera_of, laser_of
 
         camera = camera_of(self._config.camera) if self._config.sensors != "laser" else None
         laser = laser_of(self._config.laser) if self._config.sensors != "rgbd" else None
@@ -124,8 +121,7 @@ class SimulatedStream:
             waiting = next(observations, None)
 
     def _observations(self) -> Iterator[Observation]:
-        from hybridmap.simulation.camera import CameraModel
-        from hybridmap.simulation.laser import LaserModel
+        from hybridmap.simulation.sensor_models import CameraModel, LaserModel
 
         generators = self._generators()
         camera = CameraModel(self._scene, self._config.camera, generators[_CAMERA], self._config.noise)

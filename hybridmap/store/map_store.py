@@ -18,7 +18,7 @@ from hybridmap.errors import StoreError
 from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node
-from hybridmap.store import codec, schema
+from hybridmap.store import schema
 from hybridmap.store.track import Track
 from hybridmap.streams.base import Rig
 from hybridmap.trajectory import NO_ANCHORS, Anchors, Trajectory
@@ -53,7 +53,7 @@ class MapStore:
         """
         path = _file_of(folder)
         store = cls(path, schema.create(path), writable=True)
-        for key, value in (("config_yaml", config_yaml), ("rig", codec.rig_to_json(rig)), ("source", source)):
+        for key, value in (("config_yaml", config_yaml), ("rig", schema.rig_to_json(rig)), ("source", source)):
             store.put_info(key, value)
         store.commit()
         return store
@@ -117,7 +117,7 @@ class MapStore:
         self._write(f"INSERT INTO nodes VALUES ({_marks(len(row))})", row)
         for part, arrays in ((_CODE, {"place": node.place_code}), (_KEYFRAME, keyframe), (_SNAPSHOT, snapshot)):
             for name, array in arrays.items():
-                packed = codec.pack(np.asarray(array))
+                packed = schema.pack(np.asarray(array))
                 fields = (number, part, name, packed.dtype, packed.shape, packed.codec, packed.data)
                 self._write("INSERT INTO arrays VALUES (?, ?, ?, ?, ?, ?, ?)", fields)
 
@@ -125,9 +125,9 @@ class MapStore:
         """Write an edge, or what has become of it since; every edge ever considered belongs here."""
         measured: tuple[Any, ...] = (None,) * 4
         if edge.relative is not None:
-            measured = (*_floats(edge.relative.delta), codec.pack_floats(edge.relative.covariance))
+            measured = (*_floats(edge.relative.delta), schema.pack_floats(edge.relative.covariance))
         ends, kind = (int(edge.source), int(edge.target)), EdgeKind(edge.kind).name.lower()
-        record = codec.record_to_json(edge)
+        record = schema.record_to_json(edge)
         row = (number, *ends, kind, str(edge.status), edge.reason, *measured, record, int(edge.since_node))
         self._write(f"INSERT OR REPLACE INTO edges VALUES ({_marks(len(row))})", row)
 
@@ -152,7 +152,7 @@ class MapStore:
         position = self._one("SELECT position FROM solutions WHERE backend = ?", (backend,))
         if position is None:
             position = self._one("SELECT COUNT(*) FROM solutions", ())
-        row = (backend, position, codec.pack_floats(poses), codec.report_to_json(report))
+        row = (backend, position, schema.pack_floats(poses), schema.report_to_json(report))
         self._write("INSERT OR REPLACE INTO solutions VALUES (?, ?, ?, ?)", row)
 
     def put_info(self, key: str, value: Any) -> None:
@@ -192,7 +192,7 @@ class MapStore:
     @property
     def rig(self) -> Rig:
         """The sensors of the run."""
-        return codec.rig_from_json(self.info("rig"))
+        return schema.rig_from_json(self.info("rig"))
 
     @property
     def source(self) -> str:
@@ -221,15 +221,15 @@ class MapStore:
     def map(self) -> ExperienceMap:
         """The experience map: the same nodes and edges in the same order."""
         experiences, version = ExperienceMap(), int(self._one("PRAGMA user_version", ()))
-        codes = {row[0]: codec.Packed(*row[1:]) for row in self._arrays(_CODE)}
+        codes = {row[0]: schema.Packed(*row[1:]) for row in self._arrays(_CODE)}
         for row in self._rows("SELECT * FROM nodes ORDER BY number"):
-            node = Node(row[1], np.array(row[2:5]), codec.unpack(codes[row[0]]), row[8], row[9])
+            node = Node(row[1], np.array(row[2:5]), schema.unpack(codes[row[0]]), row[8], row[9])
             experiences.add_node(node, np.array(row[5:8]))
         for row in self._rows("SELECT * FROM edges ORDER BY number"):
             relative = None
             if row[9] is not None:
-                relative = RelativePose(np.array(row[6:9]), codec.unpack_floats(row[9], 3))
-            kind, status, record = EdgeKind[row[3].upper()], Status(row[4]), codec.record_from_json(row[10], version)
+                relative = RelativePose(np.array(row[6:9]), schema.unpack_floats(row[9], 3))
+            kind, status, record = EdgeKind[row[3].upper()], Status(row[4]), schema.record_from_json(row[10], version)
             experiences.add_edge(Edge(row[1], row[2], kind, status, relative, since_node=row[11], **record))
         return experiences
 
@@ -270,7 +270,7 @@ class MapStore:
     def solutions(self) -> dict[str, Solution]:
         """Name -> poses and report of every back-end, in the order in which they were written."""
         rows = self._rows("SELECT backend, poses, report FROM solutions ORDER BY position")
-        return {name: Solution(codec.unpack_floats(poses, 3), codec.report_from_json(report)) for name, poses, report in rows}
+        return {name: Solution(schema.unpack_floats(poses, 3), schema.report_from_json(report)) for name, poses, report in rows}
 
     # ------------------------------------------------------------------ plumbing
 
@@ -298,7 +298,7 @@ class MapStore:
 
     def _named(self, node: int, part: str) -> dict[str, NDArray[Any]]:
         statement = "SELECT name, dtype, shape, codec, data FROM arrays WHERE node = ? AND part = ? ORDER BY name"
-        return {row[0]: codec.unpack(codec.Packed(*row[1:])) for row in self._rows(statement, (int(node), part))}
+        return {row[0]: schema.unpack(schema.Packed(*row[1:])) for row in self._rows(statement, (int(node), part))}
 
 
 def _file_of(folder_or_db: Path) -> Path:

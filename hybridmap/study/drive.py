@@ -15,10 +15,9 @@ from hybridmap.backends.base import ODOMETRY, Solution
 from hybridmap.config import Config
 from hybridmap.errors import StudyError
 from hybridmap.evaluate.association import known_at
-from hybridmap.evaluate.closures import ClosureLimits, closure_errors
-from hybridmap.evaluate.edges import edge_errors, normalised_errors
+from hybridmap.evaluate.edge_errors import ClosureLimits, closure_errors, edge_errors, normalised_errors
 from hybridmap.evaluate.relations import Relations, relation_errors, relations_of
-from hybridmap.evaluate.trajectory import absolute_error
+from hybridmap.evaluate.trajectory_errors import absolute_error
 from hybridmap.geometry import Array, between
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.gaps import grounded

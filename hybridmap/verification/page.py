@@ -1,4 +1,4 @@
-"""The verification's folder: `metrics.json` and one self-contained page."""
+"""The verification's folder, `metrics.json` and one self-contained page, and the curves on the page."""
 
 from __future__ import annotations
 
@@ -7,12 +7,17 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hybridmap.metrics import Metric, to_json
 from hybridmap.output import Held, Kind, write_text
-from hybridmap.report import tables
-from hybridmap.report.template import is_page, rendered
-from hybridmap.verification import Verification, figures, maps_figure
-from hybridmap.verification.rows import recurrence_verdict
+from hybridmap.report import page_tables as tables
+from hybridmap.report import style
+from hybridmap.report.page_tables import is_page, rendered
+from hybridmap.verification import Verification, maps_figure
+from hybridmap.verification.path_error import HeadDirectionResult, PathErrors
+from hybridmap.verification.rows import PHASE_BAR_PERCENT, ROOM_BAR_MM, noise_curve, recurrence_verdict
+from hybridmap.verification.shadow import Cells, Overwriting
 
 PAGE, METRICS = "verify.html", "metrics.json"
 VERIFICATION = Kind("verification", (PAGE, METRICS), lambda folder: is_page(folder / PAGE))
@@ -60,15 +65,122 @@ def _render(head: dict[str, Any], rows: Sequence[Metric], result: Verification) 
         scale=_scale_of(result),
         distance=f"{first[0].distance_m[-1]:.0f}",
         verdict=recurrence_verdict(result.place),
-        heading=figures.heading_figure(result.head_direction),
+        heading=heading_figure(result.head_direction),
         stripes=maps_figure.stripes_figure(result.lattice),
         grid=maps_figure.grid_figure(result.lattice),
         square=maps_figure.grid_figure(result.square),
         place=maps_figure.place_figure(result.place),
-        phase=figures.phase_figure(result),
-        modules=figures.module_figure(first, result.lattice.spacings_m),
-        shadow=figures.shadow_figure(result.overwritten["softplus"]),
-        noise=figures.noise_figure(result),
+        phase=phase_figure(result),
+        modules=module_figure(first, result.lattice.spacings_m),
+        shadow=shadow_figure(result.overwritten["softplus"]),
+        noise=noise_figure(result),
         printed_kernel=result.printed_kernel,
         version=version("hybridmap"),
     )
+
+
+_COLOURS = {"relu": "#0072b2", "softplus": "#009e73"}
+_DASHES: dict[float, Any] = {30.0: "solid", 100.0: (0, (4, 1.2))}
+_NOISE_COLOURS = ("#fde725", "#5ec962", "#21918c", "#3b528b", "#440154")
+
+
+def heading_figure(heading: HeadDirectionResult) -> str:
+    """Tuning of six cells of the ring, and the population at four turn rates; a `data:` URI."""
+    degrees = np.degrees(heading.preferred_rad)
+    with style.figure(style.PAGE_WIDTH_IN, 2.7) as picture:
+        ring, one = picture.subplots(1, 2)
+        for rates in heading.tuning:
+            ring.plot(range(360), rates, linewidth=1.4)
+        ring.set(title="Six cells of the ring", xlabel="heading (deg)", ylabel="rate")
+        for number, (turn_rate, rates) in enumerate(zip(heading.turn_rates_rad_s, heading.rates, strict=True)):
+            colour = _NOISE_COLOURS[::-1][number]
+            one.plot(degrees, rates, color=colour, linewidth=1.4, label=f"{turn_rate:g} rad/s")
+        one.set(title="The population while turning", xlabel="preferred direction (deg)")
+        one.legend(title="turn rate", title_fontsize=8.5)
+        for axes in (ring, one):
+            axes.set_xticks(range(0, 361, 90))
+        return style.svg_uri(picture)
+
+
+def phase_figure(result: Verification) -> str:
+    """The worst module's phase error and the position error over distance, on every drive; a `data:` URI."""
+    with style.figure(style.PAGE_WIDTH_IN, 3.6) as picture:
+        phase, position = picture.subplots(1, 2)
+        for (rectifier, hz), drives in result.room.items():
+            looks = {"color": _COLOURS[rectifier], "linestyle": _DASHES[hz], "linewidth": 0.9, "alpha": 0.85}
+            for number, drive in enumerate(drives):
+                label = f"{rectifier}, {hz:g} Hz" if number == 0 else None
+                phase.plot(drive.distance_m, 100.0 * _highest(drive.module.max(axis=1)), label=label, **looks)
+                position.plot(drive.distance_m, 1e3 * _highest(drive.position_m), **looks)
+        for rectifier, bar in PHASE_BAR_PERCENT.items():
+            phase.axhline(bar, color=_COLOURS[rectifier], linewidth=0.8, linestyle=(0, (1, 1.5)))
+        position.axhline(ROOM_BAR_MM, color="#444444", linewidth=0.8, linestyle=(0, (1, 1.5)))
+        phase.set(title="Phase, worst module", ylabel="largest error so far (% of spacing)")
+        position.set(title="Position, all modules together", ylabel="largest error so far (mm)")
+        for axes in (phase, position):
+            axes.set(yscale="log", xlabel="driven (m)")
+            axes.grid(visible=True, linewidth=0.5)
+        picture.legend(*phase.get_legend_handles_labels(), loc="outside upper left", ncols=4)
+        return style.svg_uri(picture)
+
+
+def module_figure(drives: Sequence[PathErrors], spacings_m: Any) -> str:
+    """Each module's phase error over distance on one drive; a `data:` URI."""
+    with style.figure(style.PAGE_WIDTH_IN, 2.6) as picture:
+        axes = picture.subplots()
+        colours = np.linspace(0.0, 0.9, len(spacings_m))
+        import matplotlib
+
+        viridis = matplotlib.colormaps["viridis"]
+        for spacing, error, colour in zip(spacings_m, drives[0].module.T, colours, strict=True):
+            axes.plot(
+                drives[0].distance_m, 100.0 * error, color=viridis(colour), linewidth=0.9, label=f"{100 * spacing:.0f} cm"
+            )
+        axes.set(xlabel="driven (m)", ylabel="phase error (% of spacing)", title="Every module on one drive, relu, 30 Hz")
+        axes.set_ylim(bottom=0.0)
+        axes.grid(visible=True, linewidth=0.5)
+        picture.legend(*axes.get_legend_handles_labels(), loc="outside right upper", title="spacing")
+        return style.svg_uri(picture)
+
+
+def noise_figure(result: Verification) -> str:
+    """RMS position and heading error over distance for every noise, and where half of the drives are; a `data:` URI."""
+    with style.figure(style.PAGE_WIDTH_IN, 3.4) as picture:
+        position, heading = picture.subplots(1, 2)
+        for colour, (share, drives) in zip(_NOISE_COLOURS[1:], result.noise.items(), strict=False):
+            away, turned = noise_curve(drives), noise_curve(drives, "heading_rad")
+            for axes, curve, unit in ((position, away, 1.0), (heading, turned, np.degrees(1.0))):
+                axes.fill_between(curve.distance_m, *(unit * curve.quartiles), color=colour, alpha=0.18, linewidth=0)
+                axes.plot(curve.distance_m, unit * curve.rms, color=colour, linewidth=1.5, label=f"{100.0 * share:g} %")
+        position.set(title="Position", ylabel="error (m)")
+        heading.set(title="Heading", ylabel="error (deg)")
+        for axes in (position, heading):
+            axes.set_xlabel("driven (m)")
+            axes.set_ylim(bottom=0.0)
+            axes.grid(visible=True, linewidth=0.5)
+        picture.legend(*position.get_legend_handles_labels(), loc="outside upper left", ncols=5, title="noise of every rate")
+        return style.svg_uri(picture)
+
+
+def shadow_figure(overwriting: Overwriting) -> str:
+    """What the pose shows of a shift written into cells while the robot drives on; a `data:` URI."""
+    names: dict[Cells, str] = {"both": "rings and sheets", "rings": "rings alone", "sheets": "sheets alone"}
+    colours: dict[Cells, str] = {"both": "#000000", "rings": style.PRIMARY, "sheets": style.ODOMETRY}
+    with style.figure(style.PAGE_WIDTH_IN, 2.8) as picture:
+        panels = picture.subplots(1, 2, sharey=True)
+        for axes, stripes in zip(panels, (True, False), strict=True):
+            for cells, name in names.items():
+                share = overwriting.shown[cells, stripes]
+                looks = {"color": colours[cells], "linestyle": (0, (5, 3)) if cells == "both" else "solid", "linewidth": 1.6}
+                axes.plot(1e3 * overwriting.shift_m * share, label=name, zorder=4 if cells == "both" else 3, **looks)
+            axes.set_xlabel("steps since cells were overwritten")
+            axes.grid(visible=True, linewidth=0.5)
+        panels[0].set(title="With the stripes of the rings", ylabel="shift seen in the pose (mm)")
+        panels[1].set(title="Without them (band_drive 0)")
+        picture.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=3, title="overwritten")
+        return style.svg_uri(picture)
+
+
+def _highest(errors: Any) -> Any:
+    """Largest error so far, as a curve that a logarithmic axis can show."""
+    return np.maximum(np.maximum.accumulate(errors), 1e-9)

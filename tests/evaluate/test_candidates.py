@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybridmap.config.inputs import CameraConfig, SimulationConfig
-from hybridmap.evaluate.candidates import (
+from hybridmap.evaluate.loops import (
     CandidateErrors,
     CandidateLimits,
     Reading,
@@ -18,8 +18,8 @@ from hybridmap.evaluate.candidates import (
 )
 from hybridmap.geometry import compose
 from hybridmap.simulation import SimulatedStream
-from hybridmap.simulation.camera import CameraModel
 from hybridmap.simulation.scene import Scene
+from hybridmap.simulation.sensor_models import CameraModel
 from hybridmap.simulation.worlds import build_world
 from hybridmap.trajectory import Trajectory
 from hybridmap.vision.profile import image_profile

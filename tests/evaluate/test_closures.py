@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hybridmap.evaluate import closure_errors
-from hybridmap.evaluate.closures import ClosureLimits
+from hybridmap.evaluate.edge_errors import ClosureLimits
 from hybridmap.trajectory import Trajectory
 from tests.store.sessions import SECOND, ring_map, truth_at
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hybridmap.evaluate.edges import edge_errors
+from hybridmap.evaluate.edge_errors import edge_errors
 from hybridmap.geometry import IDENTITY, RelativePose, between, compose, exp
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node

@@ -10,7 +10,7 @@ import pytest
 from hybridmap.config import Config
 from hybridmap.errors import EvaluationError
 from hybridmap.evaluate.loops import evaluate_loops, every_mode, profiles_again, stored_profiles, view_settings
-from hybridmap.evaluate.session import evaluate_session
+from hybridmap.evaluate.session_errors import evaluate_session
 from hybridmap.geometry import wrap_angle
 from hybridmap.session import run
 from hybridmap.simulation import SimulatedStream

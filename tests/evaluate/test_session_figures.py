@@ -5,7 +5,7 @@ import pytest
 
 from hybridmap.errors import EvaluationError, StoreError, StreamError
 from hybridmap.evaluate import evaluate_session
-from hybridmap.evaluate.solutions import judge_solutions
+from hybridmap.evaluate.session_errors import judge_solutions
 from hybridmap.geometry import RelativePose, between
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.store import SessionFolder

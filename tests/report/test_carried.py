@@ -12,12 +12,12 @@ import pytest
 from hybridmap.backends import comparison
 from hybridmap.cli import main
 from hybridmap.cli.graphs import open_graph
-from hybridmap.evaluate.solutions import judge_solutions
+from hybridmap.evaluate.session_errors import judge_solutions
 from hybridmap.geometry import RelativePose, between
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
 from hybridmap.graph.gaps import carries
-from hybridmap.report import comparison_figures, correction_figure, map_figure, style
-from hybridmap.report.scene import Correction, Scene, load_scene
+from hybridmap.report import comparison_page, session_figures, style
+from hybridmap.report.session_view import Correction, Scene, load_scene
 from hybridmap.store import MapStore, SessionFolder
 from tests.store.sessions import SECOND, ring_map, truth_at, write_session
 
@@ -57,24 +57,24 @@ def is_broken(line: Any) -> bool:
 
 
 def test_the_truth_ends_where_the_robot_was_picked_up(scene: Scene, drawn: list[Any]) -> None:
-    map_figure.trajectories_figure(scene, None)
+    session_figures.trajectories_figure(scene, None)
     truth = [line for line in drawn[0].axes[0].get_lines() if line.get_color() == style.TRUTH and line.get_alpha() is not None]
     assert len(truth) == 2
     assert [line.get_label() == "ground truth" for line in truth] == [True, False]
 
 
 def test_the_chain_is_dashed_where_the_robot_was_carried(scene: Scene, drawn: list[Any]) -> None:
-    chain, carried = map_figure.chain_and_carries(scene)
+    chain, carried = session_figures.chain_and_carries(scene)
     assert [(edge.source, edge.target) for edge in carried] == [(PICKED_UP, PICKED_UP + 1)]
     assert len(chain) == len(scene.nodes) - 2
-    map_figure.graph_figure(scene, None)
+    session_figures.graph_figure(scene, None)
     (lines,) = [lines for lines in drawn[0].axes[0].collections if lines.get_label() == "carried (1)"]
     assert lines.get_linestyle()[0][1] is not None
 
 
 def test_the_ways_before_and_after_a_correction_break(scene: Scene, drawn: list[Any]) -> None:
     correction = Correction(0, 1.0, scene.nodes[:40], scene.nodes[:40] + 1.0)
-    correction_figure.correction_figure(correction, {}, carries(scene.experiences))
+    session_figures.correction_figure(correction, {}, carries(scene.experiences))
     assert [is_broken(axes.get_lines()[0]) for axes in drawn[0].axes] == [True, True]
 
 
@@ -83,15 +83,15 @@ def test_no_map_of_a_comparison_has_a_line_through_the_air(
 ) -> None:
     source = open_graph(session.path)
     rows = comparison.compare(source.graph, ("odometry", "gtsam-lm"))
-    judged = judge_solutions(session.path, comparison_figures.solved(rows))
-    comparison_figures.overlay(rows, judged.truth, source.carried)
+    judged = judge_solutions(session.path, comparison_page.solved(rows))
+    comparison_page.overlay(rows, judged.truth, source.carried)
     first, second, *maps = drawn[0].axes[0].get_lines()
     assert first.get_label() == "ground truth"
     assert len(first.get_xdata()) + len(second.get_xdata()) < len(source.graph.initial) * 10 - 9
     assert [is_broken(line) for line in maps] == [True, True]
     graphs = []
-    monkeypatch.setattr(comparison_figures, "draw_map", lambda axes, graph, *_: graphs.append(graph))
-    comparison_figures.panels(source.graph, rows, source.start, source.carried)
+    monkeypatch.setattr(comparison_page, "draw_map", lambda axes, graph, *_: graphs.append(graph))
+    comparison_page.panels(source.graph, rows, source.start, source.carried)
     assert {graph.n_edges for graph in graphs} == {source.graph.n_edges - 1}
     assert all(PICKED_UP + 1 not in graph.targets[graph.is_motion] for graph in graphs)
 

@@ -11,8 +11,8 @@ from hybridmap.backends import comparison
 from hybridmap.backends.base import SolveStatus
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.output import held
-from hybridmap.report import comparison_figures, style
-from hybridmap.report.comparison import COMPARISON, Compared, write_comparison
+from hybridmap.report import comparison_page, style
+from hybridmap.report.comparison_page import COMPARISON, Compared, write_comparison
 from tests.backends.graphs_for_tests import laps
 
 NAMES = ("gtsam-lm", "odometry", "relaxation-ratslam")
@@ -45,13 +45,13 @@ def page_of(folder, graph, rows):
 def test_a_row_has_a_map_where_its_status_says_so(rows, status):
     row = ended(rows[2], status)
     assert row.has_map is status.has_map
-    assert list(comparison_figures.solved([row])) == ([row.title] if status.has_map else [])
+    assert list(comparison_page.solved([row])) == ([row.title] if status.has_map else [])
     assert not replace(row, solution=None).has_map
 
 
 def test_a_row_that_diverged_is_in_the_table_and_in_no_picture(graph, rows, tmp_path):
     some = [*rows[:2], ended(rows[2], SolveStatus.DIVERGED)]
-    assert list(comparison_figures.solved(some)) == ["gtsam-lm", "odometry"]
+    assert list(comparison_page.solved(some)) == ["gtsam-lm", "odometry"]
     page = page_of(tmp_path, graph, some)
     assert "Without a map, in the table alone: relaxation-ratslam." in page
     assert '<tr class="bad"><td>relaxation-ratslam</td></tr>' in page
@@ -76,7 +76,7 @@ def test_the_page_says_what_its_pictures_hide_and_show(graph, rows, tmp_path):
 def test_later_lines_are_thinner_and_on_top(rows, monkeypatch):
     drawn: list[Any] = []
     monkeypatch.setattr(style, "svg_uri", drawn.append)
-    comparison_figures.overlay([rows[0], rows[2], replace(rows[0], backend="gtsam-gnc", title="gtsam-gnc")], [], [])
+    comparison_page.overlay([rows[0], rows[2], replace(rows[0], backend="gtsam-gnc", title="gtsam-gnc")], [], [])
     lines = drawn[0].axes[0].get_lines()
     widths = [line.get_linewidth() for line in lines]
     assert widths == sorted(widths, reverse=True)
@@ -87,6 +87,6 @@ def test_later_lines_are_thinner_and_on_top(rows, monkeypatch):
 def test_rejected_loops_lie_under_the_others(graph):
     with style.figure(4.0, 3.0) as picture:
         axes = picture.add_subplot()
-        comparison_figures.draw_map(axes, graph, graph.initial, (int(graph.edge_ids[graph.is_loop][0]),))
+        comparison_page.draw_map(axes, graph, graph.initial, (int(graph.edge_ids[graph.is_loop][0]),))
         lowest = min(axes.collections, key=lambda lines: lines.get_zorder())
     assert to_hex(lowest.get_color()[0]) == style.REJECTED

@@ -7,16 +7,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybridmap.evaluate.scores import in_words
 from hybridmap.geometry import compose, transform_points
 from hybridmap.graph.edges import Edge, EdgeKind, at_least, at_most
 from hybridmap.metrics import Metric
-from hybridmap.report import closures, map_figure, style, tables
-from hybridmap.report.closures import examples, spread
-from hybridmap.report.error_figure import ErrorSeries, draw_errors, error_series, gaps, over_intervals, with_gaps
-from hybridmap.report.map_figure import loops_by_fate
+from hybridmap.report import loop_examples, page_tables, session_figures, style
+from hybridmap.report.loop_examples import examples, in_words, spread
 from hybridmap.report.outline import outline, outlines, raster
-from hybridmap.report.scene import Scene, load_scene
+from hybridmap.report.session_figures import (
+    ErrorSeries,
+    draw_errors,
+    error_series,
+    gaps,
+    loops_by_fate,
+    over_intervals,
+    with_gaps,
+)
+from hybridmap.report.session_view import Scene, load_scene
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.study.statistics import Interval
 from hybridmap.trajectory import Trajectory
@@ -123,9 +129,9 @@ def test_titles_of_overlays_are_as_wide_as_their_axes(scene: Scene, measured: bo
     from matplotlib.textpath import TextPath
 
     edge = next(edge for edge in scene.experiences.edges if edge.relative is not None)
-    title = closures.overlay_title(edge if measured else replace(edge, relative=None))
-    bold = FontProperties(family="sans-serif", weight="bold", size=closures.TITLE_PT)
-    assert TextPath((0, 0), title, prop=bold).get_extents().width < 72 * 0.8 * closures.WIDTH_IN
+    title = loop_examples.overlay_title(edge if measured else replace(edge, relative=None))
+    bold = FontProperties(family="sans-serif", weight="bold", size=loop_examples.TITLE_PT)
+    assert TextPath((0, 0), title, prop=bold).get_extents().width < 72 * 0.8 * loop_examples.WIDTH_IN
 
 
 def test_accepted_loops_lie_over_the_rejected_ones_and_the_legend_can_be_read(
@@ -133,7 +139,7 @@ def test_accepted_loops_lie_over_the_rejected_ones_and_the_legend_can_be_read(
 ) -> None:
     drawn: list[Any] = []
     monkeypatch.setattr(style, "svg_uri", drawn.append)
-    map_figure.graph_figure(scene, None)
+    session_figures.graph_figure(scene, None)
     loops = {lines.get_label(): lines for lines in drawn[0].axes[0].collections}
     accepted, rejected = loops["loops accepted (20)"], loops["loops rejected (20)"]
     assert accepted.get_zorder() > rejected.get_zorder()
@@ -185,21 +191,21 @@ def test_tables_put_back_ends_side_by_side() -> None:
         Metric("ate_rmse/gtsam-lm", float("nan"), "m", "error"),
         Metric("cpu_s/matching", 12.0, "s", "time"),
     ]
-    rows = tables.by_backend(metrics, ("odometry", "gtsam-lm"))
+    rows = page_tables.by_backend(metrics, ("odometry", "gtsam-lm"))
     assert [(row.measure, row.cells) for row in rows] == [("ate_rmse", ("1.5", "–")), ("chi2", ("", "146.1"))]
-    assert [row.measure for row in tables.of_session(metrics, ("odometry", "gtsam-lm"))] == ["cpu_s/matching"]
+    assert [row.measure for row in page_tables.of_session(metrics, ("odometry", "gtsam-lm"))] == ["cpu_s/matching"]
 
 
 @pytest.mark.parametrize(
     ("value", "said"), [(0.004, ("0.4", "cm")), (0.28, ("28", "cm")), (6.5, ("6.5", "m")), (227.4, ("227", "m"))]
 )
 def test_lengths_are_said_as_people_say_them(value: float, said: tuple[str, str]) -> None:
-    assert tables.length(value) == said
+    assert page_tables.length(value) == said
 
 
 @pytest.mark.parametrize(("value", "said"), [(37.5, ("38", "s")), (1060.0, ("17.7", "min")), (float("nan"), ("nan", "s"))])
 def test_times_are_said_as_people_say_them(value: float, said: tuple[str, str]) -> None:
-    assert tables.duration(value) == said
+    assert page_tables.duration(value) == said
 
 
 @pytest.mark.parametrize(
@@ -220,4 +226,4 @@ def test_times_are_said_as_people_say_them(value: float, said: tuple[str, str]) 
 )
 def test_an_interval_has_the_decimals_that_it_bears_out(figures, text):
     value, low, high = figures
-    assert tables.interval(Interval(value, low, high, 0 if math.isnan(value) else 7, 0.95)) == text
+    assert page_tables.interval(Interval(value, low, high, 0 if math.isnan(value) else 7, 0.95)) == text

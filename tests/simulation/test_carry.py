@@ -9,7 +9,7 @@ from hybridmap.config.inputs import CameraConfig, SimulationConfig
 from hybridmap.errors import ConfigError
 from hybridmap.geometry import between, compose, wrap_angle
 from hybridmap.simulation import SimulatedStream
-from hybridmap.simulation.carry import carry
+from hybridmap.simulation.motion import carry
 from hybridmap.streams.rgbd import RgbdFrame
 from tests.simulation.test_stream import PERFECT_WHEELS, fingerprint
 

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from hybridmap.config.inputs import CameraConfig, LaserScannerConfig
-from hybridmap.simulation import camera, laser
-from hybridmap.simulation.camera import CameraModel
-from hybridmap.simulation.laser import LaserModel
+from hybridmap.simulation import sensor_models
 from hybridmap.simulation.scene import Scene, build_atlas
+from hybridmap.simulation.sensor_models import CameraModel, LaserModel
 from hybridmap.simulation.worlds import build_world
 
 CAMERA = CameraConfig(width_px=160, height_px=120)
@@ -59,7 +58,7 @@ def test_depth_is_whole_millimetres_within_its_range():
 
 @pytest.mark.parametrize("distance_m", [1.0, 2.5, 4.5])
 def test_depth_noise_grows_with_the_square_of_the_distance(distance_m, monkeypatch):
-    monkeypatch.setattr(camera, "HOLE_FRACTION", 0.0)
+    monkeypatch.setattr(sensor_models, "HOLE_FRACTION", 0.0)
     _, seen = frame(pose=(LENGTH_M - 0.1 - distance_m, 1.2, 0.0))
     middle = seen.depth_m[50:70, 70:90].astype(np.float64)
     expected = 0.0012 + 0.0019 * (distance_m - 0.4) ** 2
@@ -70,7 +69,7 @@ def test_depth_noise_grows_with_the_square_of_the_distance(distance_m, monkeypat
 def test_holes_where_depth_jumps_and_in_patches(monkeypatch):
     found = []
     for share in (0.0, 0.05):
-        monkeypatch.setattr(camera, "HOLE_FRACTION", share)
+        monkeypatch.setattr(sensor_models, "HOLE_FRACTION", share)
         found.append(frame("lab", (2.0, 0.72, 0.0))[1])
     whole, patchy = found
     assert np.count_nonzero(patchy.depth_m == 0) > np.count_nonzero(whole.depth_m == 0) + 100
@@ -108,7 +107,7 @@ def test_the_same_place_gives_features_that_match_from_elsewhere():
 
 
 def test_laser_measures_the_corridor(monkeypatch):
-    monkeypatch.setattr(laser, "DROP_FRACTION", 0.0)
+    monkeypatch.setattr(sensor_models, "DROP_FRACTION", 0.0)
     model = LaserModel(scene("corridor"), LaserScannerConfig(range_max_m=8.0))
     bearings = model.laser.bearings_rad
     np.testing.assert_array_equal(bearings, bearings[0] + np.arange(180) * np.float64(np.float32(np.pi / 179)))

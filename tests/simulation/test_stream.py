@@ -10,9 +10,8 @@ import pytest
 from hybridmap.config.inputs import CameraConfig, LaserScannerConfig, SimulationConfig, WheelErrorConfig
 from hybridmap.errors import ConfigError
 from hybridmap.geometry import align, between, compose, wrap_angle
-from hybridmap.simulation import SimulatedStream, wheels, world_names
-from hybridmap.simulation.drive import DriveLimits, drive
-from hybridmap.simulation.wheels import wheel_odometry
+from hybridmap.simulation import SimulatedStream, motion, world_names
+from hybridmap.simulation.motion import DriveLimits, drive, wheel_odometry
 from hybridmap.simulation.worlds import build_world
 from hybridmap.streams.base import SelfMotion
 from hybridmap.streams.laser import LaserScan
@@ -163,12 +162,12 @@ def test_each_wheel_error_does_what_it_says(monkeypatch):
     np.testing.assert_allclose(end(straight, scale_bias=0.02), [10.2, 0.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(end(straight, heading_bias_deg_per_m=1.0)[2], np.deg2rad(10.0), atol=1e-6)
     np.testing.assert_allclose(end(on_the_spot, turn_bias=0.1)[2], 1.1 * np.pi / 2, atol=1e-6)
-    monkeypatch.setattr(wheels, "SLIPS_PER_M", 0.0)
+    monkeypatch.setattr(motion, "SLIPS_PER_M", 0.0)
     ends = np.array([end(straight, noise=2.0) for _ in range(300)])
-    assert np.rad2deg(ends[:, 2].std()) == pytest.approx(2 * wheels.ROTATION_DEG_PER_SQRT_M * np.sqrt(10.0), rel=0.15)
-    assert ends[:, 0].std() == pytest.approx(2 * wheels.TRANSLATION_M_PER_SQRT_M * np.sqrt(10.0), rel=0.25)
-    monkeypatch.setattr(wheels, "SLIPS_PER_M", 1.0)
-    monkeypatch.setattr(wheels, "SLIP_M", 0.1)
+    assert np.rad2deg(ends[:, 2].std()) == pytest.approx(2 * motion.ROTATION_DEG_PER_SQRT_M * np.sqrt(10.0), rel=0.15)
+    assert ends[:, 0].std() == pytest.approx(2 * motion.TRANSLATION_M_PER_SQRT_M * np.sqrt(10.0), rel=0.25)
+    monkeypatch.setattr(motion, "SLIPS_PER_M", 1.0)
+    monkeypatch.setattr(motion, "SLIP_M", 0.1)
     slipped = np.array([end(straight, noise=1.0)[0] for _ in range(20)])
     assert slipped.max() < 10.0
 

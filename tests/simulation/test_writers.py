@@ -13,7 +13,7 @@ from hybridmap.errors import OutputError, StreamError
 from hybridmap.geometry import quaternion_from_yaw, rotation_from_quaternion, yaw_from_quaternion
 from hybridmap.simulation import SimulatedStream
 from hybridmap.simulation.writers import write_rosbag1, write_rosbag2, write_tum
-from hybridmap.simulation.writers.mounting import quaternion_of, quaternion_of_rotation
+from hybridmap.simulation.writers.messages import quaternion_of, quaternion_of_rotation
 from hybridmap.streams import open_stream
 from hybridmap.streams.base import SelfMotion
 from hybridmap.streams.laser import LaserScan

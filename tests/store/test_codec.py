@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridmap.errors import StoreError
-from hybridmap.store.codec import pack, rig_from_json, unpack
+from hybridmap.store.schema import pack, rig_from_json, unpack
 
 DTYPES = ("|b1", "|u1", "|i1", "<u2", ">u2", "<i4", "<i8", "<f4", ">f4", "<f8")
 

@@ -10,7 +10,7 @@ import yaml
 from hybridmap import session
 from hybridmap.cli import main
 from hybridmap.config import Config
-from hybridmap.evaluate.session import evaluate_session
+from hybridmap.evaluate.session_errors import evaluate_session
 from hybridmap.geometry import between
 from hybridmap.simulation.writers import write_rosbag2
 from hybridmap.streams import open_stream

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from hybridmap.config import Config
-from hybridmap.evaluate.closures import ClosureLimits, closure_errors
-from hybridmap.evaluate.edges import edge_errors
+from hybridmap.evaluate.edge_errors import ClosureLimits, closure_errors, edge_errors
 from hybridmap.geometry import align, transform_points
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.gaps import unobserved

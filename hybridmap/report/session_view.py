@@ -8,15 +8,13 @@ from typing import Any
 from hybridmap.backends.base import ODOMETRY, SolveReport
 from hybridmap.errors import EvaluationError, HybridMapError
 from hybridmap.evaluate.association import Pairs, associate
-from hybridmap.evaluate.session import session_trajectories
-from hybridmap.evaluate.trajectory import absolute_error_of
+from hybridmap.evaluate.session_errors import session_trajectories
+from hybridmap.evaluate.trajectory_errors import absolute_error_of
 from hybridmap.geometry import IDENTITY, Array, compose
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.metrics import Metric
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
-
-ONLINE = "_online"
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,10 +1,12 @@
-"""The figures of a session as tables: back-ends side by side, and what belongs to none."""
+"""What every page is filled with: figures as tables and in words, and the templates of this folder."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from hybridmap.metrics import Metric
 from hybridmap.study.statistics import Interval
@@ -93,3 +95,25 @@ def duration(value_s: float) -> tuple[str, str]:
 def unit(metric: Metric) -> str:
     """The unit; nothing for a plain number."""
     return "" if metric.unit == "1" else metric.unit
+
+
+_MARK = '<meta name="generator" content="hybridmap '  # in the head of the pages that have a folder of their own
+
+
+def is_page(path: Path) -> bool:
+    """Whether a file is a page that was made here, and that no session or study folder holds."""
+    return path.is_file() and _MARK in path.read_text(encoding="utf-8", errors="replace")
+
+
+def rendered(template: str, **content: Any) -> str:
+    """The text of a page: a template by its file name, filled; text is escaped, and a name that is missing is an error."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("hybridmap", "report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(content)

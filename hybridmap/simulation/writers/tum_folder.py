@@ -11,8 +11,14 @@ from numpy.typing import NDArray
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array
 from hybridmap.output import staged
-from hybridmap.simulation.writers.messages import RECORDING, Progress, millimetres, silent
-from hybridmap.simulation.writers.mounting import quaternion_of, quaternion_of_rotation
+from hybridmap.simulation.writers.messages import (
+    RECORDING,
+    Progress,
+    millimetres,
+    quaternion_of,
+    quaternion_of_rotation,
+    silent,
+)
 from hybridmap.streams.base import SelfMotion, Stream
 from hybridmap.streams.rgbd import Camera, RgbdFrame
 from hybridmap.trajectory import format_stamp

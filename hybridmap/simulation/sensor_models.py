@@ -1,4 +1,4 @@
-"""The simulated RGB-D camera: a pinhole whose depth has the noise, holes and limits of a structured-light sensor."""
+"""The simulated sensors: an RGB-D camera with the noise, holes and limits of structured light, and a planar laser."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.inputs import CameraConfig
+from hybridmap.config.inputs import CameraConfig, LaserScannerConfig
 from hybridmap.geometry import Array, rotation_from_quaternion
 from hybridmap.simulation.paints import smooth_noise
 from hybridmap.simulation.scene import Hits, Scene
+from hybridmap.streams.laser import Laser, LaserScan
 from hybridmap.streams.rgbd import Camera, RgbdFrame
 
 OPTICAL_QUATERNION_XYZW: tuple[float, float, float, float] = (-0.5, 0.5, -0.5, 0.5)
 """A level camera that looks along x of `base_link`: optical frame with x right, y down, z forward."""
-FORWARD_M = 0.1
+CAMERA_FORWARD_M = 0.1
 """The camera stands this far in front of `base_link`, as on the head of a small robot."""
-HEIGHT_M = 1.0
+CAMERA_HEIGHT_M = 1.0
 """Height above the floor, m: furniture and pictures on the walls are both in view."""
-RANGE_MIN_M, RANGE_MAX_M = 0.4, 5.0
+CAMERA_RANGE_MIN_M, CAMERA_RANGE_MAX_M = 0.4, 5.0
 """No depth nearer or farther than this, m along the optical axis: the limits of a structured-light camera."""
 DEPTH_NOISE_M, DEPTH_NOISE_PER_M = 0.0012, 0.0019
 """Standard deviation of depth at 0.4 m, and its growth with the square of the distance beyond (Nguyen et al. 2012)."""
@@ -43,7 +44,7 @@ def camera_of(config: CameraConfig) -> Camera:
     focal = 0.5 * config.width_px / float(np.tan(np.deg2rad(0.5 * config.field_of_view_deg)))
     mounting = np.eye(4)
     mounting[:3, :3] = rotation_from_quaternion(OPTICAL_QUATERNION_XYZW)
-    mounting[:3, 3] = FORWARD_M, 0.0, HEIGHT_M
+    mounting[:3, 3] = CAMERA_FORWARD_M, 0.0, CAMERA_HEIGHT_M
     center = 0.5 * (config.width_px - 1), 0.5 * (config.height_px - 1)
     return Camera(config.width_px, config.height_px, focal, focal, *center, mounting)
 
@@ -96,7 +97,7 @@ class CameraModel:
         return RgbdFrame(stamp_ns, color, self._depth(hits, cosine, rng))
 
     def _color(self, hits: Hits, cosine: NDArray[np.float32], gain: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-        depth = np.where(hits.hit, hits.length, np.float32(RANGE_MAX_M))
+        depth = np.where(hits.hit, hits.length, np.float32(CAMERA_RANGE_MAX_M))
         # between the widths of the pixel's footprint along and across the slant
         slant = 1.0 / np.sqrt(np.maximum(cosine, np.float32(0.03)))
         footprint = (self._scene.px_per_m[hits.surface] * depth * slant / self.camera.fx_px).astype(np.float32)
@@ -117,7 +118,7 @@ class CameraModel:
             | (cosine < _GRAZING_COSINE * rng.random(z.shape, dtype=np.float32) ** 0.5)
         )
         lost |= self._shadow(z, rng) | self._patches(z.shape, rng)
-        lost |= (noisy < RANGE_MIN_M) | (noisy > RANGE_MAX_M)
+        lost |= (noisy < CAMERA_RANGE_MIN_M) | (noisy > CAMERA_RANGE_MAX_M)
         millimetres = np.where(lost, 0.0, np.rint(noisy.astype(np.float64) * _MM_PER_M))
         return (millimetres / _MM_PER_M).astype(np.float32)
 
@@ -144,3 +145,50 @@ class CameraModel:
             return np.zeros(shape, dtype=np.bool_)
         field = smooth_noise(rng, (shape[0], shape[1]), shape[1] / 28.0)
         return np.asarray(field > np.quantile(field, 1.0 - share))
+
+
+LASER_FORWARD_M = 0.15
+"""The laser stands this far in front of `base_link`, m."""
+LASER_HEIGHT_M = 0.3
+"""Height of the scanning plane, m: it meets the legs of tables and the fronts of cupboards."""
+LASER_RANGE_MIN_M = 0.05
+"""No return nearer than this, m."""
+LASER_NOISE_M = 0.01
+"""Standard deviation of a range, m: that of the small scanners of indoor robots."""
+DROP_FRACTION = 0.002
+"""Share of beams without a return."""
+
+
+def laser_of(config: LaserScannerConfig) -> Laser:
+    """Bearings and mounting; bearings are those that a LaserScan message with its 32-bit angles gives."""
+    field = np.deg2rad(config.field_of_view_deg)
+    steps = config.beams if config.field_of_view_deg >= 360.0 else config.beams - 1
+    first, step = float(np.float32(-0.5 * field)), float(np.float32(field / steps))
+    bearings = first + np.arange(config.beams, dtype=np.float64) * step
+    low, high = (float(np.float32(value)) for value in (LASER_RANGE_MIN_M, config.range_max_m))
+    return Laser(bearings, low, high, np.array([LASER_FORWARD_M, 0.0, 0.0]))
+
+
+class LaserModel:
+    """Scans one scene in a plane parallel to the floor."""
+
+    def __init__(self, scene: Scene, config: LaserScannerConfig, noise: float = 1.0) -> None:
+        self._scene = scene
+        self._noise = noise
+        self.laser = laser_of(config)
+
+    def scan(self, stamp_ns: int, pose_world_base: Array, rng: np.random.Generator) -> LaserScan:
+        """What the laser measures from a pose (3,), m and rad, with the noise of `rng`."""
+        x, y, yaw = pose_world_base
+        angle = self.laser.bearings_rad + yaw
+        rays = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))]).astype(np.float32)
+        origin = np.array([x + LASER_FORWARD_M * np.cos(yaw), y + LASER_FORWARD_M * np.sin(yaw), LASER_HEIGHT_M])
+        hits = self._scene.cast(origin, rays)
+        ranges = np.where(hits.hit, hits.length, np.inf).astype(np.float64)
+        ranges = ranges + self._noise * LASER_NOISE_M * rng.standard_normal(len(ranges))
+        dropped = rng.random(len(ranges)) < self._noise * DROP_FRACTION
+        return LaserScan(stamp_ns, self._valid(ranges.astype(np.float32), dropped))
+
+    def _valid(self, ranges: NDArray[np.float32], dropped: NDArray[np.bool_]) -> NDArray[np.float32]:
+        inside = (ranges >= np.float32(self.laser.range_min_m)) & (ranges < np.float32(self.laser.range_max_m))
+        return np.where(inside & ~dropped, ranges, np.float32(np.nan))

@@ -11,14 +11,12 @@ from hybridmap.backends.base import ODOMETRY
 from hybridmap.graph.gaps import carries
 from hybridmap.metrics import Metric
 from hybridmap.output import write_text
-from hybridmap.report import tables
-from hybridmap.report.closures import examples
-from hybridmap.report.correction_figure import correction_figure
-from hybridmap.report.error_figure import error_figure
-from hybridmap.report.map_figure import graph_figure, trajectories_figure
+from hybridmap.report import page_tables as tables
+from hybridmap.report.loop_examples import examples
 from hybridmap.report.outline import outlines, raster
-from hybridmap.report.scene import Scene, load_scene
-from hybridmap.report.template import rendered
+from hybridmap.report.page_tables import rendered
+from hybridmap.report.session_figures import correction_figure, error_figure, graph_figure, trajectories_figure
+from hybridmap.report.session_view import Scene, load_scene
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.trajectory import NS_PER_S
 

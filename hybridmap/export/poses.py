@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hybridmap.errors import ExportError
-from hybridmap.export.view import SessionView
+from hybridmap.export.formats import SessionView
 from hybridmap.geometry import Array, RelativePose, invert_relative
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.io import write_g2o

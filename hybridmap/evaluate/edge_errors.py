@@ -1,0 +1,238 @@
+"""The edges of a map against the truth: precision and recall of loops, errors of every kind, and whether covariances fit."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.evaluate.association import MAX_GAP_S, known_at
+from hybridmap.geometry import Array, between, log, wrap_angle
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.trajectory import NS_PER_S, Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class ClosureLimits:
+    """When a loop edge is right, and what counts as a revisit.
+
+    Attributes:
+        right_m, right_deg: a loop edge whose measurement is this close to the truth is right.
+        revisit_m, revisit_deg: a node this close to an older one revisits its place ...
+        revisit_gap_s: ... if the older one was made at least this long before.
+        window_nodes: a revisit is found if a right loop edge starts within so many nodes of it.
+    """
+
+    right_m: float = 1.0
+    right_deg: float = 15.0
+    revisit_m: float = 1.0
+    revisit_deg: float = 30.0
+    revisit_gap_s: float = 10.0
+    window_nodes: int = 3
+
+
+@dataclass(frozen=True, slots=True)
+class ClosureErrors:
+    """How good a set of loop edges is.
+
+    Attributes:
+        precision: share of the judged edges that are right; NaN without any.
+        recall: share of the revisits that got a right edge; NaN without any revisit.
+        judged, right: number of loop edges between nodes whose truth is known, and of the right ones.
+        revisits, found: number of nodes that revisit a place, and of those that got a right edge.
+        trans_median_m, trans_p95_m, rot_median_deg, rot_p95_deg: errors of the right edges; NaN without any.
+    """
+
+    precision: float
+    recall: float
+    judged: int
+    right: int
+    revisits: int
+    found: int
+    trans_median_m: float
+    trans_p95_m: float
+    rot_median_deg: float
+    rot_p95_deg: float
+
+
+DEFAULT_LIMITS = ClosureLimits()
+
+
+def closure_errors(
+    experiences: ExperienceMap,
+    truth: Trajectory,
+    rejected: Collection[int] = (),
+    limits: ClosureLimits = DEFAULT_LIMITS,
+    max_gap_s: float = MAX_GAP_S,
+) -> ClosureErrors:
+    """Judge the accepted loop edges of a map.
+
+    Args:
+        experiences: the map.
+        truth: true poses of `base_link`, in any frame.
+        rejected: numbers of loop edges that a back-end threw out; they do not count as closures.
+        limits: when an edge is right and a node a revisit.
+        max_gap_s: longest gap over which the truth is interpolated.
+    """
+    stamps, poses, known = _true_nodes(experiences, truth, max_gap_s)
+    edges = [e for n, e in _judged(experiences, EdgeKind.LOOP, known).items() if n not in rejected]
+    translation, rotation = _edge_errors(edges, poses)
+    right = (translation <= limits.right_m) & (rotation <= limits.right_deg)
+    newer = np.array([max(edge.source, edge.target) for edge in edges], dtype=np.int64)[right]
+    revisits = _revisits(stamps, poses, known, limits)
+    found = _near_any(revisits, newer, limits.window_nodes)
+    return ClosureErrors(
+        precision=float(right.mean()) if len(edges) else float("nan"),
+        recall=float(found.mean()) if len(revisits) else float("nan"),
+        judged=len(edges),
+        right=int(right.sum()),
+        revisits=len(revisits),
+        found=int(found.sum()),
+        trans_median_m=_quantile(translation[right], 0.5),
+        trans_p95_m=_quantile(translation[right], 0.95),
+        rot_median_deg=_quantile(rotation[right], 0.5),
+        rot_p95_deg=_quantile(rotation[right], 0.95),
+    )
+
+
+def _edge_errors(edges: list[Edge], poses: Array) -> tuple[Array, Array]:
+    measured = np.array([e.relative.delta for e in edges if e.relative is not None], dtype=np.float64).reshape(-1, 3)
+    ends = np.array([(edge.source, edge.target) for edge in edges], dtype=np.int64).reshape(-1, 2)
+    error = between(between(poses[ends[:, 0]], poses[ends[:, 1]]), measured)
+    return np.hypot(error[:, 0], error[:, 1]), np.degrees(np.abs(error[:, 2]))
+
+
+def _revisits(stamps: NDArray[np.int64], poses: Array, known: NDArray[np.bool_], limits: ClosureLimits) -> NDArray[np.int64]:
+    """Nodes that come back to a place seen from about the same side."""
+    found = []
+    for node in np.flatnonzero(known):
+        older = known & (stamps < stamps[node] - limits.revisit_gap_s * NS_PER_S)
+        offset = poses[older] - poses[node]
+        near = np.hypot(offset[:, 0], offset[:, 1]) <= limits.revisit_m
+        if np.any(near & (np.degrees(np.abs(wrap_angle(offset[:, 2]))) <= limits.revisit_deg)):
+            found.append(node)
+    return np.array(found, dtype=np.int64)
+
+
+def _near_any(nodes: NDArray[np.int64], targets: NDArray[np.int64], window: int) -> NDArray[np.bool_]:
+    """Which nodes have a target no more than `window` numbers away."""
+    if len(targets) == 0:
+        return np.zeros(len(nodes), dtype=np.bool_)
+    return np.asarray(np.abs(nodes[:, None] - np.unique(targets)[None, :]).min(axis=1, initial=window + 1) <= window)
+
+
+def _quantile(values: Array, q: float) -> float:
+    return float(np.quantile(values, q)) if len(values) else float("nan")
+
+
+EXPECTED_MEDIAN = 2.366
+"""Median of chi2 with 3 degrees of freedom."""
+
+WRONG_M = 1.0
+"""An edge farther than this from the truth is wrong, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeErrors:
+    """The accepted edges of one kind.
+
+    Attributes:
+        count: edges between nodes whose truth is known.
+        trans_median_m, trans_p95_m, rot_median_deg, rot_p95_deg: their errors; NaN without any edge.
+        chi2_ratio: median of the normalised squared errors over what it should be: 1 for calibrated covariances, less where
+            they are too large, more where they are too small.
+        wrong: edges more than a metre from the truth.
+        wrong_kept: of those, the ones that a back-end gave a weight of more than a half.
+    """
+
+    count: int
+    trans_median_m: float
+    trans_p95_m: float
+    rot_median_deg: float
+    rot_p95_deg: float
+    chi2_ratio: float
+    wrong: int
+    wrong_kept: int
+
+    @property
+    def wrong_share(self) -> float:
+        """Share of the edges that are wrong; NaN without any edge."""
+        return self.wrong / self.count if self.count else float("nan")
+
+
+def edge_errors(
+    experiences: ExperienceMap, truth: Trajectory, weights: Mapping[int, float] | None = None, max_gap_s: float = MAX_GAP_S
+) -> dict[EdgeKind, EdgeErrors]:
+    """Judge the accepted edges of a map, kind by kind.
+
+    Args:
+        experiences: the map.
+        truth: true poses of `base_link`, in any frame.
+        weights: edge number -> weight that a robust back-end gave it; what is missing counts as 1.
+        max_gap_s: longest gap over which the truth is interpolated.
+    """
+    _, poses, known = _true_nodes(experiences, truth, max_gap_s)
+    return edge_errors_on(experiences, poses, known, weights)
+
+
+def edge_errors_on(
+    experiences: ExperienceMap, poses: Array, known: NDArray[np.bool_] | None = None, weights: Mapping[int, float] | None = None
+) -> dict[EdgeKind, EdgeErrors]:
+    """The same, given the true pose (N, 3) of each node and which of them are known (default: all)."""
+    known = np.ones(len(poses), dtype=np.bool_) if known is None else known
+    out = {}
+    for kind in (EdgeKind.ODOMETRY, EdgeKind.REGISTRATION, EdgeKind.LOOP):
+        if edges := _judged(experiences, kind, known):
+            out[kind] = _errors(edges, poses, weights or {})
+    return out
+
+
+def normalised_errors(edges: list[Edge], poses: Array) -> tuple[Array, Array]:
+    """Errors (E, 3) of measured edges, twists in the target's frame, m and rad, and their squared Mahalanobis norms (E,)."""
+    measured = [edge.relative for edge in edges if edge.relative is not None]
+    ends = np.array([(e.source, e.target) for e in edges if e.relative is not None], dtype=np.int64).reshape(-1, 2)
+    delta = np.array([m.delta for m in measured]).reshape(-1, 3)
+    covariance = np.array([m.covariance for m in measured]).reshape(-1, 3, 3)
+    error = log(between(delta, between(poses[ends[:, 0]], poses[ends[:, 1]])))
+    return error, np.einsum("ei,ei->e", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+
+
+def _true_nodes(
+    experiences: ExperienceMap, truth: Trajectory, max_gap_s: float
+) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
+    """Stamps (N,) of the nodes, their true poses (N, 3), and which of these are known."""
+    stamps = np.array([node.stamp_ns for node in experiences.nodes], dtype=np.int64)
+    known = known_at(truth, stamps, max_gap_s)
+    return stamps, truth.at(stamps) if known.any() else np.zeros((len(stamps), 3)), known
+
+
+def _judged(experiences: ExperienceMap, kind: EdgeKind, known: NDArray[np.bool_]) -> dict[int, Edge]:
+    """Number -> accepted edge of a kind between nodes whose truth is known."""
+    return {
+        number: edge
+        for number, edge in enumerate(experiences.edges)
+        if edge.kind is kind
+        and edge.status is Status.ACCEPTED
+        and edge.relative is not None
+        and known[edge.source]
+        and known[edge.target]
+    }
+
+
+def _errors(edges: Mapping[int, Edge], poses: Array, weights: Mapping[int, float]) -> EdgeErrors:
+    error, squared = normalised_errors(list(edges.values()), poses)
+    translation, rotation = np.hypot(error[:, 0], error[:, 1]), np.degrees(np.abs(error[:, 2]))
+    wrong = [number for number, off in zip(edges, translation, strict=True) if off > WRONG_M]
+    return EdgeErrors(
+        count=len(edges),
+        trans_median_m=float(np.median(translation)),
+        trans_p95_m=float(np.quantile(translation, 0.95)),
+        rot_median_deg=float(np.median(rotation)),
+        rot_p95_deg=float(np.quantile(rotation, 0.95)),
+        chi2_ratio=float(np.median(squared)) / EXPECTED_MEDIAN,
+        wrong=len(wrong),
+        wrong_kept=sum(weights.get(number, 1.0) > 0.5 for number in wrong),
+    )
