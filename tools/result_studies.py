@@ -242,6 +242,13 @@ TOPICS = (
         ),
     ),
     Topic(
+        "kidnapped-recording",
+        "pieces cut out of fr079",
+        (_study("kidnapped-recording"),),
+        _asked(("way driven until it is found", "found_m/*"), ("loops wrong by more than 1 m", "wrong_loops/*")),
+        needs="real/fr079/fr079.mcap",
+    ),
+    Topic(
         "threshold-sweep-laser",
         "a laser's threshold from far too strict to far too loose, fr079",
         (_study("threshold-sweep-laser"),),
@@ -405,7 +412,14 @@ TOPICS = (
 PARTS = {
     "Maps": ("demo", "fr079", "aces", "office", "hololens", "rgbd-drives", "rgbd-cost"),
     "What may go wrong": (
-        *("rgbd-robustness", "laser-robustness", "kidnapped", "threshold-sweep-laser", "threshold-sweep-rgbd"),
+        *(
+            "rgbd-robustness",
+            "laser-robustness",
+            "kidnapped",
+            "kidnapped-recording",
+            "threshold-sweep-laser",
+            "threshold-sweep-rgbd",
+        ),
     ),
     "Back-ends on standard graphs": (
         *("manhattan", "optima", "false-loops-intel", "false-loops-manhattan", "false-loops-relaxation", "bent-odometry"),
