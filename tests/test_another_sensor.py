@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,19 +14,24 @@ import pytest
 from hybridmap import session
 from hybridmap.cli.choose import choose
 from hybridmap.config import Config
+from hybridmap.config.inputs import SensorsConfig
+from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import ConfigError, StreamError
 from hybridmap.export import export_session
-from hybridmap.geometry import transform_points
+from hybridmap.geometry import Array, RelativePose, transform_points
+from hybridmap.graph.edges import Edge
 from hybridmap.mapper import Mapper
+from hybridmap.metrics import StageClock
 from hybridmap.plugins import Table
 from hybridmap.report import write_report
 from hybridmap.store import MapStore
 from hybridmap.streams import sensors
-from hybridmap.streams.base import InBag, Observation, Planned, Rig, Seen, SelfMotion, SensorKind, SensorPlan
+from hybridmap.streams.bagindex import BagIndex, TopicChooser
+from hybridmap.streams.base import InBag, Keyframe, Observation, Planned, Rig, Seen, SelfMotion, SensorKind, SensorPlan
 from hybridmap.streams.inspection import inspect_source
 from hybridmap.streams.order import sorted_order
 from hybridmap.streams.rosbag import BagStream
-from hybridmap.vision.base import View
+from hybridmap.vision.base import Belief, View
 from tests.streams.recordings import NS, Recording
 
 HALF_ROOM_M = 3.0
@@ -52,45 +61,46 @@ class EchoDecoder:
     def __init__(self) -> None:
         self.counts: dict[str, int] = {}
 
-    def __call__(self, stamp_ns, parts):
+    def __call__(self, stamp_ns: int, parts: tuple[Any, ...]) -> Echoes:
         return Echoes(stamp_ns, np.array([np.hypot(p.x, p.y) for p in parts[0].points], dtype=np.float32))
 
 
 class SonarFrontEnd:
     """Sees, keeps, and closes no loop."""
 
-    def __init__(self, config, rig, seed, clock) -> None:
+    def __init__(self, config: VisionConfig, rig: Rig, seed: int, clock: StageClock) -> None:
         self.ring = rig.sensors["ring"]
         self.kept: list[dict[str, np.ndarray]] = []
 
-    lost_since = None
+    lost_since: int | None = None
 
-    def observe(self, frame, delta_node_robot):
+    def observe(self, frame: Observation, delta_node_robot: Array) -> View:
+        assert isinstance(frame, Echoes)
         self.frame = frame
         return View(frame.stamp_ns, frame.ranges_m[None], -1, False)
 
-    def add_node(self, node, view):
+    def add_node(self, node: int, view: View) -> None:
         self.kept.append({"profile": view.profile, **SONAR.compact(self.frame)})
 
-    def track(self, node, odometry):
+    def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
         return []
 
-    def close(self, node, belief):
+    def close(self, node: int, belief: Belief) -> list[Edge]:
         return []
 
-    def finish(self, belief):
+    def finish(self, belief: Belief) -> list[Edge]:
         return []
 
-    def keyframe(self, node):
+    def keyframe(self, node: int) -> dict[str, np.ndarray]:
         return self.kept[node]
 
 
-def find(chooser):
+def find(chooser: TopicChooser) -> dict[str, str]:
     topic = chooser.best((TYPE,), (r"sonar",))
     return {} if topic is None else {"sonar": topic}
 
 
-def plan(topics, index, base_frame, config, source):
+def plan(topics: Mapping[str, str], index: BagIndex, base_frame: str, config: SensorsConfig, source: str) -> SensorPlan:
     if not topics:
         raise StreamError(f"{source}: no sonar")
     topic = topics["sonar"]
@@ -102,7 +112,7 @@ def plan(topics, index, base_frame, config, source):
     return SensorPlan(Rig(ring=Ring(bearings, np.array([*mounting[:2, 3], 0.0]))), planned, EchoDecoder())
 
 
-def see(keyframe, ring, max_range_m):
+def see(keyframe: Keyframe, ring: Ring, max_range_m: float) -> Seen | None:
     if "echoes_mm" not in keyframe:
         return None
     ranges = keyframe["echoes_mm"] / 1000.0
@@ -132,7 +142,7 @@ SONAR = SensorKind(
 
 
 @pytest.fixture(autouse=True)
-def known(monkeypatch):
+def known(monkeypatch: pytest.MonkeyPatch) -> None:
     """The kind is there for one test."""
     ours = {kind.name: kind for kind in sensors.kinds()}
     monkeypatch.setattr(sensors, "SENSORS", Table("kind of sensor", ours, "hybridmap.sensors", ConfigError))
@@ -148,7 +158,7 @@ def echoes(pose: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture
-def bag(tmp_path):
+def bag(tmp_path: Path) -> Path:
     recording = Recording()
     recording.transform("base_link", "ring", (0.1, 0.0, 0.2))
     for i in range(60):
@@ -162,7 +172,7 @@ def bag(tmp_path):
 
 
 @pytest.mark.parametrize("sensor", ["auto", "sonar"])
-def test_a_bag_is_mapped_stored_exported_and_shown(bag, tmp_path, sensor):
+def test_a_bag_is_mapped_stored_exported_and_shown(bag: Path, tmp_path: Path, sensor: str) -> None:
     o3d = pytest.importorskip("open3d")
     chosen = choose(str(bag), None, {"vision.sensor": sensor, "backends.names": ["odometry"]})
     finished = session.run(chosen.stream, chosen.config, tmp_path / "out")
@@ -182,14 +192,14 @@ def test_a_bag_is_mapped_stored_exported_and_shown(bag, tmp_path, sensor):
     assert "over what the robot saw" in write_report(finished.folder).read_text()
 
 
-def test_inspect_says_what_it_would_map_with(bag):
+def test_inspect_says_what_it_would_map_with(bag: Path) -> None:
     found = inspect_source(bag, choose(str(bag), None, {}).config)
     assert found.mappable
     assert found.uses == {"odometry": "/odom", "sonar": "/sonar"}
     assert sensors.words(found.rig) == ["ring of 8 sonars"]
 
 
-def test_what_a_bag_lacks_is_said_in_the_words_of_the_kind(tmp_path):
+def test_what_a_bag_lacks_is_said_in_the_words_of_the_kind(tmp_path: Path) -> None:
     recording = Recording()
     for i in range(3):
         recording.odometry(100 * NS + i * NS // 10, 0.1 * i)
@@ -201,7 +211,7 @@ def test_what_a_bag_lacks_is_said_in_the_words_of_the_kind(tmp_path):
         choose(str(path), None, {"vision.sensor": "sonar"})
 
 
-def test_the_mapper_takes_its_samples_one_by_one():
+def test_the_mapper_takes_its_samples_one_by_one() -> None:
     chosen = {"vision.sensor": "sonar", "nodes.distance_m": 0.1, "backends.names": ["odometry"]}
     ring = Ring(BEARINGS, np.zeros(3))
     mapper = Mapper(Config.load(None, chosen), Rig(ring=ring))
@@ -215,6 +225,14 @@ def test_the_mapper_takes_its_samples_one_by_one():
         Mapper(Config.load(None, chosen), Rig())
 
 
-def test_a_name_is_given_once():
+def test_nothing_but_streams_vision_the_simulator_and_disturbances_asks_for_one_sensor() -> None:
+    own = ("streams/", "vision/", "simulation/", "study/disturb.py")
+    asks = re.compile(r"\brig\.(laser|camera)\b|sensors(\.get\(|\[)\"(laser|camera)\"|\b(LASER|RGBD)\b")
+    package = Path(__file__).resolve().parents[1] / "hybridmap"
+    files = {str(path.relative_to(package)): path.read_text() for path in package.rglob("*.py")}
+    assert [name for name, text in files.items() if asks.search(text) and not name.startswith(own)] == []
+
+
+def test_a_name_is_given_once() -> None:
     with pytest.raises(ConfigError, match="sonar"):
         sensors.register(SONAR)

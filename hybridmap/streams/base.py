@@ -216,7 +216,7 @@ class Stream(Protocol):
 
     @property
     def expected_observations(self) -> int | None:
-        """How many scans or frames will come, for a progress bar; None where unknown."""
+        """How many observations will come, for a progress bar; None where unknown."""
 
     @property
     def report(self) -> StreamReport:

@@ -117,11 +117,9 @@ def check_overlap(motion_ns: Stamps, observation_ns: Stamps, what: str) -> None:
     if not len(motion_ns) or not len(observation_ns):
         return
     if observation_ns[-1] < motion_ns[0] - NS_PER_S or observation_ns[0] > motion_ns[-1] + NS_PER_S:
-        spans = [
-            f"{format_stamp(int(stamps[0]))} to {format_stamp(int(stamps[-1]))} s" for stamps in (motion_ns, observation_ns)
-        ]
         raise StreamError(
-            f"{what}: odometry runs from {spans[0]}, scans or frames from {spans[1]}; expected one clock and a common time"
+            f"{what}: odometry runs from {_span(motion_ns)}, observations from {_span(observation_ns)}; "
+            "expected one clock and a common time"
         )
 
 
@@ -130,7 +128,7 @@ def _span(stamps_ns: Stamps) -> str:
 
 
 def sort_key(sample: Sample) -> tuple[int, int]:
-    """Order of a stream: by stamp; at equal stamps motion, then scans, then frames."""
+    """Order of a stream: by stamp; at equal stamps the lower precedence, so motion, comes first."""
     return sample.stamp_ns, sample.precedence
 
 
@@ -164,5 +162,5 @@ class ReorderBuffer:
 
 
 def merge(*sources: Iterable[Sample]) -> Iterator[Sample]:
-    """One stream out of several sorted ones, by stamp; at equal stamps motion, then scans, then frames."""
+    """One stream out of several sorted ones, by stamp; at equal stamps the lower precedence, so motion, comes first."""
     return heapq.merge(*sources, key=sort_key)

@@ -69,7 +69,7 @@ class BagStream:
 
     @property
     def expected_observations(self) -> int | None:
-        """Number of scans or frames within the window."""
+        """Number of observations within the window."""
         return len(self._planned)
 
     def __iter__(self) -> Iterator[Sample]:
