@@ -1,4 +1,4 @@
-"""A helper for values that may be absent by their type and are there in the case a test has made."""
+"""Helpers for values whose type allows more than the case that a test has made."""
 
 from __future__ import annotations
 
@@ -10,4 +10,10 @@ T = TypeVar("T")
 def known(value: T | None) -> T:
     """The value, which the test knows to be there."""
     assert value is not None
+    return value
+
+
+def as_a(kind: type[T], value: object) -> T:
+    """The value, which the test knows to be of this kind."""
+    assert isinstance(value, kind)
     return value

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hybridmap.streams.base import SelfMotion
+from hybridmap.streams.base import Sample, SelfMotion
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.synchronise import Synchroniser
 
@@ -12,7 +12,7 @@ MS = 1_000_000
 
 def steps_with(delay_s):
     """Odometry every 100 ms at 1 m/s, scans between; in order of stamp, as a reader gives them."""
-    samples = [SelfMotion(k * 100 * MS, np.array([0.1 * k, 0.0, 0.0])) for k in range(20)]
+    samples: list[Sample] = [SelfMotion(k * 100 * MS, np.array([0.1 * k, 0.0, 0.0])) for k in range(20)]
     samples += [LaserScan(k * 100 * MS + 50 * MS, np.ones(3, np.float32)) for k in range(3, 15)]
     samples.sort(key=lambda sample: sample.stamp_ns)
     synchroniser = Synchroniser(odometry_delay_s=delay_s)

@@ -13,6 +13,7 @@ from hybridmap.streams.base import SelfMotion, Velocity
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.order import merge
 from hybridmap.streams.synchronise import Synchroniser
+from tests.narrowing import known
 
 MS = 1_000_000
 
@@ -22,7 +23,7 @@ def _motion(ms: int, x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> SelfMo
 
 
 def _scan(ms: int) -> LaserScan:
-    return LaserScan(ms * MS, np.float32([ms]))
+    return LaserScan(ms * MS, np.array([ms], np.float32))
 
 
 def _run(samples, **settings):
@@ -38,7 +39,7 @@ def test_an_observation_waits_for_odometry_and_is_interpolated():
     assert (first.dt_s, first.observation) == (0.0, None)
     assert synchroniser.push(_scan(25)) == []
     seen, moved = synchroniser.push(_motion(100, 1.4, 0.0, 0.4))
-    assert (seen.stamp_ns, seen.observation.stamp_ns) == (25 * MS, 25 * MS)
+    assert (seen.stamp_ns, known(seen.observation).stamp_ns) == (25 * MS, 25 * MS)
     expected = geometry.interpolate([1.0, 0, 0], [1.4, 0, 0.4], 0.25)
     np.testing.assert_allclose(seen.pose_odom_robot, expected)
     np.testing.assert_allclose(seen.delta_robot, geometry.between([1.0, 0, 0], expected))

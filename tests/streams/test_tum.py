@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from recordings import NS, color_pixels, depth_mm
 
 from hybridmap.config import Config
 from hybridmap.config.inputs import SensorsConfig
@@ -13,6 +12,8 @@ from hybridmap.errors import StreamError
 from hybridmap.streams import open_stream
 from hybridmap.streams.base import SelfMotion
 from hybridmap.streams.rgbd import RgbdFrame
+from tests.narrowing import as_a, known
+from tests.streams.recordings import NS, color_pixels, depth_mm
 
 CAMERA = """
 camera: {width: 8, height: 6, fx: 10.0, fy: 10.5, cx: 3.5, cy: 2.5, distortion: [0, 0, 0, 0, 0], depth_scale: 5000.0}
@@ -86,7 +87,8 @@ def test_pictures_without_partner_are_counted(folder):
 
 def test_odometry_is_named_by_the_configuration(folder):
     (folder / "odometry_hard.txt").write_text("100 9 0 0 0 0 0 1\n101 9 0 0 0 0 0 1\n")
-    first = next(iter(open_stream(folder, _config(odometry_file="odometry_hard.txt"))))
+    stream = open_stream(folder, _config(odometry_file="odometry_hard.txt"))
+    first = as_a(SelfMotion, next(iter(stream)))
     assert first.pose_odom_robot[0] == 9.0
 
 
@@ -99,9 +101,9 @@ def test_truth_of_the_camera_is_carried_to_the_base(folder):
     half = 0.5**0.5
     # The optical axis along +y, at (2, 3): a base turned by 90 deg whose camera sits 0.1 m ahead.
     (folder / "groundtruth.txt").write_text(f"100 2 3 0.5 {-half} 0 0 {half}\n")
-    np.testing.assert_allclose(open_stream(folder, Config()).groundtruth.poses, [[2.0, 2.9, np.pi / 2]], atol=1e-12)
+    np.testing.assert_allclose(known(open_stream(folder, Config()).groundtruth).poses, [[2.0, 2.9, np.pi / 2]], atol=1e-12)
     (folder / "groundtruth_base.txt").write_text("100 7 8 0 0 0 0 1\n")
-    np.testing.assert_array_equal(open_stream(folder, Config()).groundtruth.poses, [[7, 8, 0]])
+    np.testing.assert_array_equal(known(open_stream(folder, Config()).groundtruth).poses, [[7, 8, 0]])
 
 
 def test_calibration_of_the_configuration_stands_in_for_camera_yaml(folder):
@@ -163,7 +165,7 @@ def test_a_real_office_gives_what_its_readme_says(data_dir):
     frames = _frames(stream)
     whole = open_stream(data_dir / "real/hololens_office", Config())
     assert whole.expected_observations == 373
-    assert len(whole.groundtruth) == 373
+    assert len(known(whole.groundtruth)) == 373
     assert frames[0].color.shape == (180, 270, 3)
     valid = np.mean([(frame.depth_m > 0).mean() for frame in frames])
     assert 0.5 < valid < 0.75
