@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from hybridmap.config.mapping import EdgesConfig
 from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search
 from hybridmap.graph.experience_map import ExperienceMap
-from hybridmap.graph.paths import relative_covariances
+from hybridmap.graph.paths import covariances_from
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.trajectory import NS_PER_S
 from hybridmap.vision.base import Belief
@@ -65,7 +64,7 @@ class EdgeBook:
             poses_map_node=graph.initial if own else poses_of(graph),
             stamps_s=np.array([node.stamp_ns for node in nodes]) / NS_PER_S,
             travel_m=np.array([node.travel_m for node in nodes]),
-            covariance_from=cache(lambda node: relative_covariances(graph, node)),
+            covariance_from=covariances_from(graph),
         )
 
     def without_weight(self, report: SolveReport) -> list[Edge]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,10 +118,22 @@ def relative_covariances(graph: PoseGraph, node: int) -> Array:
     Raises:
         GraphError: `node` does not exist.
     """
-    n = graph.n_nodes
-    if not 0 <= node < n:
-        raise GraphError(f"graph: node {node} does not exist, expected one of 0..{n - 1}")
-    links = _links(graph)
+    return covariances_from(graph)(node)
+
+
+def covariances_from(graph: PoseGraph) -> Callable[[int], Array]:
+    """`relative_covariances` of each node that is asked for, once; what they share is computed at the first question."""
+    links = cache(lambda: _links(graph))
+
+    def from_node(node: int) -> Array:
+        if not 0 <= node < graph.n_nodes:
+            raise GraphError(f"graph: node {node} does not exist, expected one of 0..{graph.n_nodes - 1}")
+        return _relative_covariances(links(), graph.n_nodes, node)
+
+    return cache(from_node)
+
+
+def _relative_covariances(links: _Links, n: int, node: int) -> Array:
     parent, edge = _shortest_tree(links, n, node)
     child = np.flatnonzero(edge >= 0)
     delta, step = np.zeros((n, 3)), np.zeros((n, 3, 3))

@@ -8,7 +8,7 @@ import pytest
 from hybridmap.errors import GraphError
 from hybridmap.geometry import RelativePose, compose, compose_relative, invert_relative
 from hybridmap.graph.edges import EdgeKind
-from hybridmap.graph.paths import chain_of, relative_covariances
+from hybridmap.graph.paths import chain_of, covariances_from, relative_covariances
 from hybridmap.graph.pose_graph import PoseGraph
 
 
@@ -86,6 +86,14 @@ def test_a_node_out_of_reach_is_infinitely_uncertain():
     found = relative_covariances(graph, 0)
     assert np.all(np.isinf(np.diagonal(found[2:], axis1=1, axis2=2)))
     assert np.isfinite(found[:2]).all()
+
+
+def test_every_node_is_asked_of_one_graph_and_once():
+    graph = graph_of([(0, 1), (1, 2), (2, 3), (0, 3)], np.random.default_rng(1), 4)
+    from_node = covariances_from(graph)
+    for node in range(4):
+        assert np.array_equal(from_node(node), relative_covariances(graph, node))
+        assert from_node(node) is from_node(node)
 
 
 def test_an_unknown_node_is_refused():
