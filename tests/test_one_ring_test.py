@@ -4,9 +4,6 @@ from itertools import count
 
 import numpy as np
 import pytest
-from hybridmap.config.agreement import AgreementConfig
-from hybridmap.config.laser import CommitmentConfig
-from hybridmap.config.rgbd import RgbdClosingConfig
 
 from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.judging.consistency import consistent_loops
@@ -18,7 +15,7 @@ from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import Whereabouts
 from hybridmap.vision.laser.clusters import Commitment
 from hybridmap.vision.laser.hypotheses import Hypothesis as LaserHypothesis
-from hybridmap.vision.relocalising import Relocaliser
+from hybridmap.vision.relocalising import Relocaliser, Sighting
 from hybridmap.vision.rgbd.support import Hypothesis, Support
 
 NODES, AGAIN = 60, 30
@@ -58,19 +55,19 @@ def pre_filter():
 
 
 def laser_commitment():
-    commitment = Commitment(CommitmentConfig(), BELIEF.travel_m.__getitem__)
+    commitment = Commitment(BELIEF.travel_m.__getitem__)
     for key, node in enumerate(LOOPS):
         commitment.add(key, LaserHypothesis(AGAIN + node, node, SEEN, 0.7, 0.3, Search.GATE, (), {}, True, 0.0))
     return any(settled.accepted for settled in commitment.settle(BELIEF.travel_m[-1], BELIEF))
 
 
 def lost_robot():
-    relocaliser = Relocaliser(AgreementConfig(), Whereabouts(0), count(100).__next__, "vision.relocalising")
-    return len(relocaliser.settle([edge(node, node) for node in LOOPS], BELIEF).friends) > 0
+    relocaliser = Relocaliser(Whereabouts(0), count(100).__next__, 0.75)
+    return len(relocaliser.settle([Sighting(edge(node, node)) for node in LOOPS], BELIEF).friends) > 0
 
 
 def rgbd_support():
-    support = Support(RgbdClosingConfig())
+    support = Support()
     filed = [support.file(Hypothesis(edge(node, node), SEEN), BELIEF) for node in LOOPS]
     return filed[-1][0].status is Status.ACCEPTED
 
