@@ -9,11 +9,14 @@ from typing import Any
 # section, module, keys: each key is now the constant KEY in the module (`key:NAME` where it has another name)
 _CONSTANTS = """
 simulation simulation/stream.py speed_m_s turn_rate_rad_s odometry_rate_hz
-simulation.wheels simulation/wheels.py translation_m_per_sqrt_m rotation_deg_per_sqrt_m rotation_per_turn
-simulation.wheels simulation/wheels.py slips_per_m slip_m slip_deg
-simulation.camera simulation/camera.py forward_m height_m range_min_m range_max_m depth_noise_m depth_noise_per_m
-simulation.camera simulation/camera.py depth_noise_width_px hole_fraction exposure_change color_noise
-simulation.laser simulation/laser.py forward_m height_m range_min_m noise_m drop_fraction
+simulation.wheels simulation/motion.py translation_m_per_sqrt_m rotation_deg_per_sqrt_m rotation_per_turn
+simulation.wheels simulation/motion.py slips_per_m slip_m slip_deg
+simulation.camera simulation/sensor_models.py forward_m:CAMERA_FORWARD_M height_m:CAMERA_HEIGHT_M
+simulation.camera simulation/sensor_models.py range_min_m:CAMERA_RANGE_MIN_M range_max_m:CAMERA_RANGE_MAX_M
+simulation.camera simulation/sensor_models.py depth_noise_m depth_noise_per_m depth_noise_width_px
+simulation.camera simulation/sensor_models.py hole_fraction exposure_change color_noise
+simulation.laser simulation/sensor_models.py forward_m:LASER_FORWARD_M height_m:LASER_HEIGHT_M
+simulation.laser simulation/sensor_models.py range_min_m:LASER_RANGE_MIN_M noise_m:LASER_NOISE_M drop_fraction
 neural neural/grid.py softplus_sharpness fourier_modes kernel_gain_first kernel_gain_zero kernel_widths
 neural neural/band.py band_cells band_width
 neural neural/grid.py decode_box_m
