@@ -2,8 +2,8 @@
 
 from hybridmap.backends.base import Backend, Outcome, Solution, Solver, SolveReport, SolveStatus, SupportsPoseGraph
 from hybridmap.backends.driver import Driver, Works, replay
+from hybridmap.backends.graph_session import GraphSession
 from hybridmap.backends.registry import create, names, register
-from hybridmap.backends.session import GraphSession
 
 __all__ = [
     "Backend",

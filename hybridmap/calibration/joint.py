@@ -23,9 +23,8 @@ from hybridmap.backends.gtsam.factors import NoiseModels, anchor, factors, poses
 from hybridmap.backends.registry import RELAXATION
 from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.legs import Motion
-from hybridmap.calibration.observability import NotToldError, require_delay
 from hybridmap.calibration.odometry_terms import OdometryTerms, terms_of
-from hybridmap.calibration.regression import CAUCHY, Sighting, require_told_by
+from hybridmap.calibration.regression import CAUCHY, NotToldError, Sighting, require_delay, require_told_by
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, between, compose, inverse

@@ -35,7 +35,7 @@ def calibrate(
 
     What is written differs from the configuration in use only if the estimate does, by more than three sigma.
     """
-    from hybridmap.calibration.figures import calibrated, changes, metrics_of, verdict
+    from hybridmap.calibration.estimate import calibrated, changes, metrics_of, verdict
     from hybridmap.calibration.sessions import common_tree, estimate_of, read_drive, require_options
     from hybridmap.cli.show import emit
     from hybridmap.odometry_model import Gains

@@ -30,9 +30,9 @@ backends.relaxation backends/relaxation/sweeps.py robust_scale_m robust_scale_ra
 backends.robust backends/gtsam/factors.py huber_scale dcs_phi geman_mcclure_scale
 backends.robust backends/judging/weak.py odometry_scale
 backends.gnc backends/gtsam/gnc.py chunk_nodes mu_factor max_rounds
-backends.consistency backends/judging/consistency.py neighbours
+backends.consistency backends/judging/prefilter.py neighbours
 backends.consistency graph/agreement.py quantile
-backends.isam2 backends/gtsam/smoother.py relinearize_m relinearize_rad settle_updates
+backends.isam2 backends/gtsam/incremental.py relinearize_m relinearize_rad settle_updates
 backends.isam2 backends/gtsam/incremental.py patience
 vision.templates vision/templates.py threshold stable_frames
 vision.relocalising vision/relocalising.py support mismatch_max mismatch_scale wait_m

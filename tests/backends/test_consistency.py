@@ -9,9 +9,9 @@ from scipy.stats import chi2 as chi2_law
 
 from hybridmap import backends
 from hybridmap.backends.base import Solution, SolveReport, SolveStatus
-from hybridmap.backends.judging import consistency, prefilter
+from hybridmap.backends.judging import prefilter
 from hybridmap.backends.judging.clusters import loops_of
-from hybridmap.backends.judging.consistency import Consistent, consistent_loops
+from hybridmap.backends.judging.prefilter import Consistent, consistent_loops
 from hybridmap.config.backends import BackendsConfig, ConsistencyConfig
 from hybridmap.geometry import adjoint, align, inverse, transform_points
 from hybridmap.graph.agreement import ring
@@ -86,7 +86,7 @@ def test_each_loop_needs_a_neighbour(drive, monkeypatch):
     alone = np.flatnonzero(graph.is_loop)[::25]  # far from each other
     sparse = graph.with_edges(np.sort(np.concatenate([np.flatnonzero(~graph.is_loop), alone])))
     assert len(consistent_loops(sparse).loops) == 0
-    monkeypatch.setattr(consistency, "NEIGHBOURS", 0)
+    monkeypatch.setattr(prefilter, "NEIGHBOURS", 0)
     assert len(consistent_loops(sparse).loops) == len(alone)
 
 

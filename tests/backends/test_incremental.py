@@ -7,10 +7,10 @@ import pytest
 from graphs_for_tests import laps
 
 from hybridmap import backends
-from hybridmap.backends.gtsam import incremental, smoother
+from hybridmap.backends.gtsam import incremental
 from hybridmap.backends.gtsam.covariance import Covariances
 from hybridmap.backends.gtsam.factors import NoiseModels, poses_of
-from hybridmap.backends.gtsam.smoother import Smoother
+from hybridmap.backends.gtsam.incremental import Smoother
 from hybridmap.errors import BackendError
 from hybridmap.geometry import between, log
 from hybridmap.graph.io import read_graph
@@ -30,8 +30,8 @@ def grown(backend, graph):
 
 @pytest.mark.parametrize("patience", [0.3, 1.0])
 def test_closures_wait_only_while_no_pose_would_move_by_more_than_the_patience(patience, monkeypatch):
-    monkeypatch.setattr(smoother, "RELINEARIZE_RAD", 1e-5)  # nearly always, so that only the waiting makes a difference
-    monkeypatch.setattr(smoother, "RELINEARIZE_M", 1e-4)
+    monkeypatch.setattr(incremental, "RELINEARIZE_RAD", 1e-5)  # nearly always, so that only the waiting makes a difference
+    monkeypatch.setattr(incremental, "RELINEARIZE_M", 1e-4)
     graph = modest(0)
     waited = 0
     monkeypatch.setattr(incremental, "PATIENCE", patience)

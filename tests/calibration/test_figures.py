@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from hybridmap.calibration.estimate import Estimate
-from hybridmap.calibration.figures import calibrated, changes, metrics_of, verdict
+from hybridmap.calibration.estimate import Estimate, calibrated, changes, metrics_of, verdict
 from hybridmap.config import Config
 from hybridmap.errors import ConfigError
 from hybridmap.odometry_model import NEUTRAL, Gains

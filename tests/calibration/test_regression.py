@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from hybridmap.calibration import NEUTRAL, Gains, regress
-from hybridmap.calibration.observability import DELAY_LIMIT_S
-from hybridmap.calibration.regression import Sighting
+from hybridmap.calibration.regression import DELAY_LIMIT_S, Sighting
 from hybridmap.config import Config
 from hybridmap.errors import EvaluationError
 from tests.calibration.drives import GAINS, along, circle, drive, sighting
