@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybridmap.backends.judging.clusters import rejected_clusters
-from hybridmap.backends.judging.consistency import consistent_loops
+from hybridmap.backends.judging.prefilter import consistent_loops
 from hybridmap.geometry import RelativePose
 from hybridmap.graph.agreement import BOUND, Ring
 from hybridmap.graph.edges import Edge, EdgeKind, Search, Status

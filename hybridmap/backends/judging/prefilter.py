@@ -17,8 +17,8 @@ from hybridmap.backends.objective import SLACK, chi2, gate_of
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import GraphError
 from hybridmap.graph.agreement import BOUND, agreement, chi2_quantile, largest_consistent_set, ring
-from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.graph.paths import chain_of
+from hybridmap.graph.pose_graph import PoseGraph
 
 NEIGHBOURS = 1
 """Loops between the same places, within 10 nodes at both ends, that each must agree with: a false loop seldom has one."""
