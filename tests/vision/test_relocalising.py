@@ -13,7 +13,7 @@ from hybridmap.vision.gating import Chain, Whereabouts
 from hybridmap.vision.relocalising import Relocaliser, Sighting
 
 STEP_M = 0.3
-X = STEP_M * np.arange(200)
+X = (STEP_M * np.arange(200)).astype(np.float64)
 BELIEF = Belief(np.column_stack([X, 0 * X, 0 * X]), np.arange(200.0), X, lambda _: np.zeros((200, 3, 3)))
 """A straight drive; its chain breaks at 40, and in truth nodes 40.. are where 10.. are."""
 BROKEN_AT = 40

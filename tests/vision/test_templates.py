@@ -3,6 +3,7 @@ import pytest
 
 from hybridmap.vision.templates import (
     Matcher,
+    Mode,
     ProfileStore,
     ViewTemplates,
     band_weights,
@@ -50,7 +51,7 @@ def test_every_reading_of_G_by_hand():
     weights = band_weights(2, 0.7, 0.3)
     shifts = np.array([0, 1])
     bar_r, bar_d = 0.5, 0.7  # means of g_min over the templates
-    expected = {
+    expected: dict[Mode, float] = {
         "literal": 0.7 * abs(0.2 - bar_r) + 0.3 * abs(0.5 - bar_d),
         "ratio": 0.7 * 0.2 / bar_r + 0.3 * 0.5 / bar_d,
         "signed": 0.7 * (0.2 - bar_r) + 0.3 * (0.5 - bar_d),

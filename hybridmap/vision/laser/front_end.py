@@ -36,22 +36,27 @@ MOST_BETWEEN = 30
 
 
 class LaserFrontEnd:
-    """Submap registration and commitment by cluster, as a `vision.base.FrontEnd`."""
+    """Submap registration and commitment by cluster, as a `vision.base.FrontEnd`.
+
+    Attributes:
+        atlas: the scans of the nodes, of which submaps are made.
+        whole_map: where a robot that may be anywhere is looked for.
+    """
 
     def __init__(self, config: VisionConfig, laser: Laser) -> None:
         """Start without a node."""
         self._config, self._refines, self._profile_width = config.laser, config.tracking.enabled, config.profile.width
         self._laser = laser
-        self._atlas = Atlas()
-        self._tracker = Tracker(self._atlas)
-        self._prober = Prober(config, self._atlas, laser)
-        self._reviser = Reviser(config, self._atlas, laser)
-        self._commitment = Commitment(self._atlas.travel_m.__getitem__)
+        self.atlas = Atlas()
+        self._tracker = Tracker(self.atlas)
+        self._prober = Prober(config, self.atlas, laser)
+        self._reviser = Reviser(config, self.atlas, laser)
+        self._commitment = Commitment(self.atlas.travel_m.__getitem__)
         self._templates = ViewTemplates(config.profile.width // 16, config.matching.mu_r, config.matching.mu_d)
         self._profiles: list[NDArray[np.float32]] = []
-        self._continuity = Continuity(config, self._atlas, laser, self._tracker)
-        self._whole_map = WholeMap(config, self._atlas, self._prober, self._continuity, self._profiles, self._next_key)
-        self._retracer = Retracer(self._atlas, laser)
+        self._continuity = Continuity(config, self.atlas, laser, self._tracker)
+        self.whole_map = WholeMap(config, self.atlas, self._prober, self._continuity, self._profiles, self._next_key)
+        self._retracer = Retracer(self.atlas, laser)
         self._scans: list[SeenScan] = []
         self._steps: list[Array] = []
         self._between: list[SeenScan] = []
@@ -92,30 +97,30 @@ class LaserFrontEnd:
         number, cloud, scan = self._node
         assert number == node
         if odometry is None:
-            self._atlas.add(cloud, scan.ranges_m, IDENTITY.copy(), np.zeros((3, 3)))
+            self.atlas.add(cloud, scan.ranges_m, IDENTITY.copy(), np.zeros((3, 3)))
             return []
         if not self._refines:
-            self._atlas.add(cloud, scan.ranges_m, compose(self._atlas.chain[-1], odometry.delta), odometry.covariance)
+            self.atlas.add(cloud, scan.ranges_m, compose(self.atlas.chain[-1], odometry.delta), odometry.covariance)
             return []
         step = self._tracker.step(cloud, odometry, self._clouds_between)
-        self._atlas.add(cloud, scan.ranges_m, compose(self._atlas.chain[-1], step.relative.delta), step.scatter)
+        self.atlas.add(cloud, scan.ranges_m, compose(self.atlas.chain[-1], step.relative.delta), step.scatter)
         broken = self._continuity.broken(node, step, odometry, [(seen.motion, seen.scan) for seen in self._between])
-        return [self._whole_map.tracked(self._registration(node, step), broken)]
+        return [self.whole_map.tracked(self._registration(node, step), broken)]
 
     def close(self, node: int, belief: Belief) -> list[Edge]:
         """Look for a lost robot on the whole map; probe the old submaps every few metres; settle what has waited."""
-        sought = self._whole_map.search(node, belief)
-        travel_m = self._atlas.travel_m[node]
+        sought = self.whole_map.search(node, belief)
+        travel_m = self.atlas.travel_m[node]
         if sought.friends or travel_m - self._last_probe_m < self._config.probes.every_m:
             return sought.proposals
         out = sought.proposals + self._probe(node, belief)
         settled = [s.proposed() for s in self._commitment.settle(travel_m, belief)]
-        return out + settled + (self._whole_map.closed() if any(p.status is Status.ACCEPTED for p in settled) else [])
+        return out + settled + (self.whole_map.closed() if any(p.status is Status.ACCEPTED for p in settled) else [])
 
     def _probe(self, node: int, belief: Belief) -> list[Edge]:
-        self._last_probe_m = self._atlas.travel_m[node]
-        hypotheses, out = self._prober.probe(node, belief, self._whole_map.since), []
-        self._whole_map.probed(node, hypotheses, belief)
+        self._last_probe_m = self.atlas.travel_m[node]
+        hypotheses, out = self._prober.probe(node, belief, self.whole_map.since), []
+        self.whole_map.probed(node, hypotheses, belief)
         for hypothesis in hypotheses:
             key = self._next_key()
             out.append(hypothesis.proposed(key, Lack.WAITING))
@@ -125,14 +130,14 @@ class LaserFrontEnd:
 
     def finish(self, belief: Belief) -> list[Edge]:
         """Probe from where the robot ended and settle all that waits; then register nodes that lie near each other."""
-        last, out = len(self._atlas) - 1, []
-        if last >= 0 and self._atlas.travel_m[last] - self._last_probe_m > LAST_PROBE_M:
+        last, out = len(self.atlas) - 1, []
+        if last >= 0 and self.atlas.travel_m[last] - self._last_probe_m > LAST_PROBE_M:
             out = self._probe(last, belief)
         settled = self._commitment.flush(belief)
-        out += self._whole_map.finish() + [s.proposed() for s in settled]
+        out += self.whole_map.finish() + [s.proposed() for s in settled]
         if any(s.accepted for s in settled):
             return out
-        near = self._reviser.round(belief, self._whole_map.since)
+        near = self._reviser.round(belief, self.whole_map.since)
         return out + [hypothesis.proposed(self._next_key()) for hypothesis in near]
 
     def verify(self, doubted: Sequence[Edge], belief: Belief) -> list[Edge]:
@@ -148,11 +153,11 @@ class LaserFrontEnd:
     @property
     def lost_since(self) -> int | None:
         """As `vision.base.FrontEnd`."""
-        return self._whole_map.lost_since
+        return self.whole_map.lost_since
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
         """Profile and ranges of a node's scan."""
-        return {"profile": self._profiles[node], **LASER.compact(LaserScan(0, self._atlas.ranges[node]))}
+        return {"profile": self._profiles[node], **LASER.compact(LaserScan(0, self.atlas.ranges[node]))}
 
     def _next_key(self) -> int:
         self._keys += 1

@@ -132,7 +132,7 @@ class WholeMap:
         broken = self._broken_at is not None
         recent = self._atlas.along(node, LENGTH_M if broken else RECENT_M, 0.0)
         anchors = self._prober.anchors_before(self.since if broken else int(recent[0]))
-        found = self._prober.probe_anywhere(self._atlas.submap(node, recent), self._likeliest(node, anchors))
+        found = self._prober.probe_anywhere(self._atlas.submap(node, recent), self.likeliest(node, anchors))
         settlement = self._relocaliser.settle([self._sighting(h) for h in found], belief)
         return self._found(settlement, belief) if settlement.friends else settlement
 
@@ -143,7 +143,7 @@ class WholeMap:
             return travel_m - self._lost_m >= FROM_M
         return travel_m - self._searched_m >= self._every_m
 
-    def _likeliest(self, node: int, anchors: list[int]) -> list[int]:
+    def likeliest(self, node: int, anchors: list[int]) -> list[int]:
         """All anchors if they are few; else those about the nodes whose views are most like the robot's."""
         most = SUBMAPS
         if len(anchors) <= most:

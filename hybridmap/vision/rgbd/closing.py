@@ -52,7 +52,11 @@ SURE = 4.0
 
 
 class LoopCloser:
-    """Finds loops for one camera. The newer node is the source of an edge."""
+    """Finds loops for one camera. The newer node is the source of an edge.
+
+    Attributes:
+        support: the loops that were found, with how many others agree with each.
+    """
 
     def __init__(
         self,
@@ -79,7 +83,7 @@ class LoopCloser:
         self._relocaliser = Relocaliser(whereabouts, new_key, SPAN_M)
         self._whole_map = WholeMap(keyframes, self._matcher, verifier, new_key)
         self._c_t = matching.c_t if matching.c_t is not None or not self._unverified else MODERATE_THRESHOLD[rgbd.matching]
-        self._support = Support()
+        self.support = Support()
         self._revisits = Revisits()
         self._tried: set[tuple[int, int]] = set()
         self._travel_at_closure = 0.0
@@ -107,7 +111,7 @@ class LoopCloser:
                 changed += self._catch_up(belief)
         if self._travel_at_closure > since_m:
             self._revisits.closed(node, since_m, belief)
-        return [*changed, *self._support.give_up(before=node - PENDING_NODES)]
+        return [*changed, *self.support.give_up(before=node - PENDING_NODES)]
 
     def _catch_up(self, belief: Belief) -> list[Edge]:
         """Try a few of the nodes again that a closure has moved."""
@@ -116,7 +120,7 @@ class LoopCloser:
             node = self._revisits.next_moved(belief)
             if node is None:
                 break
-            if self._support.accepted(node) < ACCEPT:
+            if self.support.accepted(node) < ACCEPT:
                 near = self._nearest(node, REPROPOSE_PER_NODE, belief)
                 out += self._try_again(node, near, belief, {j for j in near if self._is_sure(node, j, belief)})
         return out
@@ -152,7 +156,7 @@ class LoopCloser:
         found = self._relocaliser.settle([Sighting(edge) for edge in seen], belief)
         if found.friends:
             for sighting in found.friends:
-                self._support.join(sighting.source, sighting.target)
+                self.support.join(sighting.source, sighting.target)
             self._travel_at_closure = float(belief.travel_m[node])
         return found.proposals
 
@@ -163,12 +167,12 @@ class LoopCloser:
             self._rounds_left -= 1
             first_break = self._relocaliser.whereabouts.first_break
             for node in range(len(self._keyframes)):
-                if self._support.accepted(node) < ACCEPT:
+                if self.support.accepted(node) < ACCEPT:
                     near = self._nearest(node, REPROPOSE_PER_NODE, belief)
                     placed = first_break is None or node < first_break
                     out += self._try_again(node, near, belief, near if placed else ())
         out += self._relocaliser.dismiss()
-        return [*out, *self._support.give_up(before=len(self._keyframes))]
+        return [*out, *self.support.give_up(before=len(self._keyframes))]
 
     def verify(self, doubted: Sequence[Edge], belief: Belief) -> list[Edge]:
         """Measure doubted loops again; `belief` is that of the map without them."""
@@ -178,7 +182,7 @@ class LoopCloser:
         for d in doubted:
             found = self._second_look.measure(d, belief)
             out.append(found.proposed(d.source, d.target, d.key, Candidate(Search.AGAIN)))
-            self._support.replace(out[-1])
+            self.support.replace(out[-1])
         return out
 
     def _is_sure(self, node: int, target: int, belief: Belief) -> bool:
@@ -259,7 +263,7 @@ class LoopCloser:
         waiting = found.proposed(node, target, self._new_key(), candidate, Lack.WAITING)
         if found.relative is None:
             return [waiting]
-        changed = self._support.file(Hypothesis(waiting, found.relative), belief)
+        changed = self.support.file(Hypothesis(waiting, found.relative), belief)
         if changed[0].status is Status.ACCEPTED:
             self._travel_at_closure = max(self._travel_at_closure, float(belief.travel_m[node]))
         return changed
@@ -275,7 +279,7 @@ class LoopCloser:
         chosen: dict[int, Candidate] = {}
         for i in np.argsort(np.where(near, cost, np.inf), kind="stable")[: int(near.sum())]:
             target = int(i)
-            if self._support.has(node, target):
+            if self.support.has(node, target):
                 continue
             if all(abs(target - other) >= SEPARATION for other in chosen):
                 chosen[target] = Candidate(Search.NEAR, figures={"map_distance_m": float(gap[i])})

@@ -45,6 +45,11 @@ class RgbdFrontEnd:
         camera: pinhole and mounting of the frames.
         seed: for RANSAC.
         clock: is given the stage `search`; what else closing takes is verification.
+
+    Attributes:
+        keyframes: of the nodes, in their order.
+        verifier: measures how two keyframes lie to each other.
+        closer: finds loops, and keeps those that wait for others.
     """
 
     def __init__(self, config: VisionConfig, camera: Camera, seed: int, clock: StageClock | None = None) -> None:
@@ -56,17 +61,17 @@ class RgbdFrontEnd:
         self._cell_px = cell_px(self._camera.width_px)
         self._bands = config.profile.bands if rgbd.matching == "four-band" else 1
         self._templates = ViewTemplates(config.profile.width // 16, matching.mu_r, matching.mu_d)
-        self._keyframes: list[Keyframe] = []
+        self.keyframes: list[Keyframe] = []
         self._images: deque[tuple[int, RgbdFrame]] = deque(maxlen=rgbd.held_images)
         keys = itertools.count()
         level = NoiseLevel()
-        self._tracker = Tracker(self._keyframes, config, self._camera, level, keys.__next__)
-        self._verifier = Verifier(self._camera, rgbd.pnp.min_inliers, rgbd.registration.depth_sigma, level, seed)
-        self._posture = Posture(rgbd.tilt, camera.T_base_camera, self._verifier.solver)
-        self._closer = LoopCloser(
-            self._keyframes,
+        self._tracker = Tracker(self.keyframes, config, self._camera, level, keys.__next__)
+        self.verifier = Verifier(self._camera, rgbd.pnp.min_inliers, rgbd.registration.depth_sigma, level, seed)
+        self._posture = Posture(rgbd.tilt, camera.T_base_camera, self.verifier.solver)
+        self.closer = LoopCloser(
+            self.keyframes,
             config,
-            self._verifier,
+            self.verifier,
             self._yaw_of_shift,
             keys.__next__,
             clock or StageClock(),
@@ -95,38 +100,38 @@ class RgbdFrontEnd:
 
     def add_node(self, node: int, view: View) -> None:
         """Keep features, surface and images of the frame observed last."""
-        if self._frame is None or self._image is None or node != len(self._keyframes):
-            raise ValueError(f"node {node} cannot be made here: {len(self._keyframes)} nodes so far, observe a frame first")
+        if self._frame is None or self._image is None or node != len(self.keyframes):
+            raise ValueError(f"node {node} cannot be made here: {len(self.keyframes)} nodes so far, observe a frame first")
         rgbd = self._config.rgbd
         features = detect(self._image.grey, self._image.depth_m, self._camera)
         grid = make_grid(self._image.depth_m, self._camera, self._cell_px, rgbd.registration.depth_sigma)
-        stance = self._posture.stance(grid, features, self._keyframes[-1] if self._keyframes else None)
-        self._keyframes.append(Keyframe(view.profile, features, place(grid, stance)))
+        stance = self._posture.stance(grid, features, self.keyframes[-1] if self.keyframes else None)
+        self.keyframes.append(Keyframe(view.profile, features, place(grid, stance)))
         self._images.append((node, self._frame))
-        self._closer.add_node(view.profile)
+        self.closer.add_node(view.profile)
 
     def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
         """Register the new node to the ones before it."""
         steps = self._tracker.track(node, odometry)
-        self._closer.tracked(node, steps)
+        self.closer.tracked(node, steps)
         return steps
 
     def close(self, node: int, belief: Belief) -> list[Edge]:
         """Look for loop closures of the new node."""
-        return self._closer.close(node, belief)
+        return self.closer.close(node, belief)
 
     def finish(self, belief: Belief) -> list[Edge]:
         """Re-propose on the optimised map; settle what is pending."""
-        return self._closer.finish(belief)
+        return self.closer.finish(belief)
 
     def verify(self, doubted: Sequence[Edge], belief: Belief) -> list[Edge]:
         """Measure again, from where their nodes lie on the map, loops that a back-end holds for false."""
-        return self._closer.verify(doubted, belief)
+        return self.closer.verify(doubted, belief)
 
     @property
     def lost_since(self) -> int | None:
         """As `vision.base.FrontEnd`."""
-        return self._closer.lost_since
+        return self.closer.lost_since
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
         """`profile` float32, the frame in its compact form, `T_base_camera` (4, 4) as it was then.
@@ -136,7 +141,7 @@ class RgbdFrontEnd:
         Raises:
             StreamError: the node is not one of the newest `held_images`; the map file has what it had.
         """
-        kept = self._keyframes[node]
+        kept = self.keyframes[node]
         held = [frame for number, frame in self._images if number == node]
         if not held:
             newest = self._config.rgbd.held_images
@@ -147,7 +152,7 @@ class RgbdFrontEnd:
             "profile": kept.profile,
             **RGBD.compact(held[0]),
             "T_base_camera": kept.surface.stance.T_base_camera,
-            **self._closer.note(node),
+            **self.closer.note(node),
         }
 
     def _yaw_of_shift(self, shift: int) -> float:

@@ -12,6 +12,7 @@ from hybridmap.graph.edges import EdgeKind
 from hybridmap.streams.laser import Laser, LaserScan
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.front_end import LaserFrontEnd
+from tests.narrowing import known
 
 LASER = Laser(np.deg2rad(np.arange(-135.0, 136.0, 1.0)), 0.05, 30.0, np.array([0.1, 0.0, 0.0]))
 SIGMAS = np.array([0.03, 0.03, np.deg2rad(0.5)])
@@ -104,7 +105,8 @@ class Run:
         rng = np.random.default_rng(seed)
         self.front_end = LaserFrontEnd(config or VisionConfig(), LASER)
         self.proposals, self.poses, self.travel, last = [], [IDENTITY], [0.0], 0
-        self.truth, self.node_at = truth, []
+        self.truth = truth
+        self.node_at: list[int] = []
         for i, pose in enumerate(truth):
             motion = between(odometry[last], odometry[i])
             scan = LaserScan(1_000_000_000 + i * 100_000_000, cast(world, pose, rng))
@@ -117,7 +119,7 @@ class Run:
             relative = RelativePose(motion, np.diag(SIGMAS**2)) if node else None
             tracked = self.front_end.track(node, relative)
             if node:
-                step = tracked[0].relative if tracked and tracked[0].relative else relative
+                step = known(tracked[0].relative if tracked and tracked[0].relative else relative)
                 self.poses.append(compose(self.poses[-1], step.delta))
                 self.travel.append(self.travel[-1] + np.hypot(*step.delta[:2]))
             self.proposals += tracked + self.front_end.close(node, self.belief())

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
+from hybridmap.graph.edges import Check
 from hybridmap.vision.laser import checks
 
 HAIR = 1e-6
-RULES = {
+RULES: dict[str, tuple[Callable[..., tuple[Check, ...]], dict[str, float]]] = {
     "step": (checks.of_step, {"inliers": checks.INLIERS_WEAK, "off_odometry_m": checks.TRANSLATION_MAX_M}),
     "way": (checks.of_way, {"odometry_sigma": checks.CONTRADICTION_SIGMAS, "violation": checks.WAY_VIOLATION}),
     "fit": (lambda **f: checks.of_fit(fit_min=0.7, **f), {"near": checks.NEAR_MIN, "fit": 0.7}),

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from laser_worlds import LASER, cast, corridor, room
 
 from hybridmap.geometry import IDENTITY
 from hybridmap.vision.laser.cloud import EMPTY, Cloud, cloud_of_scan, merged
 from hybridmap.vision.laser.submap import Atlas
 from hybridmap.vision.laser.visibility import violation
+from tests.vision.laser.laser_worlds import LASER, cast, corridor, room
 
 
 def test_points_lie_on_the_walls_and_normals_face_the_robot():

@@ -12,7 +12,7 @@ from hybridmap.vision.laser.hypotheses import Hypothesis
 N = 400
 STEP_M = 0.5
 CHAIN = np.column_stack([np.arange(N) * STEP_M, np.zeros(N), np.zeros(N)])
-TRAVEL = np.arange(N) * STEP_M
+TRAVEL = (np.arange(N) * STEP_M).astype(np.float64)
 
 
 def covariance_from(node):

@@ -1,20 +1,18 @@
 """What shows that a laser robot was carried, and what does not."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
-from laser_worlds import LASER, box, cast, ring, ring_drive, room
 
 from hybridmap.config.vision import RelocalisingConfig, VisionConfig
 from hybridmap.geometry import IDENTITY, RelativePose, between, compose
-from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Status, at_least
 from hybridmap.streams.laser import LaserScan
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.cloud import cloud_of_scan
 from hybridmap.vision.laser.continuity import Continuity
 from hybridmap.vision.laser.submap import Atlas
-from hybridmap.vision.laser.tracking import Tracker
+from hybridmap.vision.laser.tracking import Step, Tracker
+from tests.vision.laser.laser_worlds import LASER, box, cast, ring, ring_drive, room
 
 SURE = np.diag([0.05, 0.05, np.deg2rad(1.0)]) ** 2
 OTHER_ROOM = np.array([(-30.0, 9.0, 30.0, 9.0), (-20.0, 9.0, 5.0, -30.0)])
@@ -47,7 +45,8 @@ def stepped(worlds, step, odometry, measured=True, config=None):
     scans = [LaserScan(i, cast(world, compose(start, at), rng)) for i, (world, at) in enumerate(zip(worlds, way, strict=True))]
     chain = Chain([start], [IDENTITY], room(), config)
     chain.add(scans[-1].ranges_m, compose(IDENTITY, step))
-    judged = SimpleNamespace(relative=RelativePose(np.asarray(step, float), SURE), measured=measured)
+    relative, asked = RelativePose(np.asarray(step, float), SURE), (at_least("inliers", float(measured), 0.5),)
+    judged = Step(relative, asked, contradicts_odometry=False, inliers=1.0, fit=1.0, scatter=SURE)
     on_the_way = list(zip(wheels[:-1], scans[:-1], strict=True))
     return chain.continuity.broken(1, judged, RelativePose(np.asarray(odometry, float), SURE), on_the_way)
 

@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from laser_worlds import LASER, Run, cast, corridor, drifting, ring, ring_drive, room
 
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
@@ -14,6 +13,7 @@ from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
 from hybridmap.vision.base import RetracingFrontEnd, VerifyingFrontEnd
 from hybridmap.vision.laser.front_end import LaserFrontEnd
+from tests.vision.laser.laser_worlds import LASER, Run, cast, corridor, drifting, ring, ring_drive, room
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def test_nothing_is_accepted_on_the_first_lap(two_laps):
 
 
 def test_a_closure_waits_before_it_is_accepted(two_laps):
-    history = {}
+    history: dict[int, list[Status]] = {}
     for p in two_laps.proposals:
         history.setdefault(p.key, []).append(p.status)
     accepted = [v for v in history.values() if Status.ACCEPTED in v and v != [Status.ACCEPTED]]

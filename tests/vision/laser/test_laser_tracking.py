@@ -4,12 +4,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from laser_worlds import LASER, cast, corridor, ring, ring_drive, room
 
 from hybridmap.geometry import IDENTITY, RelativePose, between, compose
 from hybridmap.vision.laser.cloud import cloud_of_scan
 from hybridmap.vision.laser.submap import Atlas
 from hybridmap.vision.laser.tracking import Tracker
+from tests.vision.laser.laser_worlds import LASER, cast, corridor, ring, ring_drive, room
 
 LOOSE = np.diag([0.03, 0.03, 0.05]) ** 2
 

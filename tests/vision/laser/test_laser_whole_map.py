@@ -2,15 +2,14 @@
 
 import numpy as np
 import pytest
-from laser_worlds import LASER, Run, drifting, ring, ring_drive
 
 from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind, Lack, Method, Search, Status
 from hybridmap.vision import relocalising
 from hybridmap.vision.laser import whole_map
-from hybridmap.vision.laser.hypotheses import WINDOW_M
-from hybridmap.vision.laser.whole_map import WholeMap
+from hybridmap.vision.laser.hypotheses import WINDOW_M, Prober
+from tests.vision.laser.laser_worlds import LASER, Run, drifting, ring, ring_drive
 
 EVERY = 5
 UP, DOWN, STOP = 700, 1000, 1100
@@ -93,7 +92,7 @@ def test_mismatch_is_held_against_how_well_the_scans_of_the_drive_fit(found):
 
 def test_submaps_of_either_side_are_not_mixed(found):
     run, down = found
-    atlas = run.front_end._atlas
+    atlas = run.front_end.atlas
     assert atlas.around(down + 2, 4.0).nodes[0] == down
     assert atlas.around(down - 2, 4.0).nodes[-1] == down - 1
 
@@ -111,15 +110,14 @@ def test_scans_are_traced_on_either_side_of_the_carry(found):
 
 def test_of_many_submaps_those_with_the_likeliest_views_are_searched(found, monkeypatch):
     run, down = found
-    front_end, prober = run.front_end, run.front_end._prober
-    anchors = prober.anchors_before(down)
-    assert front_end._whole_map._likeliest(down + 2, anchors) == anchors
+    searched = run.front_end.whole_map
+    anchors = Prober(VisionConfig(), run.front_end.atlas, LASER).anchors_before(down)
+    assert searched.likeliest(down + 2, anchors) == anchors
     monkeypatch.setattr(whole_map, "SUBMAPS", 3)
-    few = WholeMap(VisionConfig(), front_end._atlas, prober, LASER, front_end._profiles, int)
     places = run.truth[run.node_at]
     near = []
     for node in range(down + 2, down + 8):
-        chosen = few._likeliest(node, anchors)
+        chosen = searched.likeliest(node, anchors)
         assert chosen == sorted(chosen)
         assert len(chosen) == 3 < len(anchors)
         near.append(np.hypot(*(places[chosen, :2] - places[node, :2]).T).min() < WINDOW_M)
@@ -148,6 +146,6 @@ def test_a_glimpse_of_something_else_is_no_carry():
     assert [p.target for p in run.proposals if p.broken_by] == [660 // EVERY]
     assert not [p for p in run.proposals if p.carried_m is not None]
     assert len([p for p in run.loops(Status.ACCEPTED) if p.search is Search.WHOLE_MAP]) >= 4
-    assert len(run.front_end._atlas.pieces) == 1
+    assert len(run.front_end.atlas.pieces) == 1
     assert run.front_end.lost_since is None
-    assert run.front_end._whole_map.since == 0
+    assert run.front_end.whole_map.since == 0

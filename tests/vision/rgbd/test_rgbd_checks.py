@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
+from hybridmap.graph.edges import Check
 from hybridmap.vision.rgbd import checks
 
 HAIR = 1e-6
@@ -14,7 +17,7 @@ PLANE = {
     "reverse_m": checks.REVERSE_M,
     "reverse_deg": checks.REVERSE_DEG,
 }
-RULES = {
+RULES: dict[str, tuple[Callable[..., tuple[Check, ...]], dict[str, float]]] = {
     "step": (
         lambda **f: checks.of_step(slack_m=0.0, **f),
         {"depth_inliers": checks.DEPTH_INLIERS_MIN, "odometry_sigma": checks.CONTRADICTION_SIGMA},

@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from rgbd_room import CUPBOARD, HIGH, LOW, camera, render
 
 from hybridmap.geometry import RelativePose, between, compose
 from hybridmap.vision.rgbd.depth_grid import make_grid, place
@@ -16,14 +15,17 @@ from hybridmap.vision.rgbd.stance import (
     small_rotvec,
     to_floor,
 )
+from tests.narrowing import known
+from tests.vision.rgbd.rgbd_room import CUPBOARD, HIGH, LOW, camera, render
 
 DEPTH_SIGMA = 0.003
 LEVEL = (np.deg2rad(0.2), 0.004)
 
 
-def surface(view, pose, noise=0.0, seed=0, believed=None, sigma=LEVEL):
+def surface(view, pose, noise=0.0, seed=0, believed=None, sigma: tuple[float, float] = LEVEL):
     frame = render(view, pose, noise=noise, rng=np.random.default_rng(seed))
-    stance = Stance(view.T_base_camera if believed is None else believed, *sigma, believed is not None)
+    tilt_rad, height_m = sigma
+    stance = Stance(view.T_base_camera if believed is None else believed, tilt_rad, height_m, believed is not None)
     return place(make_grid(frame.depth_m, view, 5, DEPTH_SIGMA), stance)
 
 
@@ -84,7 +86,7 @@ def test_covariance_is_that_of_the_error_where_every_pixel_errs_by_itself():
     squared = []
     for seed in range(16):
         a, b = surface(view, first, 0.003, 2 * seed), surface(view, moved, 0.003, 2 * seed + 1)
-        fit = register(a, b, from_planar(truth), None)
+        fit = known(register(a, b, from_planar(truth), None))
         error = between(truth, fit.relative.delta)
         assert np.hypot(error[0], error[1]) < 0.01
         assert abs(error[2]) < np.deg2rad(0.3)
@@ -98,7 +100,7 @@ def test_a_lone_wall_leaves_the_slide_along_it_to_odometry():
     stance = Stance(view.T_base_camera, *LEVEL, False)
     wall = place(make_grid(depth, view, 5, DEPTH_SIGMA), stance)
     prior = RelativePose(np.array([0.0, 0.1, 0.0]), np.diag([0.02, 0.02, 0.01]) ** 2)
-    fit = register(wall, wall, from_planar(prior.delta + np.array([0.05, 0.0, 0.02])), prior)
+    fit = known(register(wall, wall, from_planar(prior.delta + np.array([0.05, 0.0, 0.02])), prior))
     sigma = np.sqrt(np.diag(fit.relative.covariance))
     assert fit.relative.delta == pytest.approx(prior.delta, abs=2e-3)
     assert sigma[0] < 0.01
@@ -112,14 +114,14 @@ def test_noise_of_the_normals_does_not_pass_for_a_hold_along_a_wall():
     for _ in range(4):
         depth = [(2.5 + 0.012 * rng.normal(size=(180, 240))).astype(np.float32) for _ in range(2)]
         walls = [place(make_grid(one, view, 5, DEPTH_SIGMA), stance) for one in depth]
-        fits.append(register(walls[0], walls[1], np.eye(4), None))
+        fits.append(known(register(walls[0], walls[1], np.eye(4), None)))
     assert min(np.sqrt(fit.relative.covariance[1, 1]) for fit in fits) > 0.01  # squared noise would make it 4.5 mm
     assert min(fit.slack_m for fit in fits) > 0.05  # and this 24 mm
 
 
 def test_no_overlap_is_no_registration():
     view = camera()
-    fit = register(surface(view, [0.0, 0.0, 0.0]), surface(view, [0.0, 0.0, 3.1]), from_planar([0.0, 0.0, 3.1]), None)
+    fit = register(surface(view, [0.0, 0.0, 0.0]), surface(view, [0.0, 0.0, 3.1]), from_planar(np.array([0.0, 0.0, 3.1])), None)
     assert fit is None
 
 
@@ -130,7 +132,7 @@ def test_a_wrong_posture_is_straightened_by_a_sure_neighbour():
     sure = surface(tilted, first, believed=tilted.T_base_camera, sigma=(np.deg2rad(0.5), 0.02))
     unsure = surface(tilted, second, believed=off, sigma=(np.deg2rad(3.0), 0.06))
     truth = between(first, second)
-    fit = register(sure, unsure, from_planar(truth), None)
+    fit = known(register(sure, unsure, from_planar(truth), None))
     assert fit.relative.delta == pytest.approx(truth, abs=0.01)
     assert fit.level.T_base_camera_moving == pytest.approx(tilted.T_base_camera, abs=0.02)
 

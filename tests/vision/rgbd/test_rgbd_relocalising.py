@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
-from rgbd_room import camera, render
 
 from hybridmap.backends import create
 from hybridmap.config import Config
@@ -16,9 +16,11 @@ from hybridmap.mapper import Mapper
 from hybridmap.streams.base import Rig
 from hybridmap.vision.gating import Chain
 from hybridmap.vision.rgbd import checks, whole_map
-from hybridmap.vision.rgbd.pnp import Verification
+from hybridmap.vision.rgbd.pnp import Verification, Verifier
 from hybridmap.vision.rgbd.whole_map import WholeMap, chain_of
 from hybridmap.vision.templates import Matcher
+from tests.narrowing import known
+from tests.vision.rgbd.rgbd_room import camera, render
 
 VIEW = camera(width=240)
 PER_LAP, UP, DOWN = 16, 19, 28
@@ -51,7 +53,7 @@ def mapped(carried, **overrides):
     for i, (pose, frame) in enumerate(zip(wheels, frames, strict=True)):
         mapper.add_odometry(float(i), pose)
         update = mapper.add_rgbd(float(i), frame.color, frame.depth_m)
-        off = between(compose(truth[0], update.pose_map_robot), truth[i])
+        off = between(compose(truth[0], known(update).pose_map_robot), truth[i])
         if i > UP and found_at is None and np.hypot(off[0], off[1]) < 0.15:
             found_at = i
     mapper.finish()
@@ -116,7 +118,7 @@ def test_a_view_of_nothing_is_no_carry(carried):
     assert off_m(mapper.poses(), truth[: UP + 1]).max() < 0.05
 
 
-class FakeVerifier:
+class FakeVerifier(Verifier):
     """Says of a pair what it was told."""
 
     def __init__(self, found):
@@ -133,7 +135,7 @@ def test_the_likeliest_views_some_nodes_apart_are_verified(monkeypatch):
     profiles = rng.normal(size=(31, 2, 16)).astype(np.float32)
     profiles[30] = profiles[12] + 0.1 * profiles[20]
     profiles[13] = profiles[12] + 0.05
-    keyframes = [SimpleNamespace(profile=profile, number=i) for i, profile in enumerate(profiles)]
+    keyframes: list[Any] = [SimpleNamespace(profile=profile, number=i) for i, profile in enumerate(profiles)]
     matcher = Matcher("plain", 0.5, 0.5, max_shift=2)
     for profile in profiles:
         matcher.add(profile)

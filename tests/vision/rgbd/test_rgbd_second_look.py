@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rgbd_room import camera, render
-from test_rgbd_front_end import NOT_CARRIED, PER_LAP, VIEW, belief_of, drive, errors, lap_poses
 
 from hybridmap.config import Config
 from hybridmap.config.vision import RgbdClosingConfig, RgbdConfig, VisionConfig
@@ -18,6 +16,9 @@ from hybridmap.vision.rgbd import checks, closing
 from hybridmap.vision.rgbd.front_end import RgbdFrontEnd
 from hybridmap.vision.rgbd.pnp import Verification, Verifier
 from hybridmap.vision.rgbd.revisits import Revisits
+from tests.narrowing import as_a, known
+from tests.vision.rgbd.rgbd_room import camera, render
+from tests.vision.rgbd.test_rgbd_front_end import NOT_CARRIED, PER_LAP, VIEW, belief_of, drive, errors, lap_poses
 
 SURE, UNSURE = 0.02, 1.0
 
@@ -101,12 +102,12 @@ def test_before_a_wall_features_hold_what_depth_alone_lets_slide():
         front_end.add_node(node, front_end.observe(render(view, pose, stamp_ns=node), np.zeros(3)))
     off = np.array([0.02, 0.08, 0.01])
     guess = RelativePose(between(poses[1], poses[0]) + off, np.diag([0.15, 0.15, 0.05]) ** 2)
-    keyframes, verifier = front_end._keyframes, front_end._verifier
+    keyframes, verifier = front_end.keyframes, front_end.verifier
     refused = verifier.verify_on_map(keyframes[1], keyframes[0], guess)
     assert [check.figure for check in refused.checks if not check.passed] == ["slack_m"]
     found = verifier.verify_near(keyframes[1], keyframes[0], guess)
     assert found.method is Method.FEATURES_AND_DEPTH
-    assert found.relative.delta == pytest.approx(between(poses[1], poses[0]), abs=0.01)
+    assert known(found.relative).delta == pytest.approx(between(poses[1], poses[0]), abs=0.01)
 
 
 def test_a_view_that_depth_cannot_confirm_stays_where_features_have_it_near_the_map(driven, poses, monkeypatch):
@@ -129,7 +130,7 @@ def test_without_verification_nothing_is_measured_again(poses, frames):
 def test_a_retracted_loop_no_longer_supports_others(poses, frames):
     front_end, proposals, _ = drive(VisionConfig(), poses, 0.0, frames)
     loops = [p for p in proposals.values() if p.kind is EdgeKind.LOOP and p.status is Status.ACCEPTED]
-    support = front_end._closer._support
+    support = front_end.closer.support
     before = support.accepted(loops[0].source)
     away = moved(poses, loops[0].source, np.array([0.3, 1.5, 0.6]))
     assert again(front_end, loops[0], away).status is Status.REJECTED
@@ -153,7 +154,7 @@ def test_a_mapper_mends_one_loop_and_retracts_another(poses, frames, monkeypatch
             Edge(PER_LAP // 2, 0, EdgeKind.LOOP, Status.ACCEPTED, RelativePose(np.zeros(3), tight), key=9001),
         ]
     )
-    held, verify = [mapper.belief().covariance_from(PER_LAP // 2)[0]], mapper.vision.verify
+    held, verify = [mapper.belief().covariance_from(PER_LAP // 2)[0]], as_a(RgbdFrontEnd, mapper.vision).verify
 
     def looked_at(doubted, belief):
         held.append(belief.covariance_from(PER_LAP // 2)[0])
@@ -166,7 +167,7 @@ def test_a_mapper_mends_one_loop_and_retracts_another(poses, frames, monkeypatch
     assert {spoilt, false} <= set(mapper.book.tried_again)
     assert edges[spoilt].status is Status.ACCEPTED
     assert edges[spoilt].search is Search.AGAIN
-    assert edges[spoilt].relative.delta == pytest.approx(between(poses[true.source], poses[true.target]), abs=0.01)
+    assert known(edges[spoilt].relative).delta == pytest.approx(between(poses[true.source], poses[true.target]), abs=0.01)
     assert (edges[false].status, edges[false].search) == (Status.RETRACTED, Search.AGAIN)
     assert spoilt not in mapper.backends.solutions["gtsam-gnc"].report.rejected_edge_ids
     relative = between(poses[0], poses)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rgbd_room import render
-from test_rgbd_front_end import VIEW, drive, errors, lap_poses
 
 from hybridmap.config.vision import MatchingConfig, VisionConfig
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.vision.gating import Gate
+from tests.vision.rgbd.rgbd_room import render
+from tests.vision.rgbd.test_rgbd_front_end import VIEW, drive, errors, lap_poses
 
 
 @pytest.fixture(scope="module")
