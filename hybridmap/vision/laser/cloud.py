@@ -16,7 +16,14 @@ RANGE_MAX_M = 20.0
 """Returns farther away are left out, m: beyond it the beams of most lasers are too far apart to give a wall its normal."""
 CELL_M = 0.05
 """Points of one cell are merged into one, m: a few times the noise of a range."""
+REACH_M, REACH_BEAMS, REACH_MAX_M = 0.1, 8.0, 1.0
+"""A neighbour of a point lies no farther than this, m, beside so many distances between beams there; never beyond the last."""
+THIN = 0.1
+"""Neighbours are a line where their spread across it is at most this share of that along it (squares)."""
+AGREEING = 0.3
+"""Length of the sum of the normals in a cell below which they contradict one another, and the cell has none."""
 NEIGHBOURS = 3
+"""Beams to either side of a point that give it its normal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +79,7 @@ def clouds_of_scans(ranges_m: Sequence[NDArray[np.float32]], laser: Laser) -> li
     distance, bearing = ranges[scan, beam], laser.bearings_rad[beam]
     points = np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], axis=1)
     step = abs(float(laser.bearings_rad[-1] - laser.bearings_rad[0])) / max(len(laser.bearings_rad) - 1, 1)
-    normals = _normals(points, np.minimum(1.0, 0.1 + 8.0 * step * distance), scan)
+    normals = _normals(points, np.minimum(REACH_MAX_M, REACH_M + REACH_BEAMS * step * distance), scan)
     whole, group = _merged(Cloud(points, normals).moved(laser.pose_base_laser), scan, CELL_M)
     ends = np.searchsorted(group, np.arange(len(ranges_m) + 1))
     return [Cloud(whole.points[a:b], whole.normals[a:b]) for a, b in pairwise(ends.tolist())]
@@ -115,7 +122,7 @@ def _merged(cloud: Cloud, group: NDArray[np.int64], cell_m: float) -> tuple[Clou
     mean: Array = np.stack([np.bincount(member, cloud.points[:, i], n) / count for i in (0, 1)], axis=1)
     normal: Array = np.stack([np.bincount(member, cloud.normals[:, i], n) for i in (0, 1)], axis=1)
     length = np.sqrt(normal[:, 0] ** 2 + normal[:, 1] ** 2)
-    normal = np.where((length > 0.3)[:, None], normal / np.maximum(length, 1e-9)[:, None], 0.0)
+    normal = np.where((length > AGREEING)[:, None], normal / np.maximum(length, 1e-9)[:, None], 0.0)
     return Cloud(mean, normal), found // (rows * columns)
 
 
@@ -144,6 +151,6 @@ def _normals(points: Array, reach_m: Array, scan: NDArray[np.int64]) -> Array:
     along = 0.5 * np.arctan2(2.0 * xy, xx - yy)
     normal = np.stack([-np.sin(along), np.cos(along)], axis=1)
     spread = np.sqrt((xx - yy) ** 2 + 4.0 * xy * xy)
-    is_line = (total >= 3.0) & ((xx + yy - spread) <= 0.1 * (xx + yy + spread))
+    is_line = (total >= 3.0) & ((xx + yy - spread) <= THIN * (xx + yy + spread))
     normal *= np.where((normal * points).sum(axis=1) > 0.0, -1.0, 1.0)[:, None]
     return np.where(is_line[:, None], normal, 0.0)

@@ -15,6 +15,8 @@ from hybridmap.vision.base import Belief
 from hybridmap.vision.laser import checks
 from hybridmap.vision.laser.hypotheses import SURE_SIGMA_M, Hypothesis
 
+HALF = 0.5
+"""What agrees with less than this share of a cluster's members contradicts it."""
 WAIT_M = 32.0
 """Travel after which a hypothesis that found no cluster is given up, m: it is tried again at the end."""
 PROBES, SPAN_M = 3, 3.0
@@ -160,7 +162,7 @@ class Commitment:
         for i, w in enumerate(self._queue):
             if i in members or agrees[i] == 1.0:
                 out.append(Settled(w.key, w.hypothesis, ripe.checks))
-            elif agrees[i] < 0.5:
+            elif agrees[i] < HALF:
                 out.append(Settled(w.key, w.hypothesis, lack=Lack.CONTRADICTED))
             else:
                 left.append(i)
@@ -168,7 +170,7 @@ class Commitment:
         return out
 
     def _rivals(self, best: Cluster, other: Cluster) -> bool:
-        return bool(self._consistent[np.ix_(list(best.members), list(other.members))].mean() < 0.5)
+        return bool(self._consistent[np.ix_(list(best.members), list(other.members))].mean() < HALF)
 
     def _clusters(self) -> list[Cluster]:
         """Sets of hypotheses that agree, one a probe, begun with each of them in turn; those of the largest score first."""

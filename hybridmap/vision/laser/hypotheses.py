@@ -40,7 +40,9 @@ SURE_SIGMA_M = 0.8
 FLOOR_M, FLOOR_DEG = 0.004, 0.04
 """Standard deviations of the registration of two submaps at least, m and degrees: what their bending hides."""
 REGISTERED_POINTS = 400
+"""Points of a probe that are registered."""
 UNKNOWN = 1e8
+"""Stands for an infinite standard deviation, m."""
 SAME_M, SAME_RAD = 0.3, 0.1
 """Hypotheses of one anchor that lie so near to each other are one."""
 

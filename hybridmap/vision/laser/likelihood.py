@@ -153,11 +153,12 @@ def score_starts(field: LikelihoodField, points: Array, center: Array, headings_
     return scores / (255.0 * max(len(points), 1))
 
 
-STEP_M = 0.3
-STEP_DEG = 2.0
+STEP_M, STEP_DEG = 0.3, 2.0
+"""Half a step of the wide grid of starts, m and degrees; the search about the best ones goes by it."""
 SURVIVORS = 24
-SEPARATE_M = 0.8
-SEPARATE_DEG = 12.0
+"""Starts of the wide grid that are looked at more closely."""
+SEPARATE_M, SEPARATE_DEG = 0.8, 12.0
+"""Modes are apart where they differ by more, m or degrees."""
 
 
 @dataclass(frozen=True, slots=True)

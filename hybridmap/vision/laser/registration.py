@@ -22,9 +22,18 @@ SIGMA_M = 0.01
 """Standard deviation of a point's residual at least, m: the noise of a laser."""
 SPURIOUS = 0.04
 """Share of the inliers whose information along any direction is not believed: normals err by some 10 degrees."""
+WIDE, WIDE_ITERATIONS = 2.0, 2
+"""Factor on that scale in the first iterations, and how many these are."""
+LARGEST_STEP = 0.3
+"""No iteration moves the cloud by more, m and rad."""
+FACING = -0.1
+"""Least cosine between the normals of partners: the two sides of a wall are none."""
 CONVERGED = 5e-4
+"""Iterations end when none moves the cloud by more, m and rad."""
 LEAST = 1e-6
+"""Information beside that of the points, so that the equations have a solution where there are none."""
 WEAKEST_INFORMATION = (1.0, 1.0, 4.0)
+"""Information of a registration that no wall holds: a metre, and half a radian."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,12 +136,12 @@ def align(field: LikelihoodField, cloud: Cloud, starts: Array, prior: Prior | No
     """
     poses = np.array(starts, dtype=np.float64)
     moving = _Moving(*(np.ascontiguousarray(a[..., i]) for a in (cloud.points, cloud.normals) for i in (0, 1)))
-    scale = 2.0 * CAUCHY_SCALE_M
+    scale = WIDE * CAUCHY_SCALE_M
     for iteration in range(ITERATIONS):
         hessian, gradient = _normal_equations(_partners(field, moving, poses), scale)
         steps = _newton_steps(hessian, gradient, poses, prior)
-        poses = compose(poses, steps.clip(-0.3, 0.3))
-        if iteration >= 2:
+        poses = compose(poses, steps.clip(-LARGEST_STEP, LARGEST_STEP))
+        if iteration >= WIDE_ITERATIONS:
             scale = CAUCHY_SCALE_M
             if np.abs(steps).max() < CONVERGED:
                 break
@@ -150,7 +159,7 @@ def _partners(field: LikelihoodField, moving: _Moving, poses: Array) -> _Partner
     np.add(cos * nx, sin * ny, out=bx)
     np.subtract(cos * ny, sin * nx, out=by)
     np.subtract(by * moving.x, bx * moving.y, out=jacobian[:, 2])
-    has = (label > 0) & (bx * moving.normal_x + by * moving.normal_y > -0.1)
+    has = (label > 0) & (bx * moving.normal_x + by * moving.normal_y > FACING)
     return _Partners(nx * x + ny * y - offset, jacobian, has)
 
 

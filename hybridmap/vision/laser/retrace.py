@@ -27,7 +27,9 @@ INLIERS_MIN = 0.6
 OFF_MAX_M, OFF_MAX_DEG = 0.3, 17.0
 """Largest correction that is believed, m and degrees: half a step between nodes."""
 TURN_AS_TRAVEL_M = 0.3
+"""A turn by a radian counts as so much travel, m."""
 NOWHERE_M = 1e6
+"""Where points lie that only fill an array, m."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,12 @@ PROBE_HALF_M, TARGET_HALF_M = 1.5, 4.0
 """Travel about the node whose scans are registered, and about the partner to whose scans, m: short, so that neither bends."""
 SEARCH_M, SEARCH_DEG = 0.45, 4.5
 """Half-widths of the grid of starts, m and degrees: how far an optimised map still is off."""
+GRID_M, GRID_DEG = 0.15, 1.5
+"""Steps of that grid, m and degrees."""
+SCORED_POINTS, REGISTERED_POINTS = 100, 300
+"""Points that score the starts, and that are registered."""
+PRIOR_M, PRIOR_RAD = 1.0, 0.2
+"""Standard deviations of the map as prior of the registration: it only holds what the walls leave free."""
 AMBIGUOUS_M = 1.5
 """Standard deviation along a direction in which a registration is ambiguous, m."""
 FLOOR_M, FLOOR_DEG = 0.002, 0.025
@@ -87,13 +93,13 @@ class Reviser:
         target, probe = self._atlas.around(other, TARGET_HALF_M), self._atlas.around(node, PROBE_HALF_M)
         sharp, fine = self._atlas.scoring_field(target, Field.SHARP), self._atlas.fine_field(target)
         expected = between(poses[other], poses[node])
-        offsets = square(SEARCH_M, 0.15)
-        headings = expected[2] + np.deg2rad(spaced(SEARCH_DEG, 1.5))
-        scores = score_starts(sharp, probe.cloud.thinned(100).points, expected[:2], headings, offsets)
+        offsets = square(SEARCH_M, GRID_M)
+        headings = expected[2] + np.deg2rad(spaced(SEARCH_DEG, GRID_DEG))
+        scores = score_starts(sharp, probe.cloud.thinned(SCORED_POINTS).points, expected[:2], headings, offsets)
         h, t = np.unravel_index(int(np.argmax(scores)), scores.shape)
         start = np.array([*(expected[:2] + offsets[t]), headings[h]])
-        prior = Prior(expected, 1.0, 0.2)
-        alignment = align(fine, probe.cloud.thinned(300), start[None], prior)
+        prior = Prior(expected, PRIOR_M, PRIOR_RAD)
+        alignment = align(fine, probe.cloud.thinned(REGISTERED_POINTS), start[None], prior)
         covariance = alignment.covariance(0, FLOOR_M, np.deg2rad(FLOOR_DEG))
         pose = alignment.poses[0]
         near, fit, off = float(alignment.near[0]), float(alignment.fit[0]), pose - expected

@@ -54,8 +54,8 @@ class Field(Enum):
     SHARP = (0.1, 0.5, 0.2, 160)
 
 
-FINE_KEPT = 40
-SUBMAPS_KEPT = 1000
+FINE_KEPT, SUBMAPS_KEPT = 40, 1000
+"""Fields for registration, and submaps, that are kept."""
 
 
 class _Recent(Generic[Key, Value]):

@@ -46,8 +46,16 @@ CONTRADICTION_M, CONTRADICTION_DEG = 0.15, 3.0
 """A good registration this far from the odometry drops the odometry edge: several times what wheels err over a step."""
 FLOOR_M, FLOOR_DEG = 0.001, 0.02
 """Standard deviations of a node's place in the submap at least, m and degrees: what residuals do not show."""
+GRID_M, GRID_DEG = 0.1, 2.0
+"""Steps of the grid of starts, m and degrees."""
+PULL = 0.05
+"""What a start loses of its score at one standard deviation of the odometry's heading, or at two of its translation."""
+DOUBT_M, DOUBT_DEG = 0.05, 1.5
+"""Standard deviations that are added to a registration which is not good, m and degrees."""
 SCORED_POINTS = 90
+"""Points that score the starts."""
 WIDE_GAIN, LOST_GAIN = 0.03, 0.1
+"""By so much the share of inliers must be larger for a wider search to be preferred."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,10 +141,10 @@ class Tracker:
 
     def _grid(self, field: LikelihoodField, cloud: Cloud, expected: Array, window: Window) -> Alignment:
         sigma_m, sigma_rad = window.prior_m, np.deg2rad(window.prior_deg)
-        headings, offsets = np.deg2rad(spaced(window.half_deg, 2.0)), square(window.half_m, 0.1)
+        headings, offsets = np.deg2rad(spaced(window.half_deg, GRID_DEG)), square(window.half_m, GRID_M)
         scores = score_starts(field, cloud.thinned(SCORED_POINTS).points, expected[:2], expected[2] + headings, offsets)
-        scores -= 0.05 * (headings[:, None] / sigma_rad) ** 2
-        scores -= 0.05 * ((offsets / (2.0 * sigma_m)) ** 2).sum(axis=1)[None]
+        scores -= PULL * (headings[:, None] / sigma_rad) ** 2
+        scores -= PULL * ((offsets / (2.0 * sigma_m)) ** 2).sum(axis=1)[None]
         h, t = np.unravel_index(int(np.argmax(scores)), scores.shape)
         start = np.array([*(expected[:2] + offsets[t]), expected[2] + headings[h]])
         prior = Prior(expected, sigma_m, float(sigma_rad))
@@ -168,7 +176,7 @@ class Tracker:
             return Step(odometry, asked, False, inliers, fit, odometry.covariance)
         covariance = alignment.covariance(0, FLOOR_M, np.deg2rad(FLOOR_DEG))
         if self._doubtful(alignment, odometry.delta):
-            covariance = covariance + np.diag([0.05**2, 0.05**2, np.deg2rad(1.5) ** 2])
+            covariance = covariance + np.diag([DOUBT_M**2, DOUBT_M**2, np.deg2rad(DOUBT_DEG) ** 2])
         wrong = bool(inliers >= checks.INLIERS_MIN and self._contradicts(pose, odometry.delta))
         edge = self._atlas.joining(len(self._atlas) - 1, pose, covariance)
         return Step(edge, asked, wrong, inliers, fit, covariance)

@@ -14,10 +14,12 @@ from hybridmap.vision.laser.submap import Submap
 
 Marks = NDArray[np.bool_]
 
-MARGIN_M = 0.25
-VIEWPOINTS = 6
+MARGIN_M, MARGIN_PER_M = 0.25, 0.03
+"""A point is in free space where the laser saw farther by so much, m, and by this share of its distance."""
+VIEWPOINTS, POINTS = 6, 250
+"""Scans of one submap that look at points of the other, and these points, at most."""
 GRAZING = 0.3
-POINTS = 250
+"""Least cosine between a wall's normal and the ray at which the wall is judged."""
 
 
 def violation(
@@ -73,7 +75,7 @@ def _look(cloud: Cloud, poses_laser_cloud: Array, ranges_m: NDArray[np.float32],
     beam = beam.clip(1, len(bearings) - 2) - 1
     low, high = np.take_along_axis(nearest, beam, axis=1), np.take_along_axis(farthest, beam, axis=1)
     usable = inside & (np.abs(normal_x * x + normal_y * y) > GRAZING * distance) & np.isfinite(low)
-    margin = MARGIN_M + 0.03 * distance
+    margin = MARGIN_M + MARGIN_PER_M * distance
     free = usable & (distance < low - margin)
     return free, usable & ~free & (distance < high + margin)
 

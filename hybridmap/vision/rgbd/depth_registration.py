@@ -21,6 +21,12 @@ MAX_DISTANCE_M, MAX_NORMAL_DEG = 0.15, 30.0
 """Points of two surfaces are a pair no farther apart than this (plus the noise of depth), m, and no more inclined, degrees."""
 MIN_POINTS = 60
 """Fewest pairs: 3 % of a picture's cells."""
+NOISE_SIGMAS = 3.0
+"""Standard deviations of depth that are allowed beside that distance."""
+ASIDE = 4.0
+"""A pair lies at most this many times that distance apart in all directions (squares): twice, along the surface too."""
+TAILS = 0.25
+"""Share of a squared residual that is added to the variance of its point: a Cauchy weight of two standard deviations."""
 CORRELATION = 30.0
 """Where it is asked whether surfaces hold each other or slide, so many neighbouring points count as one: depth errs alike
 over some cells."""
@@ -251,7 +257,7 @@ class Pairing:
     def terms(self) -> tuple[Array, Array]:
         """H (6, 6) and b (6,) of the normal equations, with Cauchy weights."""
         J = wrenches(self.arm, self.normal)
-        weighted = J / (self.variance + 0.25 * self.residual**2)
+        weighted = J / (self.variance + TAILS * self.residual**2)
         return weighted @ J.T, -weighted @ self.residual
 
 
@@ -277,9 +283,9 @@ def associate(fixed: Surface, moving: Array, T: Array) -> Pairing:
     normal, arm, turned = theirs[3:6], turn @ ours[:3], turn @ ours[3:6]
     offset = arm + (T[:3, 3:] - theirs[:3])
     residual = np.einsum("ij,ij->j", normal, offset)
-    reach = MAX_DISTANCE_M + 3.0 * (theirs[6] + ours[6])
+    reach = MAX_DISTANCE_M + NOISE_SIGMAS * (theirs[6] + ours[6])
     keep = np.abs(residual) < reach
     keep &= np.einsum("ij,ij->j", turned, normal) > np.cos(np.deg2rad(MAX_NORMAL_DEG))
-    keep &= np.einsum("ij,ij->j", offset, offset) < 4.0 * reach * reach
+    keep &= np.einsum("ij,ij->j", offset, offset) < ASIDE * reach * reach
     variance = np.where(keep, theirs[6] ** 2 + ours[6] ** 2, np.inf)
     return Pairing(normal, turned, arm, residual, variance, int(np.count_nonzero(keep)), moving.shape[1])

@@ -11,6 +11,8 @@ from hybridmap.vision.rgbd.features import Correspondences
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.stance import apply, wrenches
 
+KEYPOINT_DEPTH_M = 0.005
+"""Noise of a keypoint's depth that does not grow with the distance, m: edges of objects."""
 AGREEING = 11.3
 """Squared error of a pair over its covariance that one in a hundred right pairs exceeds (3 degrees of freedom)."""
 
@@ -108,6 +110,6 @@ def point_pairs(
     a, b = fixed.features.points[matches.first], moving.features.points[matches.second]
     T_base_camera, z = fixed.surface.stance.T_base_camera, a[:, 2]
     ray = (a / np.linalg.norm(a, axis=1, keepdims=True)) @ T_base_camera[:3, :3].T
-    along = 0.5 / (0.005 + depth_sigma * z**2) ** 2
+    along = 0.5 / (KEYPOINT_DEPTH_M + depth_sigma * z**2) ** 2
     across = 0.5 * (focal_px / z) ** 2
     return PointPairs(apply(T_base_camera, a), apply(moving.surface.stance.T_base_camera, b), ray, across, along - across)

@@ -24,6 +24,10 @@ FLOORS, HELD_FLOORS = (0.0001, 0.005), (0.01, 0.2)
 """Least standard deviations of a loop edge, m and degrees: of a mounted camera, and of one whose tilt comes from the floor."""
 KEYPOINT_REACH_M = 0.3
 """Matched keypoints farther apart than this at a guess, beside what that is off by, are no matches, m."""
+ROUGH_M, ROUGH_DEG = 0.1, 3.0
+"""Standard deviations of a pose by features as prior of its refinement, m and degrees."""
+ALONE_M, ALONE_DEG = 0.1, 1.5
+"""Standard deviations of an edge by as few features as may measure one alone, m and degrees."""
 GUESSED = 2.0
 """Standard deviations of a guess over which features are looked for around it."""
 
@@ -179,7 +183,7 @@ class Verifier:
         asked: tuple[Check, ...],
     ) -> Verification:
         pairs = point_pairs(source, target, Correspondences(first, second), self._focal_px, self._depth_sigma)
-        rough = RelativePose(flat.delta, np.diag([0.1, 0.1, np.deg2rad(3.0)]) ** 2)
+        rough = RelativePose(flat.delta, np.diag([ROUGH_M, ROUGH_M, np.deg2rad(ROUGH_DEG)]) ** 2)
         fit = register(source.surface, target.surface, from_planar(flat.delta), rough, pairs)
         if fit is None:
             return self._features_alone(flat, len(first), asked)
@@ -195,8 +199,8 @@ class Verifier:
         asked += checks.of_features_alone(inliers)
         if not passed(asked):
             return Verification(None, Method.FEATURES, asked)
-        sigma = 0.1 * np.sqrt(checks.MIN_INLIERS_ALONE / inliers)
-        loose = RelativePose(flat.delta, np.diag([sigma, sigma, np.deg2rad(1.5)]) ** 2)
+        sigma = ALONE_M * np.sqrt(checks.MIN_INLIERS_ALONE / inliers)
+        loose = RelativePose(flat.delta, np.diag([sigma, sigma, np.deg2rad(ALONE_DEG)]) ** 2)
         return Verification(loose, Method.FEATURES, asked)
 
     def _calibrated(self, relative: RelativePose, source: Keyframe, target: Keyframe) -> RelativePose:

@@ -16,6 +16,14 @@ from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp_solver import PnpSolver
 from hybridmap.vision.rgbd.stance import Stance, camera_on, inverse_rigid, rotation_of
 
+ON_FLOOR_M = (0.05, 0.03, 0.03)
+"""Cells this near to a plane are on it, m beside the noise of depth: in each of three fits."""
+ALIKE_COS, FLOOR_COS = 0.97, 0.94
+"""Least cosine between the normals of cells of one hypothesis of a floor, and between a normal and the floor's."""
+BELOW_M, BELOW_SIGMAS = 0.1, 3.0
+"""A cell is below the floor where it lies deeper, m and standard deviations of depth."""
+STRUCTURE_DEG = (15.0, 10.0, 7.0, 5.0, 5.0)
+"""A normal belongs to an upright or flat surface within this angle: in each of five fits."""
 AGREE_TILT_RAD = float(np.deg2rad(2.0))
 AGREE_HEIGHT_M = 0.06
 """A floor seen within this of the mounting does not contradict it."""
@@ -151,16 +159,16 @@ def find_floor(grid: DepthGrid, up_nominal: Array, height_nominal_m: float, tole
         return None
     chosen = eligible[np.linspace(0, len(eligible) - 1, min(HYPOTHESES, len(eligible))).astype(int)]
     ups, heights = normals[chosen], distance[chosen]
-    off = np.abs(points[eligible] @ ups.T + heights) < 0.03 + sigma[eligible, None]
-    alike = normals[eligible] @ ups.T > 0.97
+    off = np.abs(points[eligible] @ ups.T + heights) < ON_FLOOR_M[-1] + sigma[eligible, None]
+    alike = normals[eligible] @ ups.T > ALIKE_COS
     best = int(np.argmax((off & alike).sum(axis=0)))
     up, height = ups[best], float(heights[best])
-    for reach in (0.05, 0.03, 0.03):
-        on = (np.abs(points @ up + height) < reach + sigma) & (normals @ up > 0.94)
+    for reach in ON_FLOOR_M:
+        on = (np.abs(points @ up + height) < reach + sigma) & (normals @ up > FLOOR_COS)
         if on.sum() < min_cells:
             return None
         up, height = _fit_plane(points[on], 1.0 / sigma[on] ** 2, up)
-    below = points @ up + height < -(0.1 + 3.0 * sigma)
+    below = points @ up + height < -(BELOW_M + BELOW_SIGMAS * sigma)
     if below.mean() > MIN_SHARE_BELOW or abs(height - height_nominal_m) > tolerance_m:
         return None
     return Floor(up, height, int(on.sum()))
@@ -177,7 +185,7 @@ def vertical_of_structure(normals: Array, guesses: Array) -> Array:
         guesses: (G, 3) unit vectors, the likeliest first.
     """
     outcomes = [_settle(normals, guess) for guess in guesses]
-    support = [float(np.mean(_structured(normals, up, 5.0))) + 0.5 * float(up @ guesses[0]) for up in outcomes]
+    support = [float(np.mean(_structured(normals, up, STRUCTURE_DEG[-1]))) + 0.5 * float(up @ guesses[0]) for up in outcomes]
     return outcomes[int(np.argmax(support))]
 
 
@@ -189,7 +197,7 @@ def _structured(normals: Array, up: Array, limit_deg: float) -> NDArray[np.bool_
 def _settle(normals: Array, guess: Array) -> Array:
     up = guess
     prior = (0.05 * len(normals) + 1.0) * np.outer(guess, guess)
-    for limit_deg in (15.0, 10.0, 7.0, 5.0, 5.0):
+    for limit_deg in STRUCTURE_DEG:
         kept = normals[_structured(normals, up, limit_deg)]
         lies_flat = np.abs(kept @ up) > 0.5
         upright, flat = kept[~lies_flat], kept[lies_flat]
