@@ -123,13 +123,16 @@ def cluster(count: int) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
         probe.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
     tool = (sys.executable, "-m", "dask")
-    quiet = {"env": os.environ | ONE_THREAD, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     port = address.rpartition(":")[2]
     with tempfile.TemporaryDirectory() as scratch:
-        words = ("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
-        running = [subprocess.Popen([*tool, *words], cwd=scratch, **quiet)]
-        words = ("worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")
-        running += [subprocess.Popen([*tool, *words], cwd=scratch, **quiet) for _ in range(count)]
+
+        def started(*words: str) -> subprocess.Popen[bytes]:
+            env, none = os.environ | ONE_THREAD, subprocess.DEVNULL
+            return subprocess.Popen([*tool, *words], cwd=scratch, env=env, stdout=none, stderr=none)
+
+        running = [started("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")]
+        worker = ("worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")
+        running += [started(*worker) for _ in range(count)]
         try:
             require_workers(address, count)
             yield address, running[1:]

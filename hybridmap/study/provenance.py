@@ -40,13 +40,13 @@ def digest(tree: Mapping[str, Any]) -> str:
 @cache
 def solving() -> str:
     """Digest of all that turns a graph into figures: our code, the libraries' versions, the machine's kind."""
-    return digest({"code": _digest_of(solving_only=True), **_surroundings()})
+    return digest({"code": digest_of_code(solving_only=True), **_surroundings()})
 
 
 @cache
 def mapping() -> str:
     """The same of all that turns a drive into a graph and its figures."""
-    return digest({"code": _digest_of(solving_only=False), **_surroundings()})
+    return digest({"code": digest_of_code(solving_only=False), **_surroundings()})
 
 
 def _surroundings() -> dict[str, Any]:
@@ -66,7 +66,8 @@ def _version(library: str) -> str:
         return ""
 
 
-def _digest_of(*, solving_only: bool) -> str:
+def digest_of_code(*, solving_only: bool) -> str:
+    """SHA-256 of our source text: of what turns a graph into figures only, or also of what turns a drive into a graph."""
     package = Path(str(resources.files("hybridmap")))
     total = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):

@@ -14,10 +14,10 @@ SIGMA = np.array([0.03, 0.02, 0.01])
 
 def laps(rng, nodes=60, per_lap=20, noise=1.0, every=1):
     """A robot that drives round and round; node k sees node k - per_lap again. Returns the graph and the true poses."""
-    truth = [np.zeros(3)]
+    way = [np.zeros(3)]
     for _ in range(nodes - 1):
-        truth.append(compose(truth[-1], [0.5, 0.05, 2 * np.pi / per_lap]))
-    truth = np.array(truth)
+        way.append(compose(way[-1], [0.5, 0.05, 2 * np.pi / per_lap]))
+    truth = np.array(way)
     pairs = [(k - 1, k, EdgeKind.ODOMETRY) for k in range(1, nodes)]
     pairs += [(k, k - per_lap, EdgeKind.LOOP) for k in range(per_lap, nodes, every)]
     pairs.sort(key=lambda p: (max(p[:2]), p[2]))

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from graphs_for_tests import laps
 
 from hybridmap import backends
 from hybridmap.backends.comparison import compare, metrics_of
@@ -16,6 +15,7 @@ from hybridmap.backends.judging.dual import prove, quadratic_form
 from hybridmap.geometry import compose
 from hybridmap.graph.io import read_graph
 from hybridmap.study.false_loops import inject
+from tests.backends.graphs_for_tests import laps
 
 
 def stacked(poses):

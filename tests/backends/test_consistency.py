@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from graphs_for_tests import laps
 from scipy.stats import chi2 as chi2_law
 
 from hybridmap import backends
@@ -19,6 +18,7 @@ from hybridmap.graph.paths import chain_of
 from hybridmap.graph.pose_graph import prefix
 from hybridmap.store.schema import report_from_json, report_to_json
 from hybridmap.study.false_loops import inject
+from tests.backends.graphs_for_tests import laps
 
 FILTERED = BackendsConfig(consistency=ConsistencyConfig(enabled=True))
 
@@ -149,6 +149,8 @@ class Judge:
         poses = self._right if graph.n_edges == self._n_edges else self._wrong
         weights = dict.fromkeys(graph.edge_ids[graph.is_loop].tolist(), 1.0) if self._weighs else {}
         return Solution(poses, SolveReport("judge", SolveStatus.CONVERGED, "judged", 1, 2.0, 1.0, 0.0, weights=weights))
+
+    update = finish = solve
 
 
 @pytest.mark.parametrize("weighs", [True, False])

@@ -4,18 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from graphs_for_tests import graph_of, laps
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridmap import backends
 from hybridmap.backends.base import SolveStatus
+from hybridmap.backends.gtsam.incremental import Smoother
 from hybridmap.backends.objective import chi2
 from hybridmap.config.backends import BackendsConfig, Isam2Config
 from hybridmap.errors import BackendError, GraphError
 from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import difference, prefix
+from tests.backends.graphs_for_tests import graph_of, laps
 
 FOLLOWERS = ["gtsam-lm", "gtsam-cauchy", "gtsam-gnc", "gtsam-isam2", "relaxation-ratslam", "odometry"]
 
@@ -82,8 +83,6 @@ def test_isam2_recovers_from_an_exception_inside_the_solver(monkeypatch):
 
     def fail(*_):
         raise RuntimeError("Indeterminate linear system\nmore words")
-
-    from hybridmap.backends.gtsam.incremental import Smoother
 
     with monkeypatch.context() as broken:
         broken.setattr(Smoother, "follow", fail)

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from graphs_for_tests import laps
 
 from hybridmap import backends
 from hybridmap.backends import GraphSession
 from hybridmap.errors import BackendError, GraphError
 from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind
+from tests.backends.graphs_for_tests import laps
 
 
 def fill(session, graph):

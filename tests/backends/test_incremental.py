@@ -1,10 +1,10 @@
 """ISAM2: what it may put off, what it reads, and that edges which were false leave nothing behind."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from graphs_for_tests import laps
 
 from hybridmap import backends
 from hybridmap.backends.gtsam import incremental
@@ -16,6 +16,7 @@ from hybridmap.geometry import between, log
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import prefix
 from hybridmap.study.false_loops import inject
+from tests.backends.graphs_for_tests import laps
 
 
 def modest(seed, nodes=90):
@@ -76,7 +77,7 @@ def test_poses_read_piece_by_piece_are_the_estimate_of_gtsam():
     parts.append(graph.with_edges(graph.edge_ids != 70))
     for part in parts:
         following.follow(part, graph.initial, following.lacks(part))
-        theirs = poses_of(following._isam.calculateEstimate())
+        theirs = poses_of(following.isam.calculateEstimate())
         assert np.abs(log(between(theirs, following.poses()))).max() < 1e-9
 
 
@@ -118,17 +119,18 @@ def test_a_failure_that_stays_leaves_the_state_before_it_bit_for_bit(monkeypatch
     backend = backends.create("gtsam-isam2")
     part = prefix(graph, 40)
     kept = grown(backend, part)[-1]
-    far = {"deltas": [[0.3, 0.2, 0.1]], "information": graph.information[:1], "kinds": [np.int8(2)], "edge_ids": [999]}
-    far |= {"sources": [39], "targets": [5]}
-    with_loop = replace(part, **{name: np.concatenate([getattr(part, name), rows]) for name, rows in far.items()})
-    update = Smoother._update
+    far: dict[str, Any] = {"sources": [39], "targets": [5], "deltas": [[0.3, 0.2, 0.1]], "edge_ids": [999]}
+    far |= {"information": graph.information[:1], "kinds": [np.int8(2)]}
+    longer: dict[str, Any] = {name: np.concatenate([getattr(part, name), rows]) for name, rows in far.items()}
+    with_loop = replace(part, **longer)
+    follow = Smoother.follow
 
     def fails(self, *given):
-        update(self, *given)
+        follow(self, *given)
         raise RuntimeError("Indeterminate linear system")
 
     with monkeypatch.context() as broken:
-        broken.setattr(Smoother, "_update", fails)
+        broken.setattr(Smoother, "follow", fails)
         for attempt in (backend.update, backend.finish):
             with pytest.raises(BackendError, match="gave up: Indeterminate"):
                 attempt(with_loop)

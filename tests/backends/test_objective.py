@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from graphs_for_tests import laps
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridmap.backends.gtsam.factors import NoiseModels, factors, values
 from hybridmap.backends.objective import chi2, residuals, squared_norms
 from hybridmap.geometry import between, compose, exp, inverse, log
+from tests.backends.graphs_for_tests import laps
 
 
 @given(st.floats(-50, 50), st.floats(-50, 50), st.floats(-3, 3), st.integers(0, 1000))

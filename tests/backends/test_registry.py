@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from graphs_for_tests import laps
 
 from hybridmap import backends
 from hybridmap.backends.comparison import compare
@@ -12,6 +11,7 @@ from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.mapper import Mapper
 from hybridmap.metrics import StageClock
+from tests.backends.graphs_for_tests import laps
 
 
 class Still:

@@ -5,7 +5,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from graphs_for_tests import laps
 
 from hybridmap import backends
 from hybridmap.backends.gtsam import gnc
@@ -16,6 +15,7 @@ from hybridmap.errors import GraphError
 from hybridmap.geometry import align, transform_points
 from hybridmap.graph.io import read_graph
 from hybridmap.study.false_loops import inject
+from tests.backends.graphs_for_tests import laps
 
 
 def ate(poses, reference):

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from hybridmap.geometry import between
-from hybridmap.streams.base import Observation, Rig, SelfMotion
+from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import Camera, RgbdFrame
 from hybridmap.study.disturb import TABLE, by_chance, disturbed
 
 RIG = Rig(camera=Camera(32, 24, 30.0, 30.0, 15.5, 11.5, np.eye(4)))
 SCANS = 12
-STRENGTHS = {
+STRENGTHS: dict[str, float | tuple[float, ...]] = {
     "scan_range_m": 4.0,
     "depth_range_m": 3.0,
     "views_late_s": 0.15,
@@ -26,7 +26,7 @@ STRENGTHS = {
 def drive():
     """2.4 s at 10 Hz on a circle, a scan and a frame every second odometry message, at its stamp."""
     rng = np.random.default_rng(0)
-    samples = []
+    samples: list[Sample] = []
     for k in range(2 * SCANS):
         stamp_ns = 1_000_000_000 + 100_000_000 * k
         samples.append(SelfMotion(stamp_ns, np.array([np.sin(0.2 * k), 1.0 - np.cos(0.2 * k), 0.2 * k])))

@@ -19,6 +19,7 @@ from hybridmap.study.grid import lay_out
 from hybridmap.study.model import StudyConfig
 from hybridmap.study.pools import ThisProcess
 from hybridmap.study.study import run_study
+from tests.narrowing import known
 
 LASER = {"simulation.sensors": "laser", "simulation.world": "lab", "nodes.distance_m": 0.25, "backends.names": ["gtsam-gnc"]}
 SECONDS = 12.0
@@ -39,8 +40,9 @@ def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recording")
     stream = open_stream("lab", Config.load("laser", LASER), end_s=SECONDS)
     write_rosbag2(stream, folder / "drive.mcap")
-    stamps = stream.groundtruth.stamps_ns[[0, 100, 200, 300]]
-    poses = stream.groundtruth.at(stamps)
+    truth = known(stream.groundtruth)
+    stamps = truth.stamps_ns[[0, 100, 200, 300]]
+    poses = truth.at(stamps)
     rows = [(stamps[i] / 1e9, stamps[j] / 1e9, *between(poses[i], poses[j])) for i, j in ((0, 1), (1, 2), (0, 3))]
     (folder / "relations.txt").write_text("\n".join(" ".join(f"{value:.9f}" for value in row) for row in rows))
     return folder

@@ -1,6 +1,7 @@
 """Pools: every task once, mistakes told, workers that die replaced."""
 
 import os
+from collections.abc import Generator
 
 import pytest
 
@@ -47,6 +48,7 @@ def test_workers_end_when_nobody_listens_any_more():
     next(running)
     pids = pool.pids
     assert len(pids) == 2
+    assert isinstance(running, Generator)
     running.close()
     for pid in pids:
         with pytest.raises(ProcessLookupError):

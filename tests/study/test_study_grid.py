@@ -1,6 +1,7 @@
 """The grid: which cells there are, and what their keys depend on."""
 
 from dataclasses import replace
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hybridmap.study.false_loops import inject
 from hybridmap.study.grid import lay_out
 from hybridmap.study.model import SyntheticConfig
 from hybridmap.study.sources import laps
+from tests.narrowing import known
 from tests.study.studies import small
 
 
@@ -21,7 +23,7 @@ def keys(**changes):
 
 @pytest.fixture
 def graph_file(tmp_path):
-    graph = laps(SyntheticConfig(nodes=30, per_lap=12), np.random.default_rng(1)).graph
+    graph = known(laps(SyntheticConfig(nodes=30, per_lap=12), np.random.default_rng(1)).graph)
     write_g2o(tmp_path / "graph.g2o", graph, graph.initial)
     return tmp_path / "graph.g2o"
 
@@ -50,7 +52,7 @@ def test_names_are_no_part_of_a_key_and_everything_else_is():
     base = keys()
     assert keys() == base
     assert keys(name="other", description="words", sources=[{"name": "x", "synthetic": {"nodes": 40, "per_lap": 16}}]) == base
-    changed = [
+    changed: list[dict[str, object]] = [
         {"sources": [{"synthetic": {"nodes": 41, "per_lap": 16}}]},
         {"sources": [{"synthetic": {"nodes": 40, "per_lap": 16}, "first_nodes": 39}]},
         {"seeds": [4, 6]},
@@ -79,10 +81,10 @@ def test_the_digest_of_the_code_sees_a_changed_solver(monkeypatch, tmp_path):
     for name in ("backends/gtsam/gnc.py", "cli/app.py", "vision/look.py"):
         (package / name).parent.mkdir(parents=True)
         (package / name).write_text("1\n")
-    monkeypatch.setattr(provenance.resources, "files", lambda _: package)
+    monkeypatch.setattr(resources, "files", lambda _: package)
 
     def digests():
-        return provenance._digest_of(solving_only=True), provenance._digest_of(solving_only=False)
+        return provenance.digest_of_code(solving_only=True), provenance.digest_of_code(solving_only=False)
 
     solving, mapping = digests()
     (package / "cli" / "app.py").write_text("2\n")
@@ -124,7 +126,7 @@ def test_a_damaged_graph_ends_it_before_anything_is_done(tmp_path):
 
 
 def test_no_true_loop_is_taken_for_a_false_one():
-    graph = laps(SyntheticConfig(nodes=30, per_lap=12), np.random.default_rng(1)).graph
+    graph = known(laps(SyntheticConfig(nodes=30, per_lap=12), np.random.default_rng(1)).graph)
     more = inject(graph, 0.3, "random", np.random.default_rng(0))
     assert np.array_equal(more.edge_ids[: graph.n_edges], graph.edge_ids)
     assert replace(more, initial=graph.initial).n_edges > graph.n_edges

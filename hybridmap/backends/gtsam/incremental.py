@@ -175,7 +175,11 @@ def _closing_nodes(graph: PoseGraph) -> list[int]:
 
 
 class Smoother:
-    """An ISAM2 that follows a graph. What raises may leave it half changed: throw it away then."""
+    """An ISAM2 that follows a graph. What raises may leave it half changed: throw it away then.
+
+    Attributes:
+        isam: the one of GTSAM.
+    """
 
     def __init__(self, models: NoiseModels, *, orthogonal: bool) -> None:
         """An empty one.
@@ -192,7 +196,7 @@ class Smoother:
         params.relinearizeSkip = 1
         params.setFactorization("QR" if orthogonal else "CHOLESKY")
         params.enablePartialRelinearizationCheck = True
-        self._isam = gtsam.ISAM2(params)
+        self.isam = gtsam.ISAM2(params)
         self._models = models
         self._slots: dict[int, int] = {}
         self._point: Array = np.zeros((0, 3))
@@ -235,7 +239,7 @@ class Smoother:
 
     def poses(self) -> Array:
         """Current estimate (N, 3)."""
-        point, n = self._isam.getLinearizationPoint(), len(self._point)
+        point, n = self.isam.getLinearizationPoint(), len(self._point)
         if _MANY * len(self._marked) > n:
             self._point = poses_of(point)
         else:
@@ -243,11 +247,11 @@ class Smoother:
                 pose = point.atPose2(key)
                 self._point[key] = pose.x(), pose.y(), pose.theta()
         self._marked = set()
-        return compose(self._point, exp(self._isam.getDelta().vector(range(n)).reshape(-1, 3)))
+        return compose(self._point, exp(self.isam.getDelta().vector(range(n)).reshape(-1, 3)))
 
     def _update(self, *given: Any) -> Any:
         """One update; the nodes that it may have linearised anew are marked."""
-        result = self._isam.update(*given)
+        result = self.isam.update(*given)
         self._marked.update(result.getMarkedKeys())
         return result
 
