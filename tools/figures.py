@@ -11,7 +11,7 @@ from pathlib import Path
 from hybridmap.report import style
 from hybridmap.report.outline import outlines, raster
 from hybridmap.report.session_figures import draw_errors, draw_trajectories
-from hybridmap.report.session_view import load_scene
+from hybridmap.report.session_scene import load_scene
 from hybridmap.store import MapStore, SessionFolder
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -19,7 +19,7 @@ _DEAD_BAND_M = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Pairs:
+class PosePairs:
     """Poses of an estimate and of the reference at the same stamps.
 
     Attributes:
@@ -50,7 +50,7 @@ def known_at(trajectory: Trajectory, stamps_ns: NDArray[np.int64], max_gap_s: fl
     return np.asarray(exact | (inside & (after - before <= max_gap_s * NS_PER_S)))
 
 
-def associate(estimate: Trajectory, reference: Trajectory, max_gap_s: float = MAX_GAP_S) -> Pairs:
+def associate(estimate: Trajectory, reference: Trajectory, max_gap_s: float = MAX_GAP_S) -> PosePairs:
     """Interpolate the reference at the stamps of the estimate.
 
     Raises:
@@ -63,7 +63,7 @@ def associate(estimate: Trajectory, reference: Trajectory, max_gap_s: float = MA
             f"common, expected at least 3; are they of the same recording and on the same clock?"
         )
     stamps = estimate.stamps_ns[known]
-    return Pairs(stamps, estimate.poses[known], reference.at(stamps), len(estimate))
+    return PosePairs(stamps, estimate.poses[known], reference.at(stamps), len(estimate))
 
 
 def travel(poses: Array) -> Array:

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.evaluate.association import MAX_GAP_S, Pairs, associate, travel
+from hybridmap.evaluate.association import MAX_GAP_S, PosePairs, associate, travel
 from hybridmap.geometry import Array, align, between, compose
 from hybridmap.trajectory import NS_PER_S, Trajectory
 
@@ -65,7 +65,7 @@ def absolute_error(estimate: Trajectory, reference: Trajectory, max_gap_s: float
     return absolute_error_of(associate(estimate, reference, max_gap_s))
 
 
-def absolute_error_of(pairs: Pairs) -> AbsoluteError:
+def absolute_error_of(pairs: PosePairs) -> AbsoluteError:
     """ATE of associated poses."""
     pose = align(pairs.reference, pairs.estimate)
     offset = compose(pose, pairs.estimate)[:, :2] - pairs.reference[:, :2]
@@ -92,7 +92,7 @@ def relative_error(
     return relative_error_of(associate(estimate, reference, max_gap_s), delta, unit)
 
 
-def relative_error_of(pairs: Pairs, delta: float, unit: Literal["m", "s"]) -> RelativeError:
+def relative_error_of(pairs: PosePairs, delta: float, unit: Literal["m", "s"]) -> RelativeError:
     """RPE of associated poses."""
     along = travel(pairs.reference) if unit == "m" else (pairs.stamps_ns - pairs.stamps_ns[0]) / NS_PER_S
     first, last = _pieces(along, delta)
@@ -108,7 +108,7 @@ def relative_error_of(pairs: Pairs, delta: float, unit: Literal["m", "s"]) -> Re
     )
 
 
-def drift_percent(pairs: Pairs) -> float:
+def drift_percent(pairs: PosePairs) -> float:
     """Mean translational error in % of travel over pieces of 5, 10, 20, ... 160 m (the whole way where that is shorter).
 
     Returns:
@@ -126,7 +126,7 @@ def drift_percent(pairs: Pairs) -> float:
     return 100.0 * float(np.concatenate(shares).mean())
 
 
-def motion_errors(pairs: Pairs, first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[Array, Array]:
+def motion_errors(pairs: PosePairs, first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[Array, Array]:
     """Translation (m) and rotation (deg) between the estimate's and the reference's motion from `first` to `last`."""
     moved = between(pairs.estimate[first], pairs.estimate[last])
     truly = between(pairs.reference[first], pairs.reference[last])

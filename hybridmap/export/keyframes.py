@@ -38,7 +38,7 @@ _MERGE_EVERY = 50
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class OccupancyGrid:
     """An occupancy grid.
 
     Attributes:
@@ -93,7 +93,7 @@ def write_grid(view: SessionView, path: Path) -> list[Metric]:
     ]
 
 
-def build_grid(view: SessionView) -> Grid:
+def build_grid(view: SessionView) -> OccupancyGrid:
     """Ray-cast every keyframe into log-odds.
 
     Raises:
@@ -111,7 +111,7 @@ def build_grid(view: SessionView) -> Grid:
     log_odds = np.zeros((int(size[1]), int(size[0])), np.float32)
     for fan in fans:
         _cast(log_odds, fan, low, resolution)
-    return Grid(log_odds, low * resolution, resolution)
+    return OccupancyGrid(log_odds, low * resolution, resolution)
 
 
 def _cast(log_odds: NDArray[np.float32], fan: _Fan, low: NDArray[np.int64], resolution: float) -> None:

@@ -14,7 +14,7 @@ from hybridmap.geometry import Array, between, transform_points
 from hybridmap.graph.edges import Edge, Status
 from hybridmap.report import style
 from hybridmap.report.session_figures import loops_by_fate
-from hybridmap.report.session_view import Scene
+from hybridmap.report.session_scene import SessionScene
 from hybridmap.store import MapStore
 from hybridmap.trajectory import NS_PER_S
 
@@ -53,7 +53,7 @@ class Example:
     profiles: str | None
 
 
-def examples(scene: Scene, store: MapStore, points_of: Mapping[int, Array]) -> list[Example]:
+def examples(scene: SessionScene, store: MapStore, points_of: Mapping[int, Array]) -> list[Example]:
     """Some accepted closures, spread over the drive, and the refused one that would have bent the map most.
 
     Args:
@@ -75,7 +75,7 @@ def spread(edges: Sequence[Edge], count: int) -> list[Edge]:
     return [edges[(2 * k + 1) * len(edges) // (2 * count)] for k in range(count)]
 
 
-def _telling(scene: Scene, edges: Sequence[Edge], least: int) -> list[Edge]:
+def _telling(scene: SessionScene, edges: Sequence[Edge], least: int) -> list[Edge]:
     """Edges by newer node; where there are enough, only those that were measured, lie far apart in time, look the same way."""
     stamps_s = np.array([node.stamp_ns for node in scene.experiences.nodes]) / NS_PER_S
     tests = (
@@ -90,7 +90,7 @@ def _telling(scene: Scene, edges: Sequence[Edge], least: int) -> list[Edge]:
     return kept
 
 
-def _contradiction_m(scene: Scene, edge: Edge) -> float:
+def _contradiction_m(scene: SessionScene, edge: Edge) -> float:
     """How far the measured pose is from where the final map has the node, m; less than nothing where none was measured."""
     if edge.relative is None:
         return -1.0
@@ -98,7 +98,7 @@ def _contradiction_m(scene: Scene, edge: Edge) -> float:
     return float(np.hypot(off[0], off[1]))
 
 
-def _example(scene: Scene, store: MapStore, edge: Edge, points_of: Mapping[int, Array]) -> Example:
+def _example(scene: SessionScene, store: MapStore, edge: Edge, points_of: Mapping[int, Array]) -> Example:
     accepted = edge.status is Status.ACCEPTED
     both = f"node {edge.source} and node {edge.target}"
     frames = store.keyframe(edge.source), store.keyframe(edge.target)
@@ -115,7 +115,7 @@ def _example(scene: Scene, store: MapStore, edge: Edge, points_of: Mapping[int, 
     )
 
 
-def _facts(scene: Scene, edge: Edge) -> tuple[tuple[str, str], ...]:
+def _facts(scene: SessionScene, edge: Edge) -> tuple[tuple[str, str], ...]:
     nodes = scene.experiences.nodes
     apart_s = abs(nodes[edge.source].stamp_ns - nodes[edge.target].stamp_ns) / NS_PER_S
     rows = [("time apart", f"{apart_s:.1f} s")]
@@ -134,7 +134,7 @@ def _facts(scene: Scene, edge: Edge) -> tuple[tuple[str, str], ...]:
     return (*rows, *in_words(edge))
 
 
-def _seen_around(scene: Scene, node: int, points_of: Mapping[int, Array]) -> Array:
+def _seen_around(scene: SessionScene, node: int, points_of: Mapping[int, Array]) -> Array:
     """What a node and its neighbours along the drive saw, (M, 2) in the frame of the node, m."""
     nodes = range(max(0, node - _NEIGHBOURS), min(len(scene.nodes), node + _NEIGHBOURS + 1))
     delta = between(scene.nodes[node], scene.nodes)
@@ -143,7 +143,7 @@ def _seen_around(scene: Scene, node: int, points_of: Mapping[int, Array]) -> Arr
     return points[:: max(1, len(points) // _MAX_POINTS)]
 
 
-def _overlay(scene: Scene, edge: Edge, points_of: Mapping[int, Array]) -> str | None:
+def _overlay(scene: SessionScene, edge: Edge, points_of: Mapping[int, Array]) -> str | None:
     new, old = (_seen_around(scene, node, points_of) for node in (edge.source, edge.target))
     if not len(new) or not len(old):
         return None

@@ -15,7 +15,7 @@ _FIRST = ("ate", "relation")
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class TableRow:
     """One line: a measure, its unit and meaning, and a cell for each column (empty where there is no figure)."""
 
     measure: str
@@ -24,7 +24,7 @@ class Row:
     cells: tuple[str, ...]
 
 
-def by_backend(metrics: Sequence[Metric], backends: Sequence[str]) -> list[Row]:
+def by_backend(metrics: Sequence[Metric], backends: Sequence[str]) -> list[TableRow]:
     """A row a measure that at least one of the back-ends has, a cell a back-end.
 
     Errors come first, the rest as it came; the words are those of the last back-end that has the measure.
@@ -38,14 +38,14 @@ def by_backend(metrics: Sequence[Metric], backends: Sequence[str]) -> list[Row]:
     for measure, found in sorted(measures.items(), key=lambda item: not item[0].startswith(_FIRST)):
         last = next(found[name] for name in reversed(backends) if name in found)
         cells = tuple(shown(found[name]) if name in found else "" for name in backends)
-        rows.append(Row(measure, unit(last), last.description, cells))
+        rows.append(TableRow(measure, unit(last), last.description, cells))
     return rows
 
 
-def of_session(metrics: Sequence[Metric], backends: Sequence[str]) -> list[Row]:
+def of_session(metrics: Sequence[Metric], backends: Sequence[str]) -> list[TableRow]:
     """A row for each figure that belongs to no back-end."""
     return [
-        Row(metric.name, unit(metric), metric.description, (shown(metric),))
+        TableRow(metric.name, unit(metric), metric.description, (shown(metric),))
         for metric in metrics
         if metric.name.partition("/")[2] not in backends
     ]

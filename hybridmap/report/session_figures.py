@@ -15,7 +15,7 @@ from hybridmap.graph.gaps import Carry, carries, parted, pieces
 from hybridmap.metrics import ONLINE
 from hybridmap.report import style
 from hybridmap.report.outline import Raster, raster
-from hybridmap.report.session_view import Correction, Scene
+from hybridmap.report.session_scene import Correction, SessionScene
 from hybridmap.trajectory import NS_PER_S, Trajectory
 
 _PALE, _GREY = "#efbd97", "#9a9a9a"
@@ -23,7 +23,7 @@ _LEGEND_PT = 1.8
 _MANY = 200
 
 
-def trajectories_figure(scene: Scene, building: Raster | None) -> str:
+def trajectories_figure(scene: SessionScene, building: Raster | None) -> str:
     """Every back-end's trajectory over the truth and over what the primary back-end's map shows; a `data:` URI."""
     shown = [scene.estimates[name].poses for name in scene.backends if name in scene.estimates]
     shown += [scene.truth.poses] if scene.truth is not None else []
@@ -33,7 +33,7 @@ def trajectories_figure(scene: Scene, building: Raster | None) -> str:
         return style.svg_uri(picture)
 
 
-def draw_trajectories(axes: Any, scene: Scene, building: Raster | None) -> None:
+def draw_trajectories(axes: Any, scene: SessionScene, building: Raster | None) -> None:
     """Draw every back-end's trajectory over the truth and the building."""
     style.draw_building(axes, building)
     if scene.truth is not None:
@@ -48,13 +48,13 @@ def draw_trajectories(axes: Any, scene: Scene, building: Raster | None) -> None:
     style.metric_axes(axes)
 
 
-def _draw_ways(axes: Any, trajectory: Trajectory, scene: Scene, *, label: str, **looks: Any) -> None:
+def _draw_ways(axes: Any, trajectory: Trajectory, scene: SessionScene, *, label: str, **looks: Any) -> None:
     """What was driven of a trajectory: no line leads through the air."""
     for i, piece in enumerate(pieces(trajectory, scene.experiences)):
         axes.plot(*style.thinned(piece.poses)[:, :2].T, label="" if i else label, **looks)
 
 
-def graph_figure(scene: Scene, building: Raster | None) -> str:
+def graph_figure(scene: SessionScene, building: Raster | None) -> str:
     """Nodes at the primary back-end's poses, chain, carries, and loops by their fate; a `data:` URI."""
     with style.figure(*_size(scene.nodes[:, :2], building)) as picture:
         axes = picture.add_subplot()
@@ -98,7 +98,7 @@ def _draw_legend(picture: Any) -> None:
         line.set_linewidth(max(line.get_linewidth(), _LEGEND_PT))
 
 
-def chain_and_carries(scene: Scene) -> tuple[list[Edge], list[Edge]]:
+def chain_and_carries(scene: SessionScene) -> tuple[list[Edge], list[Edge]]:
     """The accepted edges that no loops are: those of ways driven, and those that stand for a way through the air."""
     aloft = {(carry.before, carry.after) for carry in carries(scene.experiences)}
     motion = [e for e in scene.experiences.edges if e.kind is not EdgeKind.LOOP and e.status is Status.ACCEPTED]
@@ -106,7 +106,7 @@ def chain_and_carries(scene: Scene) -> tuple[list[Edge], list[Edge]]:
     return chain, [edge for edge in motion if (edge.source, edge.target) in aloft]
 
 
-def loops_by_fate(scene: Scene) -> dict[str, list[Edge]]:
+def loops_by_fate(scene: SessionScene) -> dict[str, list[Edge]]:
     """Every loop that was considered, by what became of it, in the order of the legend."""
     report = scene.reports.get(scene.primary)
     unweighted = set(report.rejected_edge_ids) if report is not None else set()
@@ -122,7 +122,7 @@ def loops_by_fate(scene: Scene) -> dict[str, list[Edge]]:
     return found
 
 
-def _draw_edges(axes: Any, scene: Scene, edges: list[Edge], **looks: Any) -> None:
+def _draw_edges(axes: Any, scene: SessionScene, edges: list[Edge], **looks: Any) -> None:
     from matplotlib.collections import LineCollection
 
     if not edges:
@@ -158,7 +158,7 @@ class ErrorSeries:
     heading_deg: Array
 
 
-def error_series(scene: Scene) -> dict[str, ErrorSeries]:
+def error_series(scene: SessionScene) -> dict[str, ErrorSeries]:
     """Name -> error: of every back-end's final trajectory and of the primary's online one, against the truth.
 
     Without a truth: of odometry and of what each back-end believed at the time, against the primary's final trajectory.
@@ -180,7 +180,7 @@ def error_series(scene: Scene) -> dict[str, ErrorSeries]:
     }
 
 
-def error_figure(scene: Scene) -> str | None:
+def error_figure(scene: SessionScene) -> str | None:
     """Position and heading error over time, with a mark at every accepted loop; a `data:` URI, None without anything."""
     series = error_series(scene)
     if not series:
@@ -195,7 +195,7 @@ def error_figure(scene: Scene) -> str | None:
         return style.svg_uri(picture)
 
 
-def draw_errors(axes: Any, scene: Scene, *, heading: bool) -> None:
+def draw_errors(axes: Any, scene: SessionScene, *, heading: bool) -> None:
     """Draw the position error, m, or the heading error, deg, of every back-end over time."""
     styles = style.line_styles(scene.backends)
     for name, errors in error_series(scene).items():
@@ -250,7 +250,7 @@ def with_gaps(errors: ErrorSeries, gaps_s: Array) -> ErrorSeries:
     return ErrorSeries(np.insert(errors.time_s, at, gaps_s), position, heading)
 
 
-def _mark_loops(scene: Scene, axes: Any) -> None:
+def _mark_loops(scene: SessionScene, axes: Any) -> None:
     nodes = scene.experiences.nodes
     start_ns = scene.estimates[ODOMETRY].stamps_ns[0]
     loops = (e for e in scene.experiences.edges if e.kind is EdgeKind.LOOP and e.status is Status.ACCEPTED)

@@ -16,7 +16,7 @@ from hybridmap.report.loop_examples import examples
 from hybridmap.report.outline import outlines, raster
 from hybridmap.report.page_tables import rendered
 from hybridmap.report.session_figures import correction_figure, error_figure, graph_figure, trajectories_figure
-from hybridmap.report.session_view import Scene, load_scene
+from hybridmap.report.session_scene import SessionScene, load_scene
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.trajectory import NS_PER_S
 
@@ -47,7 +47,7 @@ def write_report(folder: SessionFolder) -> Path:
     return folder.report
 
 
-def _content(scene: Scene, store: MapStore) -> dict[str, Any]:
+def _content(scene: SessionScene, store: MapStore) -> dict[str, Any]:
     points_of = outlines(store, len(scene.nodes))
     building = raster(points_of, scene.nodes)
     correction = scene.correction
@@ -76,7 +76,7 @@ def _content(scene: Scene, store: MapStore) -> dict[str, Any]:
     }
 
 
-def tiles(scene: Scene) -> list[Tile]:
+def tiles(scene: SessionScene) -> list[Tile]:
     """What one wants to know first: how good, how far, how many loops, how costly."""
     named = {metric.name: metric for metric in scene.metrics}
     wanted = [
@@ -104,7 +104,7 @@ def _tile(metric: Metric, label: str) -> Tile:
     return Tile(tables.number(metric.value), tables.unit(metric), label)
 
 
-def _remarks(scene: Scene) -> list[str]:
+def _remarks(scene: SessionScene) -> list[str]:
     """What went wrong or was left out on the way."""
     failed = [f"{name} failed: {why}" for name, why in dict(scene.head.get("failed_backends", {})).items()]
     return failed + [str(remark) for remark in scene.head.get("remarks", [])]

@@ -6,7 +6,7 @@ import numpy as np
 
 from hybridmap.simulation import paints, pictures
 from hybridmap.simulation.paints import Color
-from hybridmap.simulation.surfaces import Surface, box, panel
+from hybridmap.simulation.surfaces import Facet, box, panel
 
 Spot = tuple[float, float]
 
@@ -18,7 +18,7 @@ def _beside(at: Spot, yaw_deg: float, forward_m: float, left_m: float) -> Spot:
 
 def table(
     at: Spot, yaw_deg: float, size: tuple[float, float], height_m: float = 0.74, color: Color = (168, 126, 84)
-) -> list[Surface]:
+) -> list[Facet]:
     """A table of `size` (depth, width) on four legs."""
     out = box(at, (*size, 0.04), paints.wood(color), bottom_m=height_m - 0.04, yaw_deg=yaw_deg)
     leg = paints.metal((88, 90, 96))
@@ -28,7 +28,7 @@ def table(
     return out
 
 
-def desk(at: Spot, yaw_deg: float, width_m: float = 1.4) -> list[Surface]:
+def desk(at: Spot, yaw_deg: float, width_m: float = 1.4) -> list[Facet]:
     """A desk with drawers, a screen towards `yaw_deg` and papers."""
     out = table(at, yaw_deg, (0.7, width_m))
     drawers = {"front": paints.metal((128, 132, 140), drawers=3)}
@@ -51,7 +51,7 @@ def desk(at: Spot, yaw_deg: float, width_m: float = 1.4) -> list[Surface]:
     return out
 
 
-def chair(at: Spot, yaw_deg: float, color: Color = (52, 74, 116)) -> list[Surface]:
+def chair(at: Spot, yaw_deg: float, color: Color = (52, 74, 116)) -> list[Facet]:
     """A chair looking towards `yaw_deg`."""
     cloth = paints.fabric(color)
     out = box(at, (0.44, 0.44, 0.07), cloth, bottom_m=0.43, yaw_deg=yaw_deg)
@@ -63,7 +63,7 @@ def chair(at: Spot, yaw_deg: float, color: Color = (52, 74, 116)) -> list[Surfac
     return out
 
 
-def book_case(at: Spot, yaw_deg: float, width_m: float = 1.0, height_m: float = 2.0, depth_m: float = 0.3) -> list[Surface]:
+def book_case(at: Spot, yaw_deg: float, width_m: float = 1.0, height_m: float = 2.0, depth_m: float = 0.3) -> list[Facet]:
     """A filled book case facing `yaw_deg`."""
     front = {"front": pictures.books(max(2, round(height_m / 0.38)))}
     return box(at, (depth_m, width_m, height_m), paints.wood((128, 94, 64)), yaw_deg=yaw_deg, faces=front, px_per_m=160)
@@ -71,19 +71,19 @@ def book_case(at: Spot, yaw_deg: float, width_m: float = 1.0, height_m: float = 
 
 def cabinet(
     at: Spot, yaw_deg: float, width_m: float = 0.5, height_m: float = 1.3, color: Color = (150, 154, 158)
-) -> list[Surface]:
+) -> list[Facet]:
     """A filing cabinet facing `yaw_deg`, with something on top."""
     front = {"front": paints.metal(color, drawers=4)}
     out = box(at, (0.45, width_m, height_m), paints.metal(color), yaw_deg=yaw_deg, faces=front, px_per_m=140)
     return out + crate(at, yaw_deg + 12, (0.3, 0.32, 0.24), bottom_m=height_m)
 
 
-def crate(at: Spot, yaw_deg: float, size: tuple[float, float, float] = (0.4, 0.5, 0.4), bottom_m: float = 0.0) -> list[Surface]:
+def crate(at: Spot, yaw_deg: float, size: tuple[float, float, float] = (0.4, 0.5, 0.4), bottom_m: float = 0.0) -> list[Facet]:
     """A cardboard box."""
     return box(at, size, pictures.parcel(), yaw_deg=yaw_deg, bottom_m=bottom_m, px_per_m=170)
 
 
-def plant(at: Spot, height_m: float = 1.3) -> list[Surface]:
+def plant(at: Spot, height_m: float = 1.3) -> list[Facet]:
     """A pot plant."""
     out = box(at, (0.34, 0.34, 0.36), paints.fabric((168, 96, 66)), yaw_deg=20)
     crown, middle = height_m - 0.42, 0.42
@@ -91,7 +91,7 @@ def plant(at: Spot, height_m: float = 1.3) -> list[Surface]:
     return out + box(at, (0.34, 0.34, crown * 0.4), pictures.leaves(), bottom_m=middle + 0.6 * crown, yaw_deg=70, px_per_m=140)
 
 
-def sofa(at: Spot, yaw_deg: float, width_m: float = 1.8, color: Color = (146, 62, 52)) -> list[Surface]:
+def sofa(at: Spot, yaw_deg: float, width_m: float = 1.8, color: Color = (146, 62, 52)) -> list[Facet]:
     """A sofa facing `yaw_deg`."""
     cloth = paints.fabric(color)
     out = box(at, (0.8, width_m, 0.42), cloth, yaw_deg=yaw_deg)
@@ -103,6 +103,6 @@ def sofa(at: Spot, yaw_deg: float, width_m: float = 1.8, color: Color = (146, 62
     )
 
 
-def bin_(at: Spot, color: Color = (60, 110, 90)) -> list[Surface]:
+def bin_(at: Spot, color: Color = (60, 110, 90)) -> list[Facet]:
     """A waste bin."""
     return box(at, (0.3, 0.3, 0.5), paints.metal(color, drawers=1), yaw_deg=30)

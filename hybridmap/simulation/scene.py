@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hybridmap.geometry import Array
 from hybridmap.simulation.paints import Image
-from hybridmap.simulation.surfaces import Surface, World
+from hybridmap.simulation.surfaces import Facet, World
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +38,7 @@ class Hits:
 class Caster:
     """Casts rays at a list of surfaces, two triangles each."""
 
-    def __init__(self, surfaces: Sequence[Surface]) -> None:
+    def __init__(self, surfaces: Sequence[Facet]) -> None:
         corner = np.array([s.corner for s in surfaces])
         along, up = np.array([s.along for s in surfaces]), np.array([s.up for s in surfaces])
         vertices = np.stack([corner, corner + along, corner + along + up, corner + up], axis=1).reshape(-1, 3)
@@ -86,7 +86,7 @@ class Scene:
         self._world = world
 
     @cached_property
-    def atlas(self) -> Atlas:
+    def atlas(self) -> TextureAtlas:
         """Textures with the light on them; painted when a camera first looks."""
         surfaces = self._world.surfaces
         shadow_makers = Caster([s for s in surfaces if not s.decal])
@@ -105,7 +105,7 @@ class Scene:
         return self._caster.cast(np.concatenate([start, directions], axis=-1))
 
 
-def texture_size(surface: Surface) -> tuple[int, int]:
+def texture_size(surface: Facet) -> tuple[int, int]:
     """Height and width in texels."""
     height, width = (float(np.linalg.norm(edge)) * surface.px_per_m for edge in (surface.up, surface.along))
     return max(3, round(height)), max(3, round(width))
@@ -117,7 +117,7 @@ _SMALLEST_PX = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Atlas:
+class TextureAtlas:
     """Packed textures.
 
     Attributes:
@@ -163,7 +163,7 @@ class Atlas:
         return np.asarray(cv2.remap(self.image, u, v, cv2.INTER_LINEAR), dtype=np.float32)
 
 
-def build_atlas(textures: list[Image]) -> Atlas:
+def build_atlas(textures: list[Image]) -> TextureAtlas:
     """Pack textures (h, w, 3) uint8 and their halved copies."""
     pyramids = [_pyramid(texture) for texture in textures]
     stride = max(len(pyramid) for pyramid in pyramids)
@@ -183,7 +183,7 @@ def build_atlas(textures: list[Image]) -> Atlas:
     for row, image in rows:
         x, y = int(places[row, 0]), int(places[row, 1])
         packed[y : y + image.shape[0], x : x + image.shape[1]] = image
-    return Atlas(packed, np.array([len(pyramid) for pyramid in pyramids], dtype=np.int32), places)
+    return TextureAtlas(packed, np.array([len(pyramid) for pyramid in pyramids], dtype=np.int32), places)
 
 
 def _pyramid(texture: Image) -> list[Image]:
@@ -216,7 +216,7 @@ class LightMap:
         return np.asarray(np.clip(texture * smooth[..., None], 0, 255), dtype=np.uint8)
 
 
-def bake(surfaces: Sequence[Surface], caster: Caster) -> list[LightMap]:
+def bake(surfaces: Sequence[Facet], caster: Caster) -> list[LightMap]:
     """Light on every surface; those that glow are at full brightness. A world without lamps is lit evenly."""
     lamps = [s for s in surfaces if s.glow > 0.0]
     if not lamps:
@@ -234,17 +234,17 @@ def bake(surfaces: Sequence[Surface], caster: Caster) -> list[LightMap]:
     return maps
 
 
-def _normal(surface: Surface) -> Array:
+def _normal(surface: Facet) -> Array:
     normal = np.cross(surface.along, surface.up)
     return np.asarray(normal / np.linalg.norm(normal))
 
 
-def _grid_shape(surface: Surface) -> tuple[int, int]:
+def _grid_shape(surface: Facet) -> tuple[int, int]:
     rows, columns = (max(1, round(float(np.linalg.norm(edge)) / _CELL_M)) for edge in (surface.up, surface.along))
     return rows, columns
 
 
-def _grid_points(surface: Surface, shape: tuple[int, int]) -> Array:
+def _grid_points(surface: Facet, shape: tuple[int, int]) -> Array:
     rows = 1.0 - (np.arange(shape[0]) + 0.5) / shape[0]
     columns = (np.arange(shape[1]) + 0.5) / shape[1]
     grid = surface.corner + columns[None, :, None] * surface.along + rows[:, None, None] * surface.up
@@ -267,7 +267,7 @@ def _openness(points: Array, normals: Array, caster: Caster) -> Array:
     return np.asarray((0.15 + 0.85 * near).mean(axis=1), dtype=np.float64)
 
 
-def _lamp_light(points: Array, normals: Array, lamps: Sequence[Surface], caster: Caster) -> Array:
+def _lamp_light(points: Array, normals: Array, lamps: Sequence[Facet], caster: Caster) -> Array:
     """Light (N,) from the middle of each lamp within reach, unless something is between."""
     middles = np.array([lamp.corner + 0.5 * (lamp.along + lamp.up) + 0.05 * _normal(lamp) for lamp in lamps])
     facing = np.array([_normal(lamp) for lamp in lamps])

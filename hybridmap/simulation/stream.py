@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hybridmap.config.inputs import SimulationConfig
 from hybridmap.errors import ConfigError
 from hybridmap.geometry import Array
-from hybridmap.simulation.motion import Carry, DriveLimits, as_transmitted, carry, drive, wheel_odometry
+from hybridmap.simulation.motion import CarriedDrive, DriveLimits, as_transmitted, carry, drive, wheel_odometry
 from hybridmap.simulation.surfaces import World
 from hybridmap.simulation.worlds import build_world
 from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion, StreamReport
@@ -91,7 +91,7 @@ class SimulatedStream:
         return self._odometry
 
     @property
-    def carry(self) -> Carry | None:
+    def carry(self) -> CarriedDrive | None:
         """When the robot is carried, and how far; None where it never is."""
         return self._carry
 

@@ -19,7 +19,7 @@ DOOR_HEIGHT_M = 2.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Surface:
+class Facet:
     """A painted rectangle; it faces the side to which `along x up` points.
 
     Attributes:
@@ -55,7 +55,7 @@ class World:
     """
 
     name: str
-    surfaces: tuple[Surface, ...]
+    surfaces: tuple[Facet, ...]
     legs: tuple[Array, ...]
     texture_seed: int = 1
 
@@ -73,7 +73,7 @@ def box(
     yaw_deg: float = 0.0,
     faces: Mapping[str, Paint] | None = None,
     px_per_m: float = 100.0,
-) -> list[Surface]:
+) -> list[Facet]:
     """An upright box.
 
     Args:
@@ -100,7 +100,7 @@ def box(
     if bottom_m <= 0.0:
         del rectangles["bottom"]
     paints = faces or {}
-    return [Surface(*edges, paints.get(name, paint), px_per_m) for name, edges in rectangles.items()]
+    return [Facet(*edges, paints.get(name, paint), px_per_m) for name, edges in rectangles.items()]
 
 
 def panel(
@@ -113,7 +113,7 @@ def panel(
     stand_off_m: float = 0.012,
     glow: float = 0.0,
     in_depth: bool = True,
-) -> Surface:
+) -> Facet:
     """A thin upright rectangle, such as a poster, facing `yaw_deg`.
 
     Args:
@@ -129,17 +129,17 @@ def panel(
     yaw = np.deg2rad(yaw_deg)
     right = _direction(yaw + 0.5 * np.pi) * size[0]
     corner = np.asarray(middle, dtype=np.float64) + stand_off_m * _direction(yaw) - 0.5 * right
-    return Surface(corner, right, UP * size[1], paint, px_per_m, glow=glow, decal=True, in_depth=in_depth)
+    return Facet(corner, right, UP * size[1], paint, px_per_m, glow=glow, decal=True, in_depth=in_depth)
 
 
 def slab(
     low: Sequence[float], high: Sequence[float], height_m: float, paint: Paint, *, facing_up: bool, glow: float = 0.0
-) -> Surface:
+) -> Facet:
     """A horizontal rectangle: floor, ceiling or lamp."""
     corner = np.array([low[0], low[1], height_m])
     ex, ey = np.array([high[0] - low[0], 0.0, 0.0]), np.array([0.0, high[1] - low[1], 0.0])
     along, up = (ex, ey) if facing_up else (ey, ex)
-    return Surface(corner, along, up, paint, px_per_m=80.0, glow=glow, decal=glow > 0.0)
+    return Facet(corner, along, up, paint, px_per_m=80.0, glow=glow, decal=glow > 0.0)
 
 
 def partition(
@@ -150,7 +150,7 @@ def partition(
     openings: Sequence[tuple[float, float]] = (),
     height_m: float = 2.6,
     thickness_m: float = 0.12,
-) -> list[Surface]:
+) -> list[Facet]:
     """A straight wall with door openings; above an opening it goes on.
 
     Args:
@@ -166,7 +166,7 @@ def partition(
     direction = (last - first) / length
     yaw_deg = float(np.rad2deg(np.arctan2(direction[1], direction[0])))
     edges = [0.0, *[edge for opening in openings for edge in opening], length]
-    out: list[Surface] = []
+    out: list[Facet] = []
     for index, (a, b) in enumerate(pairwise(edges)):
         if b - a < 1e-6:
             continue

@@ -14,7 +14,7 @@ _MARGIN_M = 0.9
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class ExactDrive:
     """A drive.
 
     Attributes:
@@ -30,7 +30,7 @@ class Drive:
     hz: float
 
 
-def wander(rng: np.random.Generator, distance_m: float, hz: float) -> Drive:
+def wander(rng: np.random.Generator, distance_m: float, hz: float) -> ExactDrive:
     """Wander through a 10 x 3 m room at 0.3 to 1.1 m/s, turning away from its walls."""
     half = np.array(_ROOM_M) / 2 - _MARGIN_M
     dt = 1.0 / hz
@@ -52,14 +52,14 @@ def wander(rng: np.random.Generator, distance_m: float, hz: float) -> Drive:
     return _along(np.array(motions), hz)
 
 
-def corridor(rng: np.random.Generator, hz: float, length_m: float = 16.8) -> Drive:
+def corridor(rng: np.random.Generator, hz: float, length_m: float = 16.8) -> ExactDrive:
     """Drive down a corridor at 0.5 m/s, swaying a little."""
     steps = round(length_m / 0.5 * hz)
     sway = 0.05 * np.sin(np.arange(steps + 1) / hz * 2.0 * np.pi / 6.0 + rng.uniform(0.0, 2.0 * np.pi))
     return _along(np.stack([np.full(steps, 0.5 / hz), np.diff(sway)], axis=1), hz)
 
 
-def raster(side_m: float, pitch_m: float, angle_rad: float, *, upright: bool = False) -> Drive:
+def raster(side_m: float, pitch_m: float, angle_rad: float, *, upright: bool = False) -> ExactDrive:
     """Drive along the lines of a square arena around the origin, to and fro, one step a pixel.
 
     The first step leads to the corner. Pixel (i, j) of a map is at `pixel_order`; `upright` drives along y instead of x.
@@ -73,7 +73,7 @@ def raster(side_m: float, pitch_m: float, angle_rad: float, *, upright: bool = F
     ways = np.diff(path, axis=0)
     poses = np.column_stack([path, np.concatenate([[0.0], np.arctan2(ways[:, 1], ways[:, 0])])])
     deltas = geometry.between(poses[:-1], poses[1:])
-    return Drive(deltas, poses[1:], np.cumsum(np.linalg.norm(ways, axis=1)), 30.0)
+    return ExactDrive(deltas, poses[1:], np.cumsum(np.linalg.norm(ways, axis=1)), 30.0)
 
 
 def pixel_order(count: int, *, upright: bool = False) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
@@ -83,7 +83,7 @@ def pixel_order(count: int, *, upright: bool = False) -> np.ndarray[tuple[int, .
     return np.stack([lines, along] if upright else [along, lines], axis=1)
 
 
-def _along(motions: Array, hz: float) -> Drive:
+def _along(motions: Array, hz: float) -> ExactDrive:
     """The drive of steps (N, 2): distance and turn, by the mid-point heading."""
     distance, turn = motions.T
     yaw = np.cumsum(turn)
@@ -91,4 +91,4 @@ def _along(motions: Array, hz: float) -> Drive:
     position = np.cumsum(distance[:, None] * np.stack([np.cos(middle), np.sin(middle)], axis=1), axis=0)
     deltas = np.column_stack([distance * np.cos(0.5 * turn), distance * np.sin(0.5 * turn), turn])
     poses = np.column_stack([position, geometry.wrap_angle(yaw)])
-    return Drive(deltas, poses, np.cumsum(distance), hz)
+    return ExactDrive(deltas, poses, np.cumsum(distance), hz)

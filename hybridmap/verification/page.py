@@ -14,7 +14,7 @@ from hybridmap.output import Held, Kind, write_text
 from hybridmap.report import page_tables as tables
 from hybridmap.report import style
 from hybridmap.report.page_tables import is_page, rendered
-from hybridmap.verification import Verification, maps_figure
+from hybridmap.verification import CellVerification, maps_figure
 from hybridmap.verification.path_error import HeadDirectionResult, PathErrors
 from hybridmap.verification.rows import PHASE_BAR_PERCENT, ROOM_BAR_MM, noise_curve, recurrence_verdict
 from hybridmap.verification.shadow import Cells, Overwriting
@@ -24,7 +24,7 @@ VERIFICATION = Kind("verification", (PAGE, METRICS), lambda folder: is_page(fold
 _TEMPLATE = "verify.html.j2"
 
 
-def write_verification(place: Held, head: dict[str, Any], rows: Sequence[Metric], result: Verification) -> Path:
+def write_verification(place: Held, head: dict[str, Any], rows: Sequence[Metric], result: CellVerification) -> Path:
     """Write `metrics.json` and `verify.html` into a folder that is held as `VERIFICATION`; returns the page.
 
     Raises:
@@ -37,7 +37,7 @@ def write_verification(place: Held, head: dict[str, Any], rows: Sequence[Metric]
     return place.path / PAGE
 
 
-def _scale_of(result: Verification) -> dict[str, str]:
+def _scale_of(result: CellVerification) -> dict[str, str]:
     """Sizes and numbers of what the captions speak of."""
     lattice, place = result.lattice, result.place
     noisy = next(iter(result.noise.values()))
@@ -52,7 +52,7 @@ def _scale_of(result: Verification) -> dict[str, str]:
     }
 
 
-def _render(head: dict[str, Any], rows: Sequence[Metric], result: Verification) -> str:
+def _render(head: dict[str, Any], rows: Sequence[Metric], result: CellVerification) -> str:
     named = {row.name.removeprefix("verify/"): row for row in rows}
     first = next(iter(result.room.values()))
     return rendered(
@@ -102,7 +102,7 @@ def heading_figure(heading: HeadDirectionResult) -> str:
         return style.svg_uri(picture)
 
 
-def phase_figure(result: Verification) -> str:
+def phase_figure(result: CellVerification) -> str:
     """The worst module's phase error and the position error over distance, on every drive; a `data:` URI."""
     with style.figure(style.PAGE_WIDTH_IN, 3.6) as picture:
         phase, position = picture.subplots(1, 2)
@@ -143,7 +143,7 @@ def module_figure(drives: Sequence[PathErrors], spacings_m: Any) -> str:
         return style.svg_uri(picture)
 
 
-def noise_figure(result: Verification) -> str:
+def noise_figure(result: CellVerification) -> str:
     """RMS position and heading error over distance for every noise, and where half of the drives are; a `data:` URI."""
     with style.figure(style.PAGE_WIDTH_IN, 3.4) as picture:
         position, heading = picture.subplots(1, 2)

@@ -11,7 +11,7 @@ from hybridmap.config.mapping import NeuralConfig
 from hybridmap.geometry import Array
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.head_direction import HeadDirectionRing
-from hybridmap.verification.drives import Drive, corridor, wander
+from hybridmap.verification.drives import ExactDrive, corridor, wander
 
 _NODE_M = 0.5
 
@@ -33,7 +33,7 @@ class PathErrors:
     heading_rad: Array
 
 
-def path_errors(config: NeuralConfig, drive: Drive, rng: np.random.Generator | None = None) -> PathErrors:
+def path_errors(config: NeuralConfig, drive: ExactDrive, rng: np.random.Generator | None = None) -> PathErrors:
     """Drive a new path integrator and compare it with the exact poses; `rng` is of the neuron noise."""
     integrator = PathIntegrator(config, rng)
     dt, next_m = 1.0 / drive.hz, 0.0

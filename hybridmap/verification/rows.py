@@ -14,7 +14,7 @@ from hybridmap.verification.path_error import PathErrors
 from hybridmap.verification.physiology import gridness, ideal_map
 from hybridmap.verification.rate_maps import PlaceResult
 from hybridmap.verification.shadow import STEPS_ON
-from hybridmap.verification.verification import Verification
+from hybridmap.verification.verification import CellVerification
 
 PHASE_BAR_PERCENT = {"relu": 0.6, "softplus": 0.02}
 ROOM_BAR_MM, CORRIDOR_BAR_MM = 0.5, 0.1
@@ -24,9 +24,9 @@ _LEARNT = {"recruited": "recruited place cells", "printed": "place cells by the 
 _AT_MOST, _AT_LEAST = "at most", "at least"
 
 
-def rows_of(result: Verification) -> list[Metric]:
+def rows_of(result: CellVerification) -> list[Metric]:
     """Every row of the table, `verify/<row>`; those with a bar say whether they keep to it."""
-    parts: Sequence[Callable[[Verification], list[Metric]]] = (
+    parts: Sequence[Callable[[CellVerification], list[Metric]]] = (
         head_direction_rows,
         band_rows,
         gridness_rows,
@@ -49,7 +49,7 @@ def _row(name: str, value: float, unit: str, description: str, bar: float | None
     return Metric(f"verify/{name}", value, unit, f"{description}; {side} {bar:g}", bar, bool(passed))
 
 
-def head_direction_rows(result: Verification) -> list[Metric]:
+def head_direction_rows(result: CellVerification) -> list[Metric]:
     """The decoded heading after many turns, and the turn-rate modulation."""
     heading = result.head_direction
     gain = float(heading.rates[-1].max() / heading.rates[0].max())
@@ -68,7 +68,7 @@ def head_direction_rows(result: Verification) -> list[Metric]:
     ]
 
 
-def band_rows(result: Verification) -> list[Metric]:
+def band_rows(result: CellVerification) -> list[Metric]:
     """Orientation and period of every band, from rate maps of the rings' activity."""
     lattice = result.lattice
     orientation = float(lattice.band_orientation_error_deg.max())
@@ -79,7 +79,7 @@ def band_rows(result: Verification) -> list[Metric]:
     ]
 
 
-def gridness_rows(result: Verification) -> list[Metric]:
+def gridness_rows(result: CellVerification) -> list[Metric]:
     """Gridness of the sampled cells, of an ideal map, and of the square metric."""
     scores = result.lattice.gridness
     spacings = result.lattice.spacings_m / result.lattice.pitch_m
@@ -95,7 +95,7 @@ def gridness_rows(result: Verification) -> list[Metric]:
     ]
 
 
-def phase_rows(result: Verification) -> list[Metric]:
+def phase_rows(result: CellVerification) -> list[Metric]:
     """The worst module's phase error of all drives, by rectifier and rate."""
     return [
         _row(
@@ -109,7 +109,7 @@ def phase_rows(result: Verification) -> list[Metric]:
     ]
 
 
-def position_rows(result: Verification) -> list[Metric]:
+def position_rows(result: CellVerification) -> list[Metric]:
     """The position decoded from all modules together: in the room and down the corridor."""
     rows = []
     for rectifier, corridor in result.corridor.items():
@@ -122,7 +122,7 @@ def position_rows(result: Verification) -> list[Metric]:
     return rows
 
 
-def shadow_rows(result: Verification) -> list[Metric]:
+def shadow_rows(result: CellVerification) -> list[Metric]:
     """Whether an overwritten activity moves the pose by exactly that, and which cells hold the position."""
     at_once = "spacings by which the pose misses a shift written into the sheets"
     on = f"the same with rings and sheets shifted together, largest over {STEPS_ON} steps of driving on"
@@ -142,7 +142,7 @@ def shadow_rows(result: Verification) -> list[Metric]:
     return rows
 
 
-def place_rows(result: Verification) -> list[Metric]:
+def place_rows(result: CellVerification) -> list[Metric]:
     """Single fields with and without recruitment."""
     place = result.place
     recruited = f"of {len(place.recruited.fields)} recruited place cells have one field"
@@ -153,7 +153,7 @@ def place_rows(result: Verification) -> list[Metric]:
     ]
 
 
-def recurrence_rows(result: Verification) -> list[Metric]:
+def recurrence_rows(result: CellVerification) -> list[Metric]:
     """What settled recurrent competition on the attractor's sheet adds, whichever way it comes out."""
     rows, place = [], result.place
     for learnt, cells in _LEARNT.items():
@@ -188,7 +188,7 @@ def verb_of_change(percent: float) -> str:
     return "hardly changes" if abs(percent) < 5.0 else "raises" if percent > 0.0 else "lowers"
 
 
-def standstill_rows(result: Verification) -> list[Metric]:
+def standstill_rows(result: CellVerification) -> list[Metric]:
     """Standing still: as the integrator does, and with the dynamics running on."""
     still = result.standstill
     rows = [_row("standing_still", still.pose_change, "m", "largest change of the pose over all steps without motion", 0.0)]
@@ -198,7 +198,7 @@ def standstill_rows(result: Verification) -> list[Metric]:
     return rows
 
 
-def noise_rows(result: Verification) -> list[Metric]:
+def noise_rows(result: CellVerification) -> list[Metric]:
     """Where noisy neurons lead."""
     rows = []
     for share, drives in result.noise.items():
@@ -235,7 +235,7 @@ def noise_curve(drives: Sequence[PathErrors], what: Literal["position_m", "headi
     return NoiseCurve(drives[0].distance_m[:count], rms, np.quantile(errors, (0.25, 0.75), axis=0))
 
 
-def kernel_rows(result: Verification) -> list[Metric]:
+def kernel_rows(result: CellVerification) -> list[Metric]:
     """Whether the printed kernel's instability is noticed and named."""
     named = float("do not settle" in result.printed_kernel)
     return [_row("printed_kernel_refused", named, "1", "the instability of the printed kernel is named", 1.0, _AT_LEAST)]

@@ -11,7 +11,7 @@ from hybridmap.config.mapping import NeuralConfig
 from hybridmap.geometry import Array
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.grid import shift_sheets
-from hybridmap.verification.drives import Drive, wander
+from hybridmap.verification.drives import ExactDrive, wander
 
 Cells = Literal["sheets", "rings", "both"]
 CELLS: tuple[Cells, ...] = ("sheets", "rings", "both")
@@ -77,7 +77,7 @@ def _at_once(rng: np.random.Generator, config: NeuralConfig, draws: int) -> Arra
     return misses
 
 
-def _positions_after(config: NeuralConfig, drive: Drive, cells: Cells | None = None, way_m: Array | None = None) -> Array:
+def _positions_after(config: NeuralConfig, drive: ExactDrive, cells: Cells | None = None, way_m: Array | None = None) -> Array:
     """Positions (STEPS_ON + 1, 2) over the last steps of a drive; the cells named are shifted by `way_m` (2,) before them."""
     integrator = PathIntegrator(config)
     for delta in drive.deltas[:-STEPS_ON]:

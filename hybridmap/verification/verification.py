@@ -58,7 +58,7 @@ class Scale:
 
 
 @dataclass(frozen=True, slots=True)
-class Verification:
+class CellVerification:
     """What the experiments gave.
 
     Attributes:
@@ -89,7 +89,7 @@ Task = tuple[Callable[..., Any], tuple[Any, ...]]
 
 def verify_cells(
     seed: int, scale: Scale, settings: dict[str, object], progress: Callable[[int, int | None], None] | None = None
-) -> Verification:
+) -> CellVerification:
     """Run every experiment; the same seed gives the same figures, on any number of cores.
 
     Args:
@@ -105,7 +105,7 @@ def verify_cells(
     tasks = _tasks(np.random.SeedSequence(seed), scale, settings)
     done = _run(tasks, scale.workers, progress or (lambda _done, _total: None))
     parts: dict[str, Any] = {key[0]: value for key, value in done.items() if len(key) == 1}
-    return Verification(
+    return CellVerification(
         **parts,
         room={(f, hz): [done["room", f, hz, k] for k in range(scale.paths)] for f in RECTIFIERS for hz in RATES_HZ},
         corridor={f: done["corridor", f] for f in RECTIFIERS},

@@ -17,7 +17,7 @@ from hybridmap.geometry import RelativePose, between
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
 from hybridmap.graph.gaps import carries
 from hybridmap.report import comparison_page, session_figures, style
-from hybridmap.report.session_view import Correction, Scene, load_scene
+from hybridmap.report.session_scene import Correction, SessionScene, load_scene
 from hybridmap.store import MapStore, SessionFolder
 from tests.store.sessions import SECOND, ring_map, truth_at, write_session
 
@@ -38,7 +38,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> SessionFolder:
 
 
 @pytest.fixture
-def scene(session: SessionFolder) -> Scene:
+def scene(session: SessionFolder) -> SessionScene:
     with MapStore.open(session.path) as store:
         return load_scene(session, store)
 
@@ -56,14 +56,14 @@ def is_broken(line: Any) -> bool:
     return np.flatnonzero(np.isnan(line.get_xdata())).tolist() == [PICKED_UP + 1]
 
 
-def test_the_truth_ends_where_the_robot_was_picked_up(scene: Scene, drawn: list[Any]) -> None:
+def test_the_truth_ends_where_the_robot_was_picked_up(scene: SessionScene, drawn: list[Any]) -> None:
     session_figures.trajectories_figure(scene, None)
     truth = [line for line in drawn[0].axes[0].get_lines() if line.get_color() == style.TRUTH and line.get_alpha() is not None]
     assert len(truth) == 2
     assert [line.get_label() == "ground truth" for line in truth] == [True, False]
 
 
-def test_the_chain_is_dashed_where_the_robot_was_carried(scene: Scene, drawn: list[Any]) -> None:
+def test_the_chain_is_dashed_where_the_robot_was_carried(scene: SessionScene, drawn: list[Any]) -> None:
     chain, carried = session_figures.chain_and_carries(scene)
     assert [(edge.source, edge.target) for edge in carried] == [(PICKED_UP, PICKED_UP + 1)]
     assert len(chain) == len(scene.nodes) - 2
@@ -72,7 +72,7 @@ def test_the_chain_is_dashed_where_the_robot_was_carried(scene: Scene, drawn: li
     assert lines.get_linestyle()[0][1] is not None
 
 
-def test_the_ways_before_and_after_a_correction_break(scene: Scene, drawn: list[Any]) -> None:
+def test_the_ways_before_and_after_a_correction_break(scene: SessionScene, drawn: list[Any]) -> None:
     correction = Correction(0, 1.0, scene.nodes[:40], scene.nodes[:40] + 1.0)
     session_figures.correction_figure(correction, {}, carries(scene.experiences))
     assert [is_broken(axes.get_lines()[0]) for axes in drawn[0].axes] == [True, True]

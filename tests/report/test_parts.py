@@ -22,7 +22,7 @@ from hybridmap.report.session_figures import (
     over_intervals,
     with_gaps,
 )
-from hybridmap.report.session_view import Scene, load_scene
+from hybridmap.report.session_scene import SessionScene, load_scene
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.study.statistics import Interval
 from hybridmap.trajectory import Trajectory
@@ -41,19 +41,19 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> SessionFolder:
 
 
 @pytest.fixture
-def scene(session: SessionFolder) -> Scene:
+def scene(session: SessionFolder) -> SessionScene:
     with MapStore.open(session.path) as store:
         return load_scene(session, store)
 
 
-def test_everything_is_brought_to_the_frame_of_the_truth(scene: Scene) -> None:
+def test_everything_is_brought_to_the_frame_of_the_truth(scene: SessionScene) -> None:
     stamps = np.array([node.stamp_ns for node in scene.experiences.nodes])
     np.testing.assert_allclose(scene.nodes[:, :2], compose(MOVED, truth_at(stamps))[:, :2], atol=2e-3)
     assert scene.backends == ("odometry", "gtsam-lm")
     assert scene.primary == "gtsam-lm"
 
 
-def test_errors_are_those_of_the_aligned_trajectories(scene: Scene) -> None:
+def test_errors_are_those_of_the_aligned_trajectories(scene: SessionScene) -> None:
     series = error_series(scene)
     assert series["gtsam-lm"].position_m.max() < 0.01
     rmse = float(np.sqrt(np.mean(series["odometry"].position_m ** 2)))
@@ -84,7 +84,7 @@ def test_a_gap_lies_where_no_error_is_taken() -> None:
     assert np.isnan(drawn.heading_deg[nan])
 
 
-def test_no_error_is_ruled_across_a_time_without_a_truth(scene: Scene) -> None:
+def test_no_error_is_ruled_across_a_time_without_a_truth(scene: SessionScene) -> None:
     pairs = scene.pairs["odometry"]
     kept = (pairs.stamps_ns < 20 * 10**9) | (pairs.stamps_ns > 40 * 10**9)
     left = replace(pairs, stamps_ns=pairs.stamps_ns[kept], estimate=pairs.estimate[kept], reference=pairs.reference[kept])
@@ -95,14 +95,14 @@ def test_no_error_is_ruled_across_a_time_without_a_truth(scene: Scene) -> None:
     assert np.isnan(line.get_ydata()).sum() == 1
 
 
-def test_every_loop_has_one_fate(scene: Scene) -> None:
+def test_every_loop_has_one_fate(scene: SessionScene) -> None:
     counts = {fate: len(edges) for fate, edges in loops_by_fate(scene).items()}
     assert counts["loops accepted"] == 20
     assert counts["loops rejected"] == 20
     assert sum(counts.values()) == 40
 
 
-def test_examples_are_spread_and_end_with_a_refused_one(session: SessionFolder, scene: Scene) -> None:
+def test_examples_are_spread_and_end_with_a_refused_one(session: SessionFolder, scene: SessionScene) -> None:
     with MapStore.open(session.path) as store:
         found = examples(scene, store, outlines(store, len(scene.nodes)))
     assert [example.accepted for example in found] == [True, True, True, False]
@@ -111,7 +111,7 @@ def test_examples_are_spread_and_end_with_a_refused_one(session: SessionFolder, 
     assert ("time apart", "40.0 s") in found[0].facts
 
 
-def test_the_figures_of_a_closure_are_in_words_with_units(scene: Scene) -> None:
+def test_the_figures_of_a_closure_are_in_words_with_units(scene: SessionScene) -> None:
     checks = (at_most("off_m", 0.25, 1.0), at_least("feature_inliers", 12, 12))
     edge = Edge.decided(9, 2, EdgeKind.LOOP, None, checks, figures={"inliers": 0.7, "new_one": 1.0}, shift=3)
     assert in_words(edge) == [
@@ -124,7 +124,7 @@ def test_the_figures_of_a_closure_are_in_words_with_units(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_titles_of_overlays_are_as_wide_as_their_axes(scene: Scene, measured: bool) -> None:
+def test_titles_of_overlays_are_as_wide_as_their_axes(scene: SessionScene, measured: bool) -> None:
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath
 
@@ -135,7 +135,7 @@ def test_titles_of_overlays_are_as_wide_as_their_axes(scene: Scene, measured: bo
 
 
 def test_accepted_loops_lie_over_the_rejected_ones_and_the_legend_can_be_read(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
+    scene: SessionScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[Any] = []
     monkeypatch.setattr(style, "svg_uri", drawn.append)

@@ -6,7 +6,7 @@ import numpy as np
 
 from hybridmap.geometry import Array
 from hybridmap.simulation import furniture, paints, pictures
-from hybridmap.simulation.surfaces import Paint, Surface, World, panel, partition, slab
+from hybridmap.simulation.surfaces import Facet, Paint, World, panel, partition, slab
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 19.2, 2.4, 2.6
 DRIVE_M = 16.8
@@ -33,7 +33,7 @@ def _there_and_back_and_there() -> tuple[Array, ...]:
     return np.array([begin, end]), np.array([end, begin]), np.array([begin, end])
 
 
-def _shell(wall: Paint, floor: Paint, ceiling: Paint, *, ends: Paint) -> list[Surface]:
+def _shell(wall: Paint, floor: Paint, ceiling: Paint, *, ends: Paint) -> list[Facet]:
     out = [
         slab((0, 0), (LENGTH_M, WIDTH_M), 0.0, floor, facing_up=True),
         slab((0, 0), (LENGTH_M, WIDTH_M), HEIGHT_M, ceiling, facing_up=False),
@@ -45,7 +45,7 @@ def _shell(wall: Paint, floor: Paint, ceiling: Paint, *, ends: Paint) -> list[Su
     return out
 
 
-def _lamps() -> list[Surface]:
+def _lamps() -> list[Facet]:
     white = paints.plain((250, 250, 244))
     return [
         slab((x - 0.6, 1.0), (x + 0.6, 1.4), HEIGHT_M - 0.01, white, facing_up=False, glow=1.0)
@@ -53,13 +53,13 @@ def _lamps() -> list[Surface]:
     ]
 
 
-def _doors() -> list[Surface]:
+def _doors() -> list[Facet]:
     south = [panel((x, 0, 0.0), 90, (0.95, 2.05), pictures.door()) for x in (2.4, 7.1, 11.6, 16.2)]
     north = [panel((x, WIDTH_M, 0.0), -90, (0.95, 2.05), pictures.door((96, 116, 128))) for x in (4.9, 9.3, 14.4)]
     return south + north
 
 
-def _pictures() -> list[Surface]:
+def _pictures() -> list[Facet]:
     out = [panel((x, 0, 1.05), 90, (0.6, 0.85), pictures.poster(), px_per_m=240) for x in (3.9, 5.4, 9.0, 13.6, 17.6)]
     out += [panel((x, WIDTH_M, 1.05), -90, (0.6, 0.85), pictures.poster(), px_per_m=240) for x in (2.2, 6.9, 12.3, 16.9)]
     out.append(panel((10.2, 0, 1.0), 90, (1.1, 0.85), pictures.notice_board(), px_per_m=240))
@@ -69,7 +69,7 @@ def _pictures() -> list[Surface]:
     return out
 
 
-def _things() -> list[Surface]:
+def _things() -> list[Facet]:
     out = furniture.crate((3.3, 0.25), 8) + furniture.crate((3.3, 0.26), -14, (0.3, 0.36, 0.28), bottom_m=0.4)
     out += furniture.bin_((5.9, WIDTH_M - 0.22))
     out += furniture.cabinet((8.0, 0.23), 90, 0.5, 1.3)

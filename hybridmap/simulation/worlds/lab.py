@@ -6,7 +6,7 @@ import numpy as np
 
 from hybridmap.geometry import Array
 from hybridmap.simulation import furniture, paints, pictures
-from hybridmap.simulation.surfaces import Surface, World, box, panel, partition, slab
+from hybridmap.simulation.surfaces import Facet, World, box, panel, partition, slab
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 10.0, 3.0, 2.7
 LAPS = 2.35
@@ -19,7 +19,7 @@ def lab() -> World:
     )
 
 
-def _shell() -> list[Surface]:
+def _shell() -> list[Facet]:
     cream, blue = paints.plaster((222, 214, 196)), paints.plaster((166, 186, 200))
     out = [
         slab((0, 0), (LENGTH_M, WIDTH_M), 0.0, paints.wood((158, 124, 88), plank_m=0.16), facing_up=True),
@@ -36,8 +36,8 @@ def _shell() -> list[Surface]:
     return out
 
 
-def _benches() -> list[Surface]:
-    out: list[Surface] = []
+def _benches() -> list[Facet]:
+    out: list[Facet] = []
     for x in (3.4, 5.0, 6.6):
         out += furniture.table((x, 1.5), 0.0, (1.5, 0.56), height_m=0.72)
     out += furniture.crate((3.0, 1.5), 20, (0.32, 0.4, 0.3), bottom_m=0.72)
@@ -52,7 +52,7 @@ def _benches() -> list[Surface]:
     return out
 
 
-def _along_the_walls() -> list[Surface]:
+def _along_the_walls() -> list[Facet]:
     out = furniture.book_case((2.6, 0.13), 90, 1.0, 1.9, 0.24)
     out += furniture.book_case((7.5, WIDTH_M - 0.13), -90, 1.2, 1.9, 0.24)
     out += furniture.cabinet((0.25, 2.6), 0, 0.5, 1.2)
@@ -66,7 +66,7 @@ def _along_the_walls() -> list[Surface]:
     return out
 
 
-def _on_the_walls() -> list[Surface]:
+def _on_the_walls() -> list[Facet]:
     south, north = 90.0, -90.0
     return [
         panel((1.3, 0, 0.0), south, (0.9, 2.03), pictures.door()),

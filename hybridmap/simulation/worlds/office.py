@@ -6,7 +6,7 @@ import numpy as np
 
 from hybridmap.geometry import Array
 from hybridmap.simulation import furniture, paints, pictures
-from hybridmap.simulation.surfaces import Surface, World, panel, partition, slab
+from hybridmap.simulation.surfaces import Facet, World, panel, partition, slab
 
 EAST_M, NORTH_M, HEIGHT_M = 25.0, 14.4, 2.6
 CORRIDOR_M = 2.0
@@ -25,7 +25,7 @@ def office() -> World:
     return World("office", tuple(surfaces), (_round(),), texture_seed=21)
 
 
-def _shell() -> list[Surface]:
+def _shell() -> list[Facet]:
     cream = paints.plaster((216, 210, 196))
     rooms = (CORRIDOR_M, CORE_NORTH_M), (EAST_M - CORRIDOR_M, NORTH_M)
     out = [
@@ -42,7 +42,7 @@ def _shell() -> list[Surface]:
     return out
 
 
-def _inner_walls() -> list[Surface]:
+def _inner_walls() -> list[Facet]:
     west, east = CORRIDOR_M, EAST_M - CORRIDOR_M
     paint, blue, green = paints.plaster((220, 216, 206)), paints.plaster((176, 192, 204)), paints.plaster((192, 204, 180))
     out = partition((west, CORRIDOR_M), (east, CORRIDOR_M), paint)
@@ -58,7 +58,7 @@ def _opening(middle_m: float) -> tuple[float, float]:
     return middle_m - 0.5 * DOOR_M, middle_m + 0.5 * DOOR_M
 
 
-def _lamps() -> list[Surface]:
+def _lamps() -> list[Facet]:
     spots = [(x, 1.0) for x in np.arange(2.0, EAST_M, 3.5)]
     spots += [(x, y) for x in (1.0, EAST_M - 1.0) for y in (4.6, 8.0, 11.4)]
     spots += [(x, y) for x in (4.2, 7.6, 11.6, 14.6, 18.2, 21.4) for y in (10.2, 12.8)]
@@ -66,7 +66,7 @@ def _lamps() -> list[Surface]:
     return [slab((x - 0.5, y - 0.3), (x + 0.5, y + 0.3), HEIGHT_M - 0.01, white, facing_up=False, glow=1.0) for x, y in spots]
 
 
-def _south() -> list[Surface]:
+def _south() -> list[Facet]:
     north_wall = CORRIDOR_M - 0.06
     out = [panel((x, north_wall, 0), -90, (0.95, 2.05), pictures.door()) for x in (4.4, 9.2, 13.0, 19.4)]
     out += [panel((x, 0, 1.0), 90, (1.5, 1.1), pictures.window(), glow=0.4, in_depth=False) for x in (6.4, 12.2, 20.2)]
@@ -81,7 +81,7 @@ def _south() -> list[Surface]:
     return out
 
 
-def _east() -> list[Surface]:
+def _east() -> list[Facet]:
     west_wall, east_wall = EAST_M - CORRIDOR_M + 0.06, EAST_M
     out = [panel((west_wall, y, 0), 0, (0.95, 2.05), pictures.door((96, 116, 128))) for y in (3.6, 7.0)]
     out += [panel((east_wall, y, 1.05), 180, (0.6, 0.85), pictures.poster(), px_per_m=240) for y in (2.2, 5.6, 12.2)]
@@ -94,7 +94,7 @@ def _east() -> list[Surface]:
     return out + furniture.crate((west_wall + 0.28, 13.8), 5, (0.4, 0.5, 0.7))
 
 
-def _west() -> list[Surface]:
+def _west() -> list[Facet]:
     east_wall = CORRIDOR_M - 0.06
     out = [panel((east_wall, y, 0), 180, (0.95, 2.05), pictures.door((120, 88, 96))) for y in (3.4, 6.2, 8.6)]
     out += [panel((0, y, 1.05), 0, (0.6, 0.85), pictures.poster(), px_per_m=240) for y in (2.6, 6.0, 9.2, 12.6)]
@@ -110,7 +110,7 @@ def _west() -> list[Surface]:
     return out
 
 
-def _room_a() -> list[Surface]:
+def _room_a() -> list[Facet]:
     """The western room: desks."""
     out = furniture.desk((3.4, NORTH_M - 0.5), -90) + furniture.chair((3.4, NORTH_M - 1.15), 90)
     out += furniture.desk((6.2, NORTH_M - 0.5), -90) + furniture.chair((6.1, NORTH_M - 1.15), 80, (116, 58, 52))
@@ -127,7 +127,7 @@ def _room_a() -> list[Surface]:
     return out
 
 
-def _room_b() -> list[Surface]:
+def _room_b() -> list[Facet]:
     """The middle room: a meeting table under a painting, a sofa."""
     out = furniture.table((12.6, 10.0), 0, (1.9, 0.9)) + furniture.chair((12.2, 9.15), 90) + furniture.chair((13.2, 9.1), 95)
     out += furniture.crate((12.3, 10.0), 10, (0.3, 0.22, 0.2), bottom_m=0.74) + furniture.plant((13.1, 10.0), 0.6)[5:]
@@ -142,7 +142,7 @@ def _room_b() -> list[Surface]:
     return out
 
 
-def _room_c() -> list[Surface]:
+def _room_c() -> list[Facet]:
     """The eastern room: a workshop with shelves and boxes."""
     out = furniture.desk((18.4, CORE_NORTH_M + 0.5), 90, 1.6) + furniture.chair((18.4, CORE_NORTH_M + 1.2), -85, (60, 96, 70))
     out += furniture.book_case((20.6, CORE_NORTH_M + 0.22), 90, 1.4, 1.9) + furniture.crate((22.4, CORE_NORTH_M + 0.4), 6)

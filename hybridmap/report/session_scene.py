@@ -7,7 +7,7 @@ from typing import Any
 
 from hybridmap.backends.base import ODOMETRY, SolveReport
 from hybridmap.errors import EvaluationError, HybridMapError
-from hybridmap.evaluate.association import Pairs, associate
+from hybridmap.evaluate.association import PosePairs, associate
 from hybridmap.evaluate.session_errors import session_trajectories
 from hybridmap.evaluate.trajectory_errors import absolute_error_of
 from hybridmap.geometry import IDENTITY, Array, compose
@@ -34,7 +34,7 @@ class Correction:
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class SessionScene:
     """Everything drawn, in the page's frame: that of the ground truth where there is one, else `map`.
 
     Attributes:
@@ -57,7 +57,7 @@ class Scene:
     backends: tuple[str, ...]
     truth: Trajectory | None
     estimates: dict[str, Trajectory]
-    pairs: dict[str, Pairs]
+    pairs: dict[str, PosePairs]
     nodes: Array
     experiences: ExperienceMap
     reports: dict[str, SolveReport]
@@ -67,7 +67,7 @@ class Scene:
     config_yaml: str
 
 
-def load_scene(folder: SessionFolder, store: MapStore) -> Scene:
+def load_scene(folder: SessionFolder, store: MapStore) -> SessionScene:
     """Gather a session.
 
     Raises:
@@ -89,7 +89,7 @@ def load_scene(folder: SessionFolder, store: MapStore) -> Scene:
     experiences = store.map()
     place = alignments.get(primary, alignments.get(ODOMETRY, IDENTITY))
     figures = folder.read_metrics()
-    return Scene(
+    return SessionScene(
         source=store.source,
         primary=primary,
         backends=backends,
@@ -125,7 +125,7 @@ def _alignments(estimates: dict[str, Trajectory], truth: Trajectory) -> dict[str
     return found
 
 
-def _pairs(estimates: dict[str, Trajectory], truth: Trajectory) -> dict[str, Pairs]:
+def _pairs(estimates: dict[str, Trajectory], truth: Trajectory) -> dict[str, PosePairs]:
     found = {}
     for name, estimate in estimates.items():
         try:
