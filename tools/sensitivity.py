@@ -1,6 +1,7 @@
 """Move each numeric setting by 30 % down and up, map a recording each time, and record what that does to the error of the map.
 
     python tools/sensitivity.py aces.bag --config laser --relations relations.txt --end 200
+    hybridmap simulate lab --out lab.mcap
     python tools/sensitivity.py lab.mcap --config rgbd
 
 The error is that of the primary back-end, which runs alone: the mean translation error over verified relations, or the ATE
