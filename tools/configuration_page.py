@@ -126,9 +126,9 @@ def _sensitive() -> list[str]:
     head = (
         "## Which of them matter\n\n"
         f"`python tools/sensitivity.py` moved each of {tried} numeric settings by 30 % up and down, on the first\n"
-        "200 s of aces by laser (mean relation error) and on the simulated laboratory by RGB-D (ATE), the primary back-end alone.\n"
-        "These "
-        "changed the error of the map by more than 2 %; all are in [sensitivity.csv](sensitivity.csv).\n"
+        "200 s of aces by laser (mean relation error) and on the simulated laboratory by RGB-D (ATE), with the\n"
+        "primary back-end alone. These changed the error of the map by more than 2 %; all are in\n"
+        "[sensitivity.csv](sensitivity.csv).\n"
     )
     table = ["| setting | recording | value | error | as it is | change |\n|---|---|---|---|---|---|"]
     for row in matter:
