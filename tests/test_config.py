@@ -5,11 +5,11 @@ from __future__ import annotations
 import importlib
 
 import pytest
+from configuration_page import PAGE, count, page, tables
 from pydantic import ValidationError
 
 from hybridmap.config import Config, gone, named_configs
 from hybridmap.errors import ConfigError
-from tools.configuration_page import PAGE, count, page, tables
 
 
 def test_overrides_win_over_the_file_which_wins_over_defaults(tmp_path):

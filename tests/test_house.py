@@ -15,6 +15,7 @@ from tests.narrowing import known
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "hybridmap"
 MODULES = sorted(path.relative_to(ROOT) for path in PACKAGE.rglob("*.py"))
+TESTS = sorted(path.relative_to(ROOT) for path in (ROOT / "tests").rglob("*.py"))
 HEAVY = ("open3d", "matplotlib", "gtsam", "cv2", "scipy", "rosbags", "numba")
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
@@ -111,6 +112,29 @@ def test_files_and_functions_stay_small(module: Path) -> None:
     functions = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)]
     lines = {f.name: known(f.end_lineno) - f.lineno + 1 for f in functions}
     assert {name: count for name, count in lines.items() if count > MAX_FUNCTION_LINES} == {}
+
+
+def private(name: str) -> bool:
+    return any(part.startswith("_") and not part.startswith("__") for part in name.split("."))
+
+
+def reaches_inside(node: ast.AST) -> bool:
+    """Whether a piece of a test takes a private attribute of something else, imports a private name, or patches one by name."""
+    if isinstance(node, ast.Attribute):
+        own = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
+        return private(node.attr) and not own
+    if isinstance(node, ast.Import | ast.ImportFrom):
+        module = node.module if isinstance(node, ast.ImportFrom) else None
+        return private(module or "") or any(private(alias.name) for alias in node.names)
+    if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in ("getattr", "setattr", "delattr"):
+        return any(isinstance(word, ast.Constant) and isinstance(word.value, str) and private(word.value) for word in node.args)
+    return False
+
+
+@pytest.mark.parametrize("test", TESTS, ids=str)
+def test_tests_hold_behaviour_and_reach_into_nothing_private(test: Path) -> None:
+    tree = ast.parse((ROOT / test).read_text())
+    assert [f"{getattr(node, 'lineno', 0)}: {ast.unparse(node)}" for node in ast.walk(tree) if reaches_inside(node)] == []
 
 
 def test_imports_point_only_to_earlier_stages() -> None:

@@ -1,15 +1,18 @@
 """What developers run: the picture, and the page of results."""
 
-import importlib
 import json
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import barred
 import cv2
+import figures
 import numpy as np
 import pytest
+import result_studies as studies
+import results
 
 from hybridmap.metrics import Metric, to_json
 from tests.narrowing import known
@@ -18,13 +21,7 @@ from tests.store.sessions import ring_map, write_session
 ROOT = Path(__file__).resolve().parents[1]
 
 
-@pytest.fixture(autouse=True)
-def tools_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-
-
 def test_picture_of_a_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    figures = importlib.import_module("figures")
     session = write_session(tmp_path / "session", ring_map(1.2))
     figures.draw(session, tmp_path / "images" / "picture.png")
     picture = known(cv2.imread(str(tmp_path / "images" / "picture.png")))
@@ -48,7 +45,6 @@ def row(results: Any, **changes: str) -> dict[str, str]:
 
 
 def test_page_of_results_is_what_was_recorded() -> None:
-    results = importlib.import_module("results")
     found = results.recorded()
     text = (ROOT / "docs" / "results.md").read_text()
     assert text == results.page(found)
@@ -59,7 +55,6 @@ def test_page_of_results_is_what_was_recorded() -> None:
 
 
 def test_every_topic_is_on_the_page_and_every_question_finds_its_figures() -> None:
-    results, studies = importlib.import_module("results"), importlib.import_module("result_studies")
     topics = {topic.name: topic for topic in studies.TOPICS}
     assert {name for names in studies.PARTS.values() for name in names} == set(topics)
     assert {found["topic"] for found in results.recorded()} <= set(topics)
@@ -69,7 +64,6 @@ def test_every_topic_is_on_the_page_and_every_question_finds_its_figures() -> No
 
 
 def test_a_command_s_figures_are_held_against_the_bars_they_are_given(tmp_path: Path) -> None:
-    results, studies = importlib.import_module("results"), importlib.import_module("result_studies")
     step = studies.Step("hybridmap map x", (studies.Figure("ate_rmse/PRIMARY", 0.2), studies.Figure("nodes")), same_graph=True)
     output = {
         "primary_backend": "gtsam-lm",
@@ -91,7 +85,6 @@ def test_a_command_s_figures_are_held_against_the_bars_they_are_given(tmp_path: 
 
 
 def test_a_command_s_own_bars_are_taken_with_their_side(tmp_path: Path) -> None:
-    barred, results, studies = (importlib.import_module(name) for name in ("barred", "results", "result_studies"))
     metrics = [
         barred.at_least("speed", np.float64(7.5), 8.0, "of the baseline"),
         barred.at_most("error", 0.1, 0.2, "largest", "m"),
@@ -106,7 +99,6 @@ def test_a_command_s_own_bars_are_taken_with_their_side(tmp_path: Path) -> None:
 
 
 def test_a_study_s_bars_are_taken_with_the_value_of_every_seed(tmp_path: Path) -> None:
-    results, studies = importlib.import_module("results"), importlib.import_module("result_studies")
     (tmp_path / "s").mkdir()
     columns = (
         "source,setting,false_loop_kind,false_loop_rate,backend,figure,unit,statistic,value,side,bar,passed,median,worst,values"
@@ -127,7 +119,6 @@ def test_a_study_s_bars_are_taken_with_the_value_of_every_seed(tmp_path: Path) -
 
 
 def test_a_question_has_one_line_with_the_median_and_the_worst_of_its_figures() -> None:
-    results = importlib.import_module("results")
     one, other = row(results), row(results, figure="ate_m/b", values="0.2 0.4 -", worst="0.4")
     assert results.line("ATE", [one, other]) == "| ATE | 5 | 0.25 m | 0.4 m | <= 0.5 m | ✓ |"
     missed = row(results, bar="0.2", passed="no")

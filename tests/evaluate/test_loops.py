@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
-
+import loop_figures
 import numpy as np
 import pytest
 
@@ -105,9 +104,8 @@ def test_a_session_without_frames_or_truth_is_refused(tmp_path):
 
 
 def test_the_tool_prints_a_line_a_mode(lab, monkeypatch, capsys):
-    monkeypatch.syspath_prepend("tools")
     monkeypatch.setattr("sys.argv", ["loop_figures.py", str(lab.path)])
-    importlib.import_module("loop_figures").main()
+    loop_figures.main()
     said = capsys.readouterr().out.splitlines()
     assert "at least 10 s older" in said[0]
     assert "revisits" in said[1]

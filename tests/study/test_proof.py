@@ -1,9 +1,9 @@
 """The proof that developers run, in small: killed runs, killed workers and a Dask cluster give the same bytes."""
 
-import importlib
 from pathlib import Path
 
 import pytest
+import study_proof as proof
 import yaml
 
 from hybridmap.study.grid import lay_out
@@ -12,19 +12,13 @@ from hybridmap.study.model import StudyConfig
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture
-def proof(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    return importlib.import_module("study_proof")
-
-
-def test_the_proof_is_about_at_least_200_cells(proof):
+def test_the_proof_is_about_at_least_200_cells():
     cells = lay_out(StudyConfig.from_tree(proof.study(None, 8), "proof", ROOT)).cells
     assert len({cell.key for cell in cells}) >= 200
 
 
 @pytest.fixture
-def small(proof, tmp_path):
+def small(tmp_path):
     config = tmp_path / "proof.yaml"
     config.write_text(yaml.safe_dump(proof.study(None, 2)))
     alone = tmp_path / "alone"
@@ -33,7 +27,7 @@ def small(proof, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["killed_twice", "two_workers", "dask"])
-def test_tables_are_the_same_however_it_was_run(proof, small, tmp_path, way):
+def test_tables_are_the_same_however_it_was_run(small, tmp_path, way):
     if way == "dask":
         pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
     config, told, cells = small

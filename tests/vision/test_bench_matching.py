@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 
+import bench_matching
 import numpy as np
 import pytest
 
@@ -13,10 +13,8 @@ from hybridmap.vision.search import ProfileIndex
 
 @pytest.fixture
 def bench(monkeypatch):
-    monkeypatch.syspath_prepend("tools")
-    module = importlib.import_module("bench_matching")
-    monkeypatch.setattr(module, "best_of", lambda work, seconds=0.0: (work(), 1.0)[1])
-    return module
+    monkeypatch.setattr(bench_matching, "best_of", lambda work, seconds=0.0: (work(), 1.0)[1])
+    return bench_matching
 
 
 def test_the_baseline_finds_the_same_views(bench):
