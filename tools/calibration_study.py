@@ -24,7 +24,7 @@ from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.legs import Motion
 from hybridmap.calibration.sessions import Drive, estimate_of, read_drive
 from hybridmap.cli.choose import choose
-from hybridmap.evaluate.association import Pairs, known_at, travel
+from hybridmap.evaluate.association import PosePairs, known_at, travel
 from hybridmap.evaluate.trajectory_errors import motion_errors
 from hybridmap.geometry import Array
 from hybridmap.metrics import Metric, to_json
@@ -97,7 +97,7 @@ def windows(log: Log, gains: Gains, delay_s: float, length_m: float) -> tuple[Ar
     stamps = log.motion.stamps_ns
     used = known_at(log.reference, stamps + shift) & (stamps >= log.half_ns)
     poses = log.motion.poses(gains)[used]
-    pairs = Pairs(stamps[used], poses, log.reference.at(stamps[used] + shift), len(stamps))
+    pairs = PosePairs(stamps[used], poses, log.reference.at(stamps[used] + shift), len(stamps))
     along = travel(pairs.reference)
     first = np.searchsorted(along, np.arange(0.0, max(along[-1] - length_m, 0.0), EVERY_M))
     last = np.searchsorted(along, along[first] + length_m)
