@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from hybridmap.errors import ExportError
 from hybridmap.export.formats import ExportOptions, SessionView
-from hybridmap.export.poses import planar_matrix
 from hybridmap.geometry import Array, compose, transform_points
 from hybridmap.metrics import Metric
 from hybridmap.output import write_text
 from hybridmap.streams.base import Seen
 from hybridmap.streams.sensors import see
+from hybridmap.vision.rgbd.stance import from_planar
 
 _HIT, _MISS, _LIMIT = 0.9, -0.4, 4.0
 """Log-odds that a return adds to its cell, that a beam passing adds, and where they saturate."""
@@ -215,4 +215,4 @@ def _clouds(view: SessionView) -> Iterator[Any]:
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(seen.xyz))
         if seen.rgb is not None:
             cloud.colors = o3d.utility.Vector3dVector(seen.rgb)
-        yield cloud.transform(planar_matrix(pose))
+        yield cloud.transform(from_planar(pose))

@@ -14,6 +14,7 @@ from hybridmap.graph.io import write_g2o
 from hybridmap.metrics import Metric
 from hybridmap.output import write_text
 from hybridmap.trajectory import write_tum
+from hybridmap.vision.rgbd.stance import from_planar
 
 _COLORS = {
     EdgeKind.ODOMETRY: (0.30, 0.35, 0.45),
@@ -69,26 +70,17 @@ def write_posegraph(view: SessionView, path: Path) -> list[Metric]:
     registration = o3d.pipelines.registration
     drawn = registration.PoseGraph()
     for pose in view.poses:
-        drawn.nodes.append(registration.PoseGraphNode(planar_matrix(pose)))
+        drawn.nodes.append(registration.PoseGraphNode(from_planar(pose)))
     for edge in edges.values():
         assert edge.relative is not None
         turned = invert_relative(edge.relative)
         uncertain = edge.kind is EdgeKind.LOOP
-        matrix, information = planar_matrix(turned.delta), _spatial_information(turned)
+        matrix, information = from_planar(turned.delta), _spatial_information(turned)
         drawn.edges.append(registration.PoseGraphEdge(edge.source, edge.target, matrix, information, uncertain))
     o3d.io.write_pose_graph(path, drawn)
     if not path.is_file():
         raise ExportError(f"{path.name}: Open3D could not write the PoseGraph")
     return _counts("posegraph", len(drawn.nodes), len(drawn.edges))
-
-
-def planar_matrix(pose: Array) -> Array:
-    """The (4, 4) homogeneous matrix of a planar pose (3,)."""
-    matrix = np.eye(4)
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    matrix[:2, :2] = [[cos, -sin], [sin, cos]]
-    matrix[:2, 3] = pose[:2]
-    return matrix
 
 
 def _spatial_information(relative: RelativePose) -> Array:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
+from typing import Concatenate, ParamSpec
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +15,13 @@ from hybridmap.simulation.surfaces import Paint
 Image = NDArray[np.uint8]
 Field = NDArray[np.float32]
 Color = tuple[int, int, int]
+Rng = np.random.Generator
+Shape = tuple[int, int]
+"""Height and width, texels."""
+P = ParamSpec("P")
 
 
-def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cell_px: float) -> Field:
+def smooth_noise(rng: Rng, shape: Shape, cell_px: float) -> Field:
     """Smooth noise (H, W) float32 of mean 0 and about unit deviation, features about `cell_px` wide."""
     rows, columns = (max(2, round(side / max(cell_px, 1.0)) + 1) for side in shape)
     coarse = rng.standard_normal((rows, columns), dtype=np.float32)
@@ -25,144 +33,132 @@ def tint(color: Color, tone: Field) -> Image:
     return np.asarray(np.clip(tone[..., None] * np.asarray(color, dtype=np.float32), 0, 255).astype(np.uint8))
 
 
-def vary(rng: np.random.Generator, color: Color, spread: int = 20) -> Color:
+def vary(rng: Rng, color: Color, spread: int = 20) -> Color:
     """A colour near another one."""
     drawn = np.clip(np.asarray(color) + rng.integers(-spread, spread + 1, 3), 0, 255)
     return int(drawn[0]), int(drawn[1]), int(drawn[2])
 
 
-def any_color(rng: np.random.Generator, low: int = 20, high: int = 235) -> Color:
+def any_color(rng: Rng, low: int = 20, high: int = 235) -> Color:
     """A colour drawn channel by channel."""
     drawn = rng.integers(low, high, 3)
     return int(drawn[0]), int(drawn[1]), int(drawn[2])
 
 
-def plain(color: Color) -> Paint:
+def material(draw: Callable[Concatenate[Rng, Shape, float, P], Image]) -> Callable[P, Paint]:
+    """From a function that draws to one that takes its options alone and gives the paint."""
+
+    @wraps(draw)
+    def with_options(*args: P.args, **options: P.kwargs) -> Paint:
+        return lambda rng, shape, px_per_m: draw(rng, shape, px_per_m, *args, **options)
+
+    return with_options
+
+
+@material
+def plain(_rng: Rng, shape: Shape, _px_per_m: float, color: Color) -> Image:
     """One colour and nothing else: the featureless wall."""
-
-    def paint(_rng: np.random.Generator, shape: tuple[int, int], _px_per_m: float) -> Image:
-        return np.full((*shape, 3), color, dtype=np.uint8)
-
-    return paint
+    return np.full((*shape, 3), color, dtype=np.uint8)
 
 
-def plaster(color: Color, *, skirting: Color | None = (92, 84, 76), scuffs: float = 0.5) -> Paint:
+@material
+def plaster(
+    rng: Rng, shape: Shape, px_per_m: float, color: Color, *, skirting: Color | None = (92, 84, 76), scuffs: float = 0.5
+) -> Image:
     """A painted wall: faint clouds, a skirting board, `scuffs` marks a metre of wall."""
-
-    def paint(rng: np.random.Generator, shape: tuple[int, int], px_per_m: float) -> Image:
-        tone = 1.0 + 0.012 * smooth_noise(rng, shape, 0.6 * px_per_m) + 0.012 * smooth_noise(rng, shape, 0.03 * px_per_m)
-        image = tint(color, tone)
-        for _ in range(rng.poisson(scuffs * shape[1] / px_per_m)):
-            x, y = int(rng.integers(shape[1])), int(shape[0] * (1.0 - rng.beta(1.3, 4.0)))
-            end = (x + int(rng.normal(0, 0.08) * px_per_m), y + int(rng.normal(0, 0.03) * px_per_m))
-            shade = vary(rng, tuple(int(0.72 * channel) for channel in color), 25)  # type: ignore[arg-type]
-            cv2.line(image, (x, y), end, shade, int(rng.integers(1, 3)), cv2.LINE_AA)
-        if skirting is not None and shape[0] > 1.5 * px_per_m:
-            image[shape[0] - round(0.09 * px_per_m) :] = skirting
-        return image
-
-    return paint
+    tone = 1.0 + 0.012 * smooth_noise(rng, shape, 0.6 * px_per_m) + 0.012 * smooth_noise(rng, shape, 0.03 * px_per_m)
+    image = tint(color, tone)
+    for _ in range(rng.poisson(scuffs * shape[1] / px_per_m)):
+        x, y = int(rng.integers(shape[1])), int(shape[0] * (1.0 - rng.beta(1.3, 4.0)))
+        end = (x + int(rng.normal(0, 0.08) * px_per_m), y + int(rng.normal(0, 0.03) * px_per_m))
+        shade = vary(rng, tuple(int(0.72 * channel) for channel in color), 25)  # type: ignore[arg-type]
+        cv2.line(image, (x, y), end, shade, int(rng.integers(1, 3)), cv2.LINE_AA)
+    if skirting is not None and shape[0] > 1.5 * px_per_m:
+        image[shape[0] - round(0.09 * px_per_m) :] = skirting
+    return image
 
 
-def carpet(color: Color, *, tile_m: float = 0.5, contrast: float = 0.05) -> Paint:
+@material
+def carpet(rng: Rng, shape: Shape, px_per_m: float, color: Color, *, tile_m: float = 0.5, contrast: float = 0.05) -> Image:
     """Carpet tiles: each with its own tone and pile, a few stains."""
-
-    def paint(rng: np.random.Generator, shape: tuple[int, int], px_per_m: float) -> Image:
-        tile_px = max(2, round(tile_m * px_per_m))
-        rows, columns = -(-shape[0] // tile_px), -(-shape[1] // tile_px)
-        tones = 1.0 + contrast * rng.standard_normal((rows, columns), dtype=np.float32)
-        tone = np.repeat(np.repeat(tones, tile_px, axis=0), tile_px, axis=1)[: shape[0], : shape[1]].copy()
-        tone += 0.06 * smooth_noise(rng, shape, 0.04 * px_per_m) + 0.05 * smooth_noise(rng, shape, 0.15 * px_per_m)
-        tone += 0.05 * rng.standard_normal(shape, dtype=np.float32)
-        for _ in range(rng.poisson(0.25 * shape[0] * shape[1] / px_per_m**2)):
-            center = (int(rng.integers(shape[1])), int(rng.integers(shape[0])))
-            axes = (max(1, int(rng.uniform(0.03, 0.12) * px_per_m)), max(1, int(rng.uniform(0.02, 0.08) * px_per_m)))
-            cv2.ellipse(tone, center, axes, float(rng.uniform(0, 180)), 0, 360, float(rng.uniform(0.6, 0.85)), -1, cv2.LINE_AA)
-        return tint(color, tone)
-
-    return paint
+    tile_px = max(2, round(tile_m * px_per_m))
+    rows, columns = -(-shape[0] // tile_px), -(-shape[1] // tile_px)
+    tones = 1.0 + contrast * rng.standard_normal((rows, columns), dtype=np.float32)
+    tone = np.repeat(np.repeat(tones, tile_px, axis=0), tile_px, axis=1)[: shape[0], : shape[1]].copy()
+    tone += 0.06 * smooth_noise(rng, shape, 0.04 * px_per_m) + 0.05 * smooth_noise(rng, shape, 0.15 * px_per_m)
+    tone += 0.05 * rng.standard_normal(shape, dtype=np.float32)
+    for _ in range(rng.poisson(0.25 * shape[0] * shape[1] / px_per_m**2)):
+        center = (int(rng.integers(shape[1])), int(rng.integers(shape[0])))
+        axes = (max(1, int(rng.uniform(0.03, 0.12) * px_per_m)), max(1, int(rng.uniform(0.02, 0.08) * px_per_m)))
+        cv2.ellipse(tone, center, axes, float(rng.uniform(0, 180)), 0, 360, float(rng.uniform(0.6, 0.85)), -1, cv2.LINE_AA)
+    return tint(color, tone)
 
 
-def wood(color: Color = (150, 108, 70), *, plank_m: float = 0.0) -> Paint:
+@material
+def wood(rng: Rng, shape: Shape, px_per_m: float, color: Color = (150, 108, 70), *, plank_m: float = 0.0) -> Image:
     """Wood with its grain along the surface's `along`; with `plank_m` laid in planks of that width."""
-
-    def paint(rng: np.random.Generator, shape: tuple[int, int], px_per_m: float) -> Image:
-        stretched = smooth_noise(rng, (shape[0], max(2, shape[1] // 12)), 0.02 * px_per_m)
-        grain = cv2.resize(stretched, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
-        rings = np.sin(4.0 * smooth_noise(rng, shape, 0.35 * px_per_m) + 2.0 * grain)
-        tone = 1.0 + 0.09 * grain + 0.06 * rings
-        if plank_m > 0.0:
-            plank_px = max(2, round(plank_m * px_per_m))
-            rows = -(-shape[0] // plank_px)
-            tones = 1.0 + 0.10 * rng.standard_normal(rows).astype(np.float32)
-            tone *= np.repeat(tones, plank_px)[: shape[0], None]
-            tone[::plank_px] *= 0.6
-            for row in range(rows):
-                joint = int(rng.integers(0, max(1, round(1.6 * px_per_m))))
-                tone[row * plank_px : (row + 1) * plank_px, joint :: max(2, round(1.6 * px_per_m))] *= 0.6
-        return tint(color, tone.astype(np.float32))
-
-    return paint
+    stretched = smooth_noise(rng, (shape[0], max(2, shape[1] // 12)), 0.02 * px_per_m)
+    grain = cv2.resize(stretched, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
+    rings = np.sin(4.0 * smooth_noise(rng, shape, 0.35 * px_per_m) + 2.0 * grain)
+    tone = 1.0 + 0.09 * grain + 0.06 * rings
+    if plank_m > 0.0:
+        plank_px = max(2, round(plank_m * px_per_m))
+        rows = -(-shape[0] // plank_px)
+        tones = 1.0 + 0.10 * rng.standard_normal(rows).astype(np.float32)
+        tone *= np.repeat(tones, plank_px)[: shape[0], None]
+        tone[::plank_px] *= 0.6
+        for row in range(rows):
+            joint = int(rng.integers(0, max(1, round(1.6 * px_per_m))))
+            tone[row * plank_px : (row + 1) * plank_px, joint :: max(2, round(1.6 * px_per_m))] *= 0.6
+    return tint(color, tone.astype(np.float32))
 
 
-def bricks(color: Color = (156, 82, 62), mortar: Color = (178, 170, 160)) -> Paint:
+@material
+def bricks(rng: Rng, shape: Shape, px_per_m: float, color: Color = (156, 82, 62), mortar: Color = (178, 170, 160)) -> Image:
     """A brick wall, every brick with its own tone."""
-
-    def paint(rng: np.random.Generator, shape: tuple[int, int], px_per_m: float) -> Image:
-        image = np.full((*shape, 3), mortar, dtype=np.uint8)
-        height, width = max(3, round(0.077 * px_per_m)), max(6, round(0.25 * px_per_m))
-        gap = max(1, round(0.012 * px_per_m))
-        for row, top in enumerate(range(0, shape[0], height)):
-            for left in range(-(row % 2) * width // 2, shape[1], width):
-                shade = tuple(int(c * rng.uniform(0.72, 1.15)) for c in color)
-                cv2.rectangle(image, (left, top), (left + width - gap - 1, top + height - gap - 1), shade, -1)
-        tone = 1.0 + 0.05 * rng.standard_normal(shape, dtype=np.float32)
-        return np.clip(image * tone[..., None], 0, 255).astype(np.uint8)
-
-    return paint
+    image = np.full((*shape, 3), mortar, dtype=np.uint8)
+    height, width = max(3, round(0.077 * px_per_m)), max(6, round(0.25 * px_per_m))
+    gap = max(1, round(0.012 * px_per_m))
+    for row, top in enumerate(range(0, shape[0], height)):
+        for left in range(-(row % 2) * width // 2, shape[1], width):
+            shade = tuple(int(c * rng.uniform(0.72, 1.15)) for c in color)
+            cv2.rectangle(image, (left, top), (left + width - gap - 1, top + height - gap - 1), shade, -1)
+    tone = 1.0 + 0.05 * rng.standard_normal(shape, dtype=np.float32)
+    return np.clip(image * tone[..., None], 0, 255).astype(np.uint8)
 
 
-def ceiling_tiles(color: Color = (226, 224, 216)) -> Paint:
+@material
+def ceiling_tiles(rng: Rng, shape: Shape, px_per_m: float, color: Color = (226, 224, 216)) -> Image:
     """A suspended ceiling: tiles of 60 cm, seams, pinholes."""
-
-    def paint(rng: np.random.Generator, shape: tuple[int, int], px_per_m: float) -> Image:
-        tone = 1.0 - 0.10 * (rng.random(shape, dtype=np.float32) > 0.985)
-        tile_px = max(2, round(0.6 * px_per_m))
-        tones = 1.0 + 0.012 * rng.standard_normal((-(-shape[0] // tile_px), -(-shape[1] // tile_px)), dtype=np.float32)
-        tone = tone * np.repeat(np.repeat(tones, tile_px, axis=0), tile_px, axis=1)[: shape[0], : shape[1]]
-        tone[::tile_px] *= 0.8
-        tone[:, ::tile_px] *= 0.8
-        return tint(color, tone.astype(np.float32))
-
-    return paint
+    tone = 1.0 - 0.10 * (rng.random(shape, dtype=np.float32) > 0.985)
+    tile_px = max(2, round(0.6 * px_per_m))
+    tones = 1.0 + 0.012 * rng.standard_normal((-(-shape[0] // tile_px), -(-shape[1] // tile_px)), dtype=np.float32)
+    tone = tone * np.repeat(np.repeat(tones, tile_px, axis=0), tile_px, axis=1)[: shape[0], : shape[1]]
+    tone[::tile_px] *= 0.8
+    tone[:, ::tile_px] *= 0.8
+    return tint(color, tone.astype(np.float32))
 
 
-def fabric(color: Color) -> Paint:
+@material
+def fabric(rng: Rng, shape: Shape, px_per_m: float, color: Color) -> Image:
     """Woven cloth with a stripe or two."""
-
-    def paint(rng: np.random.Generator, shape: tuple[int, int], px_per_m: float) -> Image:
-        tone = 1.0 + 0.05 * rng.standard_normal(shape, dtype=np.float32) + 0.06 * smooth_noise(rng, shape, 0.1 * px_per_m)
-        return tint(color, tone)
-
-    return paint
+    tone = 1.0 + 0.05 * rng.standard_normal(shape, dtype=np.float32) + 0.06 * smooth_noise(rng, shape, 0.1 * px_per_m)
+    return tint(color, tone)
 
 
-def metal(color: Color = (150, 154, 158), *, drawers: int = 0) -> Paint:
+@material
+def metal(rng: Rng, shape: Shape, px_per_m: float, color: Color = (150, 154, 158), *, drawers: int = 0) -> Image:
     """Sheet metal, with drawers, handles and name plates where `drawers` > 0."""
-
-    def paint(rng: np.random.Generator, shape: tuple[int, int], px_per_m: float) -> Image:
-        image = tint(color, 1.0 + 0.02 * smooth_noise(rng, shape, 0.2 * px_per_m))
-        dark = vary(rng, (70, 72, 76), 10)
-        for index in range(drawers):
-            top, bottom = index * shape[0] // drawers, (index + 1) * shape[0] // drawers - 1
-            cv2.rectangle(image, (1, top + 1), (shape[1] - 2, bottom), dark, 1)
-            middle, row = shape[1] // 2, top + (bottom - top) // 4
-            half = max(2, shape[1] // 8)
-            cv2.rectangle(image, (middle - half, row), (middle + half, row + max(1, round(0.02 * px_per_m))), dark, -1)
-            if rng.random() < 0.7:
-                plate = vary(rng, (225, 220, 190), 25)
-                low = row + round(0.04 * px_per_m)
-                cv2.rectangle(image, (middle - half // 2, low), (middle + half // 2, low + round(0.03 * px_per_m)), plate, -1)
-        return image
-
-    return paint
+    image = tint(color, 1.0 + 0.02 * smooth_noise(rng, shape, 0.2 * px_per_m))
+    dark = vary(rng, (70, 72, 76), 10)
+    for index in range(drawers):
+        top, bottom = index * shape[0] // drawers, (index + 1) * shape[0] // drawers - 1
+        cv2.rectangle(image, (1, top + 1), (shape[1] - 2, bottom), dark, 1)
+        middle, row = shape[1] // 2, top + (bottom - top) // 4
+        half = max(2, shape[1] // 8)
+        cv2.rectangle(image, (middle - half, row), (middle + half, row + max(1, round(0.02 * px_per_m))), dark, -1)
+        if rng.random() < 0.7:
+            plate = vary(rng, (225, 220, 190), 25)
+            low = row + round(0.04 * px_per_m)
+            cv2.rectangle(image, (middle - half // 2, low), (middle + half // 2, low + round(0.03 * px_per_m)), plate, -1)
+    return image
