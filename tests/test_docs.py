@@ -6,9 +6,15 @@ import re
 import shlex
 import subprocess
 import sys
+import typing
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+
+from hybridmap.config import Config
+from hybridmap.config.section import Section
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -111,6 +117,38 @@ def test_every_place_that_the_paper_page_names_exists() -> None:
         source = (ROOT / "hybridmap" / file).read_text()
         for part in name.split("."):
             assert re.search(rf"\b(class|def) {part}\b|\b{part}\b\s*[:=]", source), f"{file}: {name}"
+
+
+def in_code(page: Path) -> str:
+    """What stands between back-ticks on a page, and its blocks."""
+    text = page.read_text()
+    return "\n".join([*re.findall(r"`([^`\n]+)`", text), *(block for _, block in blocks(page))])
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CHANGELOG.md"], ids=lambda page: page.name)
+def test_every_file_that_is_named_exists(page: Path) -> None:
+    for name in re.findall(r"[\w/-]+\.py\b", in_code(page)):
+        assert (ROOT / name).is_file() or list((ROOT / "hybridmap").rglob(name)), name
+
+
+def names_of(section: type[Section], above: str = "") -> Iterator[str]:
+    """Dotted names of the sections and settings of a section."""
+    for name, field in section.model_fields.items():
+        yield f"{above}{name}"
+        for inner in (field.annotation, *typing.get_args(field.annotation)):
+            if isinstance(inner, type) and issubclass(inner, Section):
+                yield from names_of(inner, f"{above}{name}.")
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CHANGELOG.md"], ids=lambda page: page.name)
+def test_every_setting_that_is_named_exists(page: Path) -> None:
+    known = set(names_of(Config))
+    sections = "|".join(Config.model_fields)
+    shown_as_unknown = {"nodes.distance"}
+    for name in re.findall(rf"(?<![\w./*-])(?:{sections})(?:\.[a-z]\w*)+", in_code(page)):
+        package, _, rest = name.partition(".")
+        python = package in ("backends", "vision") and hasattr(import_module(f"hybridmap.{package}"), rest.partition(".")[0])
+        assert python or name in known | shown_as_unknown, name
 
 
 def test_every_table_and_column_of_the_map_file_is_described() -> None:
