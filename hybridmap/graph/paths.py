@@ -101,28 +101,17 @@ def chain_of(graph: PoseGraph, poses: Array | None = None) -> Chain:
     return Chain(poses, grown, np.setdiff1d(np.arange(1, graph.n_nodes), links.high[steps]))
 
 
-def relative_covariances(graph: PoseGraph, node: int) -> Array:
-    """Covariance of every node relative to `node`, right perturbation in each node's own frame.
+def covariances_from(graph: PoseGraph) -> Callable[[int], Array]:
+    """Covariances of every node relative to one, for each node that is asked for, computed once; what they share, at the first.
 
     Edges that join the same two nodes count together: a registration that is loose along a corridor and the odometry beside
     it, which knows no heading, hold each other. Paths are shortest in the trace of the position covariance; along a path
     the covariances, taken as independent, are carried to the end by adjoints (as `geometry.compose_relative` does for two).
 
-    Args:
-        graph: the measurements.
-        node: the reference; its own covariance is zero.
-
     Returns:
-        (N, 3, 3) m^2 and rad^2; infinite on the diagonal for a node that no path reaches.
-
-    Raises:
-        GraphError: `node` does not exist.
+        From a node to (N, 3, 3) m^2 and rad^2, right perturbation in each node's own frame: zero for the node itself, infinite
+        on the diagonal for a node that no path reaches. It raises GraphError where the node does not exist.
     """
-    return covariances_from(graph)(node)
-
-
-def covariances_from(graph: PoseGraph) -> Callable[[int], Array]:
-    """`relative_covariances` of each node that is asked for, once; what they share is computed at the first question."""
     links = cache(lambda: _links(graph))
 
     def from_node(node: int) -> Array:

@@ -105,7 +105,7 @@ class _Worker:
         self.connection, theirs = context.Pipe()
         self.index: int | None = None
         self._process = context.Process(target=_serve, args=(theirs, work), daemon=True)
-        with _one_thread_for_children():
+        with one_thread_for_children():
             self._process.start()
         theirs.close()
 
@@ -157,7 +157,8 @@ def _attempt(work: Callable[[Task], Outcome], task: Task) -> Outcome | Lost:
 
 
 @contextlib.contextmanager
-def _one_thread_for_children() -> Iterator[None]:
+def one_thread_for_children() -> Iterator[None]:
+    """Let processes started meanwhile use one thread for matrix products: there are as many processes as cores."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:

@@ -92,11 +92,6 @@ class PlaceMaps:
         """Share of the cells with exactly one field."""
         return float((self.fields == 1).mean()) if len(self.fields) else float("nan")
 
-    @property
-    def multiple(self) -> float:
-        """Share of the cells with more than one field."""
-        return float((self.fields > 1).mean()) if len(self.fields) else float("nan")
-
 
 @dataclass(frozen=True, slots=True)
 class PlaceResult:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +15,7 @@ import numpy as np
 from hybridmap.config.mapping import NeuralConfig
 from hybridmap.errors import ConfigError
 from hybridmap.neural import PathIntegrator
+from hybridmap.study.pools import one_thread_for_children
 from hybridmap.verification import path_error, rate_maps, shadow
 from hybridmap.verification.path_error import HeadDirectionResult, PathErrors, StandstillResult
 from hybridmap.verification.rate_maps import LatticeMaps, PlaceResult
@@ -168,7 +168,10 @@ def _run(
             progress(number, len(tasks))
             done[key] = function(*arguments)
         return done
-    with _one_thread_each(), ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_be_quiet) as pool:
+    with (
+        one_thread_for_children(),
+        ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_be_quiet) as pool,
+    ):
         running: dict[tuple[Any, ...], Future[Any]] = {
             key: pool.submit(function, *arguments) for key, (function, arguments) in tasks.items()
         }
@@ -176,22 +179,6 @@ def _run(
             progress(number, len(tasks))
             done[key] = future.result()
     return done
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Let processes started meanwhile use one thread for matrix products: there are as many processes as cores."""
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def _be_quiet() -> None:

@@ -8,7 +8,7 @@ import pytest
 from hybridmap.errors import GraphError
 from hybridmap.geometry import RelativePose, compose, compose_relative, invert_relative
 from hybridmap.graph.edges import EdgeKind
-from hybridmap.graph.paths import chain_of, covariances_from, relative_covariances
+from hybridmap.graph.paths import chain_of, covariances_from
 from hybridmap.graph.pose_graph import PoseGraph
 
 
@@ -33,7 +33,7 @@ def edge(graph, number, turned=False):
 
 def test_a_chain_is_the_chain_of_its_edges_in_both_directions():
     graph = graph_of([(0, 1), (2, 1), (2, 3), (3, 4)], np.random.default_rng(0), 5)
-    found = relative_covariances(graph, 1)
+    found = covariances_from(graph)(1)
     there = compose_relative(compose_relative(edge(graph, 1, turned=True), edge(graph, 2)), edge(graph, 3))
     assert np.allclose(found[4], there.covariance)
     assert np.allclose(found[0], edge(graph, 0, turned=True).covariance)
@@ -45,8 +45,8 @@ def test_the_surer_of_two_ways_counts():
     information = graph.information.copy()
     information[3] *= 1e4
     sure = PoseGraph(graph.initial, graph.sources, graph.targets, graph.deltas, information, graph.kinds, graph.edge_ids)
-    assert np.allclose(relative_covariances(sure, 0)[3], edge(sure, 3).covariance)
-    assert np.allclose(relative_covariances(sure, 3)[0], edge(sure, 3, turned=True).covariance)
+    assert np.allclose(covariances_from(sure)(0)[3], edge(sure, 3).covariance)
+    assert np.allclose(covariances_from(sure)(3)[0], edge(sure, 3, turned=True).covariance)
 
 
 def test_edges_of_the_same_two_nodes_hold_each_other():
@@ -64,8 +64,8 @@ def test_edges_of_the_same_two_nodes_hold_each_other():
         edge_ids=np.arange(2),
     )
     both = np.linalg.inv(np.linalg.inv(loose) + np.linalg.inv(blind)).astype(np.float64)
-    assert np.allclose(relative_covariances(graph, 0)[1], both)
-    assert np.allclose(relative_covariances(graph, 1)[0], invert_relative(RelativePose(delta, both)).covariance)
+    assert np.allclose(covariances_from(graph)(0)[1], both)
+    assert np.allclose(covariances_from(graph)(1)[0], invert_relative(RelativePose(delta, both)).covariance)
 
 
 def test_every_covariance_is_one_on_a_large_graph_and_growth_is_that_of_the_path():
@@ -73,9 +73,9 @@ def test_every_covariance_is_one_on_a_large_graph_and_growth_is_that_of_the_path
     n = 3000
     pairs = [(i - 1, i) for i in range(1, n)] + [(int(i), int(j)) for i, j in rng.integers(0, n, (1500, 2)) if i != j]
     graph = graph_of(pairs, rng, n)
-    relative_covariances(graph, 0)
+    covariances_from(graph)(0)
     started = time.process_time()
-    found = relative_covariances(graph, 1234)
+    found = covariances_from(graph)(1234)
     assert time.process_time() - started < 0.2
     assert np.linalg.eigvalsh(np.delete(found, 1234, axis=0)).min() > 0
     assert np.allclose(found, found.transpose(0, 2, 1))
@@ -83,7 +83,7 @@ def test_every_covariance_is_one_on_a_large_graph_and_growth_is_that_of_the_path
 
 def test_a_node_out_of_reach_is_infinitely_uncertain():
     graph = graph_of([(0, 1), (2, 3)], np.random.default_rng(0), 4)
-    found = relative_covariances(graph, 0)
+    found = covariances_from(graph)(0)
     assert np.all(np.isinf(np.diagonal(found[2:], axis1=1, axis2=2)))
     assert np.isfinite(found[:2]).all()
 
@@ -92,13 +92,13 @@ def test_every_node_is_asked_of_one_graph_and_once():
     graph = graph_of([(0, 1), (1, 2), (2, 3), (0, 3)], np.random.default_rng(1), 4)
     from_node = covariances_from(graph)
     for node in range(4):
-        assert np.array_equal(from_node(node), relative_covariances(graph, node))
+        assert np.array_equal(from_node(node), covariances_from(graph)(node))
         assert from_node(node) is from_node(node)
 
 
 def test_an_unknown_node_is_refused():
     with pytest.raises(GraphError, match="node 9"):
-        relative_covariances(graph_of([(0, 1)], np.random.default_rng(0), 2), 9)
+        covariances_from(graph_of([(0, 1)], np.random.default_rng(0), 2))(9)
 
 
 def test_the_way_between_two_nodes_of_a_chain_is_that_along_its_edges():
@@ -107,7 +107,7 @@ def test_the_way_between_two_nodes_of_a_chain_is_that_along_its_edges():
     first, second = np.array([0, 1, 2, 3]), np.array([4, 3, 4, 0])
     ways = chain.ways(first, second)
     for delta, covariance, source, target in zip(ways.delta, ways.covariance, first, second, strict=True):
-        assert np.allclose(covariance, relative_covariances(graph, source)[target])
+        assert np.allclose(covariance, covariances_from(graph)(source)[target])
         assert np.allclose(compose(chain.poses[source], delta), chain.poses[target])
     assert np.allclose(compose(chain.poses[3], graph.deltas[3]), chain.poses[4])
 
