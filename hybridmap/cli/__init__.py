@@ -1,4 +1,4 @@
-"""The command line: a command a file, each one parse -> call the library -> show."""
+"""The command line: one file per command. Each parses its options, calls the library and shows the result."""
 
 from hybridmap.cli.app import main
 

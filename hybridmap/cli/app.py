@@ -46,8 +46,8 @@ def _show_version(wanted: bool) -> None:
 @app.callback()
 def _options(
     context: typer.Context,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens, on standard error.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress bars, no log below errors.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log progress to standard error.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress bars, and log errors only.")] = False,
     _version: Annotated[
         bool, typer.Option("--version", help="Show the version and exit.", callback=_show_version, is_eager=True)
     ] = False,
@@ -98,7 +98,7 @@ def main() -> None:
 
 
 def _refuse_empty(arguments: Sequence[str]) -> None:
-    """An empty path would be taken for the folder that one is in."""
+    """Refuse an empty argument: as a path it would mean the current folder."""
     for before, argument in zip(("", *arguments), arguments, strict=False):
         option, given, value = argument.partition("=") if argument.startswith("--") else (before, "=", argument)
         if given and not value:
@@ -106,7 +106,7 @@ def _refuse_empty(arguments: Sequence[str]) -> None:
             if argument and not known:
                 continue  # a flag, or no option at all: refused when it is read
             name = option if known else "an argument"
-            raise ConfigError(f"{name}: found nothing, expected a value")
+            raise ConfigError(f"{name}: the value is empty; expected a value")
 
 
 def _options_with_values() -> set[str]:

@@ -1,4 +1,4 @@
-"""`hybridmap calibrate`: odometry gains from the closed loops of sessions, or from a reference."""
+"""`hybridmap calibrate`: the systematic errors of odometry, from loop closures or a reference trajectory."""
 
 from __future__ import annotations
 
@@ -12,28 +12,31 @@ import typer
 def calibrate(
     folders: Annotated[
         list[Path],
-        typer.Argument(metavar="DIR...", help="Session folder; several of one robot (or kind of robot) are fitted together."),
+        typer.Argument(metavar="DIR...", help="Session folder. Several sessions of one robot give one joint estimate."),
     ],
     reference: Annotated[
         list[Path] | None,
-        typer.Option(metavar="GT.tum", help="True trajectory of base_link, one a session, in the same order."),
+        typer.Option(metavar="GT.tum", help="Ground truth of base_link (TUM format), one per session, in the same order."),
     ] = None,
     estimator: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Without a reference: `alternating` (default) or `joint`.")
+        str | None, typer.Option(metavar="NAME", help="Method if no reference is given: `alternating` (default) or `joint`.")
     ] = None,
     leg: Annotated[
         float | None,
-        typer.Option(help="Length of the compared legs, m, 0.1 or more; not with `joint`. Default: by the drive, 1 to 16."),
+        typer.Option(
+            help="Length of the compared legs, m (>= 0.1; not with `joint`). Default: 1 to 16 m, chosen from the drive."
+        ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE.yaml", help="Write the session's configuration with the gains.")
+        Path | None, typer.Option(metavar="FILE.yaml", help="Write the session's configuration with the estimate to this file.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Linear gain, turn gain and heading bias (rad/m) of odometry, with standard deviations.
+    """Estimate the systematic errors of wheel odometry: gain, turn gain, heading bias (rad/m), with standard deviations.
 
-    What is written differs from the configuration in use only if the estimate does, by more than three sigma.
+    The estimate comes from the loop closures of the sessions, or from reference trajectories if they are given.
+    --out writes a configuration with the estimate. A value within three standard deviations of the present one is kept.
     """
     from hybridmap.calibration.estimate import calibrated, changes, metrics_of, verdict
     from hybridmap.calibration.sessions import common_tree, estimate_of, read_drive, require_options

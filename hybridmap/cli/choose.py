@@ -1,4 +1,4 @@
-"""From a source and the options of a command to the stream and the resolved configuration."""
+"""Open a source and choose its configuration, from the options of a command."""
 
 from __future__ import annotations
 
@@ -47,7 +47,9 @@ def choose(
     start_s: float | None = None,
     end_s: float | None = None,
 ) -> Chosen:
-    """Open a source with its configuration; without `--config` the world's name or the sensors found choose it.
+    """Open a source and load its configuration.
+
+    Without a configuration name, a simulated world uses its own configuration, and a recording that of the first sensor found.
 
     Raises:
         StreamError: the source cannot be opened.
@@ -67,7 +69,7 @@ def choose(
 
 
 def _config_for(rig: Rig, overrides: Mapping[str, Any]) -> Config:
-    """The configuration that comes with the first kind of sensor found; its defaults where none does."""
+    """The configuration named after the first kind of sensor found; the defaults if there is no sensor."""
     for kind, _ in carried(rig):
         return Config.load(kind.name if kind.name in named_configs() else None, overrides)
     return Config.load(None, {**overrides, "vision.sensor": "none"})

@@ -1,4 +1,4 @@
-"""`hybridmap compare`: one graph through several back-ends, one table, one referee."""
+"""`hybridmap compare`: solve one graph with several back-ends and show the results in one table."""
 
 from __future__ import annotations
 
@@ -21,35 +21,46 @@ _ERRORS = {"ate_rmse": "ATE (m)", "relation_trans_mean": "relations (m)", "relat
 
 
 def compare(
-    source: Annotated[Path, typer.Argument(metavar="DIR_OR_GRAPH", help="A session folder, or a planar g2o or TORO file.")],
+    source: Annotated[Path, typer.Argument(metavar="DIR_OR_GRAPH", help="Session folder, or planar g2o or TORO file.")],
     backends: Annotated[str, typer.Option(metavar="A,B,...", help="Back-ends, separated by commas.")] = _DEFAULT,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write maps.png and comparison.html here.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a comparison that is there.")] = False,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for maps.png and comparison.html.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing comparison.")] = False,
     batch: Annotated[
         bool,
-        typer.Option("--batch", help="Solve the graph whole, from dead reckoning or the poses of the file; files: default."),
+        typer.Option(
+            "--batch",
+            help="Solve the whole graph at once, from dead reckoning or from the poses in the file. Default for files.",
+        ),
     ] = False,
     incremental: Annotated[
         bool,
         typer.Option(
-            "--incremental", help="Replay the graph node by node, as while driving. Session folders: both, by default."
+            "--incremental",
+            help="Add the graph node by node, as while driving. Default for session folders: --batch and --incremental.",
         ),
     ] = False,
     reference: Annotated[
         Path | None,
-        typer.Option(metavar="GT.tum", help="Session: true trajectory of base_link; default: its own, if it has one."),
+        typer.Option(
+            metavar="GT.tum", help="Sessions only: ground truth of base_link (TUM format). Default: the session's own, if any."
+        ),
     ] = None,
     relations: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Session: verified relative poses, `t1 t2 dx dy dyaw` (s, m, rad).")
+        Path | None,
+        typer.Option(metavar="FILE", help="Sessions only: verified relative poses, lines `t1 t2 dx dy dyaw` (s, m, rad)."),
     ] = None,
-    config: Annotated[str | None, typer.Option(help="Configuration with the back-ends' settings: a name or a file.")] = None,
+    config: Annotated[
+        str | None, typer.Option(help="Configuration with the settings of the back-ends: a name or a file.")
+    ] = None,
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Compare back-ends on one frozen graph: chi2, status, iterations, CPU seconds, rejected loops, proof of
-    optimality; errors against truth (m) and relations (m) if they are known.
+    """Compare back-ends on one graph.
 
-    A session's graph goes to each back-end whole and node by node. A back-end that fails is a row that says so.
+    The table shows chi2, status, iterations, CPU seconds, rejected loops and whether the solution is proved optimal. For a
+    session with a ground truth or verified relations it also shows their errors (m).
+    A session's graph is solved in one batch and replayed incrementally, in two rows per back-end. A back-end that fails
+    keeps its row, with the reason.
     """
     from hybridmap.backends import comparison
     from hybridmap.cli.graphs import open_graph, settings_of
@@ -85,12 +96,12 @@ def _names(backends: str) -> list[str]:
 
     names = [name.strip() for name in backends.split(",") if name.strip()]
     if not names:
-        raise BackendError("--backends: found no name, expected back-ends separated by commas")
+        raise BackendError("--backends: found no name; expected names of back-ends, separated by commas")
     return names
 
 
 def _judged(opened: GraphSource, rows: Sequence[Row], reference: Path | None, relations: Path | None) -> Judged:
-    """Errors of the rows that have a map; none of a graph file."""
+    """Errors of the rows that have a map; none for a graph file."""
     from hybridmap.evaluate.session_errors import Judged, judge_solutions
 
     if not opened.is_session:
@@ -115,7 +126,7 @@ def _emit(opened: GraphSource, ways: Sequence[Way], rows: Sequence[Row], judged:
 
 
 def _ways(opened: GraphSource, *, batch: bool, incremental: bool) -> list[Way]:
-    """What was asked for; by default a session is shown in both ways, and a file, which may be large, in one."""
+    """The requested ways; by default both for a session, and batch alone for a file, which may be large."""
     from hybridmap.backends.comparison import Way
 
     asked = [way for way, given in ((Way.BATCH, batch), (Way.INCREMENTAL, incremental)) if given]
@@ -130,7 +141,7 @@ def _done(opened: GraphSource, ways: Sequence[Way]) -> str:
 
 
 def _table(rows: Sequence[Row], judged: Sequence[Metric]) -> list[list[str]]:
-    """Column titles, then a line of text a row."""
+    """Column titles, then one list of cells per row."""
     from hybridmap.report.page_tables import number
 
     by_name = {metric.name: f"{metric.value:.4f}" for metric in judged}

@@ -1,4 +1,4 @@
-"""`hybridmap demo`: renders its own world, maps it, and says what came out."""
+"""`hybridmap demo`: simulate a world, map it, and show the result."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ _SHOWN = ("nodes", "loops_accepted", "travel", "duration", "largest_correction",
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="The session folder itself.")] = Path("hybridmap-demo"),
-    world: Annotated[str, typer.Option(help="Simulated world.")] = "lab",
-    seed: Annotated[int, typer.Option(help="Seed of the drive and its noise.", min=0)] = 0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a session that is there.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+    out: Annotated[Path, typer.Option(help="Session folder to write.")] = Path("hybridmap-demo"),
+    world: Annotated[str, typer.Option(help="World to simulate.")] = "lab",
+    seed: Annotated[int, typer.Option(help="Random seed of the drive and its noise.", min=0)] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Render a world, map it with relaxation and GTSAM side by side, and write the session folder. Needs no data."""
+    """Simulate a drive, map it with relaxation and GTSAM on the same graph, and write a session folder. Needs no data."""
     from hybridmap.cli.choose import choose
     from hybridmap.cli.map import map_and_report
 

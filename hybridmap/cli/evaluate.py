@@ -1,4 +1,4 @@
-"""`hybridmap evaluate`: a session against a reference and against verified relations."""
+"""`hybridmap evaluate`: errors of a session against ground truth and verified relations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def evaluate(
         Path | None,
         typer.Option(
             metavar="GT.tum",
-            help="True trajectory of base_link (TUM format: stamp in s, position in m, quaternion); "
+            help="Ground truth of base_link (TUM format: stamp in s, position in m, quaternion); "
             "default: the session's own reference, if it has one.",
         ),
     ] = None,
@@ -26,15 +26,18 @@ def evaluate(
     ] = None,
     loops: Annotated[
         bool,
-        typer.Option("--loops", help="Also judge the candidates: how well the stored views tell places apart (needs a truth)."),
+        typer.Option(
+            "--loops", help="Also evaluate the candidates: how well the stored views tell places apart (needs ground truth)."
+        ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
 ) -> None:
-    """ATE, RPE (m, deg), drift (%), relation errors (m, deg), loop precision and recall; also put into metrics.json.
+    """Evaluate a session: ATE (m), RPE (m, deg), drift (%), relation errors (m, deg), precision and recall of loop closures.
 
-    Loop precision: share of the accepted loop edges within 1 m and 15 deg of the truth. Recall: share of the nodes that come
-    within 1 m and 30 deg of one at least 10 s older, and have a right loop edge from a node at most 3 away.
-    The page is written anew.
+    Precision: share of the accepted loops whose relative pose is within 1 m and 15 deg of the truth.
+    Recall: share of the revisits that were closed. A revisit is a node within 1 m and 30 deg of one at least 10 s older. It
+    counts as closed if a correct loop starts at most 3 nodes away.
+    The figures are printed and stored in metrics.json, and the session's page is rewritten.
     """
     from hybridmap.cli.show import emit
     from hybridmap.errors import OutputError

@@ -1,4 +1,4 @@
-"""`hybridmap explain`: why a loop was closed or not, why a node was made or not."""
+"""`hybridmap explain`: the decisions made at one node or one frame, with their reasons."""
 
 from __future__ import annotations
 
@@ -20,21 +20,24 @@ MOST_RANKED, MOST_LATER = 8, 12
 
 def explain(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Session folder, as `hybridmap map` writes it.")],
-    node: Annotated[
-        int | None, typer.Option(metavar="N", help="Explain what was decided at a node, 0 being the first.")
-    ] = None,
+    node: Annotated[int | None, typer.Option(metavar="N", help="Explain the decisions at this node; 0 is the first.")] = None,
     frame: Annotated[
         float | None,
-        typer.Option(metavar="T", help="Explain an instant: seconds since the start of the recording, or a stamp."),
+        typer.Option(
+            metavar="T", help="Explain the decisions at this time: seconds from the start of the recording, or a stamp."
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Why: candidates, scores against their thresholds, verdicts (m, deg), and what would have had to be different."""
+    """Explain the decisions at a node or a frame: why a node was made or not, and why each loop was closed or not.
+
+    Shows the candidates, each check with its value and limit (m, deg), the verdict, and what would have changed it.
+    """
     from hybridmap.evaluate.explain import Explainer
     from hybridmap.metrics import to_json
 
     if (node is None) == (frame is None):
-        raise ConfigError("explain: give either --node N or --frame T")
+        raise ConfigError("explain: expected either --node N or --frame T")
     with Explainer(folder) as explainer:
         instant = explainer.frame(frame) if frame is not None else None
         number = node if instant is None else instant.at_node if instant.made else None

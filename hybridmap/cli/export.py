@@ -1,4 +1,4 @@
-"""`hybridmap export`: a session for Open3D, a navigation stack or another SLAM tool."""
+"""`hybridmap export`: write a session in the format of another tool."""
 
 from __future__ import annotations
 
@@ -15,15 +15,17 @@ def export(
     format_name: Annotated[str, typer.Option("--format", metavar="F", help=f"One of: {_NAMES}.")],
     out: Annotated[Path, typer.Option(metavar="PATH", help="File to write; `grid` writes PATH.yaml and PATH.pgm.")],
     backend: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Whose poses; default: the session's primary back-end.")
+        str | None, typer.Option(metavar="NAME", help="Back-end whose poses to use. Default: the session's primary one.")
     ] = None,
-    resolution: Annotated[float, typer.Option(min=0.001, max=10.0, help="Cell of the occupancy grid, m.")] = 0.05,
-    voxel: Annotated[float, typer.Option(min=0.001, max=10.0, help="Clouds keep one point a cube of this side, m.")] = 0.02,
-    max_depth: Annotated[float, typer.Option(min=0.1, help="Depth beyond this is left out, m.")] = 5.0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
+    resolution: Annotated[float, typer.Option(min=0.001, max=10.0, help="Cell size of the occupancy grid, m.")] = 0.05,
+    voxel: Annotated[
+        float, typer.Option(min=0.001, max=10.0, help="Voxel size of point clouds, m: one point is kept per voxel.")
+    ] = 0.02,
+    max_depth: Annotated[float, typer.Option(min=0.1, help="Largest depth to use, m.")] = 5.0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
 ) -> None:
-    """Write trajectories, graphs, clouds or grids in the map frame of one back-end; m and rad."""
+    """Export trajectory, pose graph, point cloud or occupancy grid, in the map frame of one back-end; m and rad."""
     from hybridmap.cli.show import emit
     from hybridmap.export import ExportOptions, export_session
 

@@ -1,4 +1,4 @@
-"""What `optimize` and `compare` work on: a graph file, or the graph of a session."""
+"""The input of `optimize` and `compare`: a graph file, or the graph of a session."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from hybridmap.store import MapStore, SessionFolder
 
 @dataclass(frozen=True, slots=True)
 class GraphSource:
-    """A graph and where it comes from.
+    """A graph and its origin.
 
     Attributes:
         path: the file or session folder.
         graph: its nodes and accepted edges.
         is_session: whether `path` is a session folder.
-        start: what the graph's own poses are.
-        head: what a JSON object says about it.
-        carried: where the robot was carried; a file does not say.
+        start: what the graph's initial poses are, in words.
+        head: facts about the graph for the JSON output.
+        carried: where the robot was kidnapped; empty for a file.
     """
 
     path: Path
@@ -60,7 +60,7 @@ def open_graph(path: Path) -> GraphSource:
 
 
 def settings_of(source: GraphSource, config: str | None, setting: list[str] | None) -> BackendsConfig:
-    """Settings of the back-ends: of the configuration named, else of the session itself, with `--set` on top.
+    """Settings of the back-ends: from the named configuration, else from the session, with `--set` applied last.
 
     Raises:
         ConfigError: the configuration cannot be used.

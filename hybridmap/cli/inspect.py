@@ -1,4 +1,4 @@
-"""`hybridmap inspect`: what a source holds, what mapping would use, what is missing or damaged."""
+"""`hybridmap inspect`: what a recording holds and how it would be mapped."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def inspect(
     source: Source,
-    config: Annotated[str | None, typer.Option(help="Configuration to map with: a name or a file.")] = None,
+    config: Annotated[str | None, typer.Option(help="Configuration to use: a name or a file.")] = None,
     odometry_topic: Topic = None,
     scan_topic: Topic = None,
     color_topic: Topic = None,
@@ -25,9 +25,9 @@ def inspect(
     camera_info_topic: Topic = None,
     odometry_file: OdometryFile = None,
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. sensors.sync_tolerance_s=0.05.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """What a recording holds (counts, rates in Hz, spans in s), what mapping would use, what is missing or damaged."""
+    """Show what a recording holds (topics, rates in Hz, spans in s), what mapping would use, and what is missing or damaged."""
     from hybridmap.cli.choose import parse_settings
     from hybridmap.config import Config
     from hybridmap.metrics import to_json
@@ -96,7 +96,7 @@ def _show(found: Inspection) -> None:
 
 
 def _table(found: Inspection) -> list[str]:
-    """Aligned columns that are never cut, for topic names are there to be copied."""
+    """Aligned columns that are never truncated, so that topic names can be copied."""
     if not found.parts:
         return []
     rows = [("topic or file", "type", "count", "rate Hz", "from s", "for s", "longest gap s")]

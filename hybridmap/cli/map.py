@@ -1,4 +1,4 @@
-"""`hybridmap map`: a recording or a simulated world into a session folder."""
+"""`hybridmap map`: map a recording or a simulated world into a session folder."""
 
 from __future__ import annotations
 
@@ -17,25 +17,28 @@ log = logging.getLogger(__name__)
 
 def map_source(
     source: Source,
-    out: Annotated[Path, typer.Option(help="The session folder itself.")],
-    config: Annotated[str | None, typer.Option(help="Configuration: a name or a file. Default: by the sensors found.")] = None,
-    backend: Annotated[
-        list[str] | None, typer.Option(help="Back-end; repeatable, the first one drives the pose (map -> odom).")
+    out: Annotated[Path, typer.Option(help="Session folder to write.")],
+    config: Annotated[
+        str | None, typer.Option(help="Configuration: a name or a file. Default: chosen by the sensors found.")
     ] = None,
-    start: Annotated[float | None, typer.Option(help="Begin so many seconds after the first stamp.")] = None,
-    end: Annotated[float | None, typer.Option(help="End so many seconds after the first stamp.")] = None,
+    backend: Annotated[
+        list[str] | None,
+        typer.Option(help="Back-end; may be given several times. The first sets the robot's pose (map -> odom)."),
+    ] = None,
+    start: Annotated[float | None, typer.Option(help="Start this many seconds after the first stamp.")] = None,
+    end: Annotated[float | None, typer.Option(help="End this many seconds after the first stamp.")] = None,
     odometry_topic: Topic = None,
     scan_topic: Topic = None,
     color_topic: Topic = None,
     depth_topic: Topic = None,
     camera_info_topic: Topic = None,
     odometry_file: OdometryFile = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of every random draw.", min=0)] = None,
+    seed: Annotated[int | None, typer.Option(help="Random seed of the run.", min=0)] = None,
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. nodes.distance_m=0.3.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a session that is there.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Map a recording: nodes, edges, back-ends, trajectories and a page, in one session folder."""
+    """Map a recording or a simulated world. Writes the map, the trajectories and a page into one session folder."""
     from hybridmap.cli.choose import choose, parse_settings
 
     topics = sensor_settings(
@@ -57,7 +60,7 @@ def map_source(
 
 
 def map_and_report(stream: Any, config: Any, out: Path, *, overwrite: bool) -> tuple[dict[str, Any], list[Any]]:
-    """Run a session, evaluate it where the truth is known, write the page; returns head and figures of `metrics.json`."""
+    """Map, evaluate if ground truth is known, and write the page; returns head and figures of `metrics.json`."""
     from hybridmap import session
     from hybridmap.evaluate import evaluate_session
     from hybridmap.report import write_report

@@ -1,4 +1,4 @@
-"""`hybridmap optimize`: one graph through one back-end."""
+"""`hybridmap optimize`: solve one graph with one back-end."""
 
 from __future__ import annotations
 
@@ -10,19 +10,21 @@ import typer
 
 
 def optimize(
-    graph: Annotated[Path, typer.Argument(metavar="GRAPH", help="A g2o or TORO file (planar), or a session folder.")],
+    graph: Annotated[Path, typer.Argument(metavar="GRAPH", help="Planar g2o or TORO file, or session folder.")],
     backend: Annotated[
-        str, typer.Option(metavar="NAME", help="Back-end, e.g. gtsam-lm; a wrong name lists them.")
+        str, typer.Option(metavar="NAME", help="Back-end, e.g. gtsam-lm. An unknown name gives the list.")
     ] = "gtsam-lm",
-    out: Annotated[Path | None, typer.Option(metavar="FILE.g2o", help="Write the optimised graph here (m, rad).")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
-    config: Annotated[str | None, typer.Option(help="Configuration with the back-end's settings: a name or a file.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE.g2o", help="File for the optimised graph (m, rad).")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+    config: Annotated[
+        str | None, typer.Option(help="Configuration with the settings of the back-end: a name or a file.")
+    ] = None,
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Optimise a graph: chi2 before and after, status, iterations, CPU seconds, proof of optimality.
+    """Optimise a pose graph. Shows chi2 before and after, status, iterations, CPU seconds, and a proof of optimality if found.
 
-    Exit code 1, and no file, where the back-end failed, diverged or found the graph singular.
+    If the back-end fails, diverges or finds the graph singular, no file is written and the exit code is 1.
     """
     from hybridmap.backends import create
     from hybridmap.backends.comparison import Row, metrics_of

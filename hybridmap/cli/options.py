@@ -1,4 +1,4 @@
-"""Options that more than one command takes."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from typing import Annotated
 
 import typer
 
-Source = Annotated[str, typer.Argument(help="A .bag, .mcap or .db3 file, a ROS 2 bag or TUM folder, a .csv, or a world.")]
-Topic = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic to use instead of the one found.")]
-OdometryFile = Annotated[str | None, typer.Option(help="TUM folder: the odometry file to use.")]
+Source = Annotated[
+    str, typer.Argument(help="Recording (.bag, .mcap or .db3 file, ROS 2 bag folder, TUM folder, .csv) or simulated world.")
+]
+Topic = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic to use instead of the one found automatically.")]
+OdometryFile = Annotated[str | None, typer.Option(help="TUM folders only: odometry file to use.")]
 
 
 def sensor_settings(**given: str | None) -> dict[str, str]:
-    """Settings of the section `sensors`, by key, of the topics and files that were given."""
+    """The given topics and files as settings of the section `sensors`."""
     return {f"sensors.{name}": value for name, value in given.items() if value is not None}

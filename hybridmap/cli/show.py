@@ -1,4 +1,4 @@
-"""How the commands show things: tables and JSON from one list of figures, progress on standard error."""
+"""Output of the commands: tables and JSON from one list of figures, and progress on standard error."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Advance(Protocol):
-    """Called as work gets done."""
+    """Called as work progresses."""
 
     def __call__(self, done: int, total: int | None = None) -> None:
         """`done` units of `total`."""
@@ -46,7 +46,7 @@ def emit(head: dict[str, Any], metrics: Iterable[Metric], *, as_json: bool, titl
 
 
 def print_title(console: Console, title: str) -> None:
-    """Print what stands over a table, in one line however narrow the table is; nothing where it is empty."""
+    """Print the title of a table in one line, even if the table is narrower; prints nothing for an empty title."""
     from rich.text import Text
 
     if title:

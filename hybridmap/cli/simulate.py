@@ -1,4 +1,4 @@
-"""`hybridmap simulate`: a drive through a simulated world as a recording."""
+"""`hybridmap simulate`: write a drive through a simulated world as a recording."""
 
 from __future__ import annotations
 
@@ -20,20 +20,29 @@ _FORMAT_OF_SUFFIX: dict[str, Format] = {".bag": "rosbag1", ".mcap": "mcap", ".db
 
 
 def simulate(
-    world: Annotated[str, typer.Argument(help="lab, office, corridor or corridor-landmarks.")],
-    out: Annotated[Path, typer.Option(help="File or folder to write; .bag, .mcap, .db3 choose the format, else a TUM folder.")],
-    format_: Annotated[Format | None, typer.Option("--format", help="Format, whatever the suffix.")] = None,
-    config: Annotated[str | None, typer.Option(help="Configuration: a name or a file. Default: the world's own.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the sensors' errors.", min=0)] = None,
-    duration: Annotated[float | None, typer.Option(help="Stop the drive after so many seconds.")] = None,
+    world: Annotated[str, typer.Argument(help="World: lab, office, corridor or corridor-landmarks.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="File or folder to write. The suffix .bag, .mcap or .db3 chooses the format; otherwise a TUM folder."
+        ),
+    ],
+    format_: Annotated[Format | None, typer.Option("--format", help="Format to write, regardless of the suffix.")] = None,
+    config: Annotated[str | None, typer.Option(help="Configuration: a name or a file. Default: the one of the world.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Random seed of the sensor errors.", min=0)] = None,
+    duration: Annotated[float | None, typer.Option(help="Stop the drive after this many seconds.")] = None,
     kidnap: Annotated[
-        bool, typer.Option("--kidnap", help="Carry the robot 20 m (simulation.carried_m) to a known place, unseen.")
+        bool,
+        typer.Option(
+            "--kidnap",
+            help="Kidnap the robot: carry it 20 m (simulation.carried_m) to a visited place while its sensors are off.",
+        ),
     ] = False,
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. simulation.sensors=laser.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a recording that is there.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing recording.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Render a drive with wheel odometry, RGB-D camera or laser, and its ground truth, into a bag or TUM folder."""
+    """Simulate a drive with wheel odometry and an RGB-D camera or a laser. Writes a bag or TUM folder with ground truth."""
     from hybridmap.cli.choose import parse_settings
     from hybridmap.config import Config
     from hybridmap.simulation import SimulatedStream
@@ -79,14 +88,14 @@ def _figures(stream: SimulatedStream, written: dict[str, int]) -> list[Metric]:
     driven = truth.poses if carry is None else carry.felt[: len(truth)]
     rows = [
         Metric("duration/simulation", float(truth.stamps_s[-1] - truth.stamps_s[0]), "s", "length of the drive"),
-        Metric("travel/simulation", float(travel(driven)[-1]), "m", "way driven, of the ground truth"),
+        Metric("travel/simulation", float(travel(driven)[-1]), "m", "distance driven, from the ground truth"),
         Metric("ate_rmse/odometry", absolute_error(stream.odometry, truth).rmse_m, "m", "error of the wheels, SE(2)-aligned"),
     ]
     if carry is not None:
         up_s, down_s = (float(truth.stamps_s[step] - truth.stamps_s[0]) for step in (carry.first, carry.last))
         rows += [
-            Metric("carried/simulation", carry.distance_m, "m", "how far the robot was carried, in a straight line"),
-            Metric("picked_up/simulation", up_s, "s", "when, after the start of the drive"),
-            Metric("put_down/simulation", down_s, "s", "when it was on the floor again"),
+            Metric("carried/simulation", carry.distance_m, "m", "straight-line distance by which the robot was kidnapped"),
+            Metric("picked_up/simulation", up_s, "s", "time at which it was picked up, from the start of the drive"),
+            Metric("put_down/simulation", down_s, "s", "time at which it was put down, from the start of the drive"),
         ]
     return rows + [Metric(f"written/{name.strip('/')}", float(count), "1", "written") for name, count in written.items()]

@@ -1,4 +1,4 @@
-"""`hybridmap study`: sources x settings x back-ends x false loops x seeds, resumable, here or on a cluster."""
+"""`hybridmap study`: run sources x settings x back-ends x false loops x seeds, here or on a cluster."""
 
 from __future__ import annotations
 
@@ -18,19 +18,30 @@ _COLUMNS = {"false_kept": "false kept", "own_lost": "own lost", "loop_recall": "
 
 
 def study(
-    config: Annotated[str, typer.Argument(metavar="CONFIG.yaml", help="A study: a file, or the name of one that comes along.")],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Results; a study that is there is gone on with.")],
-    workers: Annotated[int, typer.Option(min=0, help="Processes of this machine, of one thread each; 0: this process.")] = 1,
+    config: Annotated[
+        str, typer.Argument(metavar="CONFIG.yaml", help="Study: a file, or the name of one that comes with hybridmap.")
+    ],
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder for the results. An existing one of the same study is continued.")
+    ],
+    workers: Annotated[
+        int, typer.Option(min=0, help="Worker processes on this machine, one thread each; 0: compute in this process.")
+    ] = 1,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="tcp://HOST:PORT", help="A Dask scheduler whose workers do it (extra `cluster`).")
+        str | None,
+        typer.Option(
+            metavar="tcp://HOST:PORT", help="Compute on the workers of this Dask scheduler (needs the extra `cluster`)."
+        ),
     ] = None,
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. seeds=3.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Run a study: errors against the truth, verified relations or the clean optimum, chi2, false loops kept, true loops
-    lost, with paired statistics over the seeds; tables and a page.
+    """Run a study: map or solve every combination of source, setting, back-end, false loops and seed; compare the back-ends.
 
-    Killed at any time, it goes on where it was. A cell that fails is a row that says so. Exit code 1 where a bar is missed.
+    Figures: error against ground truth, verified relations or the optimum without false loops; chi2; accepted false loops;
+    lost true loops. Differences between back-ends are paired by seed. Writes tables and a page.
+    An interrupted study continues when it is run again. A cell that fails keeps its row, with the reason.
+    The exit code is 1 if a figure misses a bar of the study.
     """
     _one_thread()
     from hybridmap.cli.choose import parse_settings
@@ -53,7 +64,7 @@ def study(
 
 
 def _one_thread() -> None:
-    """Pin this process's numerical libraries to one thread, as workers are; they read this when they are loaded."""
+    """Limit the numerical libraries to one thread, as in workers; they read these variables when they are imported."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"
 
@@ -81,7 +92,7 @@ def _show(done: Study) -> None:
     known = len({cell.key for cell in done.grid.cells}) - done.computed
     counts = ", ".join(f"{count} {status}" for status, count in done.head["status"].items())
     table = Table(
-        title=f"{done.head['study']}: {done.head['cells']} cells ({counts}); {known} known before", title_justify="left"
+        title=f"{done.head['study']}: {done.head['cells']} cells ({counts}); {known} computed earlier", title_justify="left"
     )
     measure, others = error_of(done), [name for name in _COLUMNS if _known(done, name)]
     table.add_column("source / setting / false loops")

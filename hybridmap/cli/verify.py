@@ -1,4 +1,4 @@
-"""`hybridmap verify`: the spatial cells against physiology and against exact integration."""
+"""`hybridmap verify`: check the path integration cells against physiology and exact integration."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import typer
 
 
 def verify(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Write verify.html and metrics.json here.")],
-    seed: Annotated[int, typer.Option(help="Seed of all drives, sampled cells and noises.", min=0)] = 0,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for verify.html and metrics.json.")],
+    seed: Annotated[int, typer.Option(help="Random seed of drives, sampled cells and noise.", min=0)] = 0,
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. neural.kernel_gain_first=1.3.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a verification that is there.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing verification.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Verify the spatial cells: a table of figures (m, rad, deg, %) against stated bars, and a page. Needs no data.
+    """Verify the head-direction, band, grid and place cells against stated bars (m, rad, deg, %). Writes a page. Needs no data.
 
-    Exit code 1 if a row misses its bar.
+    The exit code is 1 if a figure misses its bar.
     """
     from hybridmap.cli.choose import parse_settings
     from hybridmap.cli.show import emit, progress

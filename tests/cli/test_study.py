@@ -54,7 +54,7 @@ def test_a_study_is_run_and_gone_on_with(run, tmp_path, monkeypatch):
     monkeypatch.setattr(study_page, "write_study_page", lambda study: study.folder.path / PAGE)  # one page is enough
     code, printed, _ = run(*words)
     assert code == 0
-    assert "18 known before" in printed
+    assert "18 computed earlier" in printed
     assert "laps/default/aliased 30 %" in printed
     assert (out / "cells.csv").read_bytes() == before
     code, printed, _ = run(*words, "--set", "seeds=[3]")
