@@ -1,4 +1,4 @@
-"""How well the views of a session tell its places apart: from the profiles that it stored, or made again from its keyframes.
+"""How well the views of a session tell its places apart: from the profiles that it stored.
 
 Two nodes show *the same* place when they lie within `same_m` and `same_deg` of each other, *different* ones when they lie
 beyond `other_m` or `other_deg`; pairs between the two are not judged. Only nodes at least `gap_s` older count.
@@ -6,7 +6,7 @@ beyond `other_m` or `other_deg`; pairs between the two are not judged. Only node
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -125,35 +125,30 @@ def judge_pairs(
     return Truth(queries, same, different)
 
 
-def score_matrix(profiles: Sequence[Profile], queries: Indices, readings: Sequence[Reading]) -> list[Array]:
-    """Scores of views against all older ones, for readings that share the profiles.
+def score_matrix(profiles: Sequence[Profile], queries: Indices, reading: Reading) -> Array:
+    """Scores of views against all older ones.
 
     Args:
         profiles: of all nodes, (bands, width) each.
         queries: (Q,) the views, ascending.
-        readings: how to score; their largest shifts, and whether they are circular, must be one and the same.
+        reading: how to score.
 
     Returns:
-        For each reading (Q, N), smaller for a better match; infinite where a node is not older than the view.
+        (Q, N), smaller for a better match; infinite where a node is not older than the view.
     """
-    store = ProfileStore(readings[0].max_shift, readings[0].circular)
+    store = ProfileStore(reading.max_shift, reading.circular)
     for profile in profiles:
         store.add(profile)
-    wanted = _with_predecessors(queries, max(reading.sequence for reading in readings))
-    rows = [np.full((len(wanted), len(profiles)), np.inf) for _ in readings]
+    wanted = _with_predecessors(queries, reading.sequence)
+    rows = np.full((len(wanted), len(profiles)), np.inf)
     for at, number in enumerate(wanted):
-        if number == 0:
-            continue
-        g = store.differences(profiles[number], np.arange(number))
-        for row, r in zip(rows, readings, strict=True):
-            weights = band_weights(g.shape[1], r.mu_r, r.mu_d)
-            row[at, :number] = combine(g, store.shifts, r.mode, weights, r.g_bar)[0]
+        if number > 0:
+            g = store.differences(profiles[number], np.arange(number))
+            weights = band_weights(g.shape[1], reading.mu_r, reading.mu_d)
+            rows[at, :number] = combine(g, store.shifts, reading.mode, weights, reading.g_bar)[0]
     row_of = {int(number): at for at, number in enumerate(wanted)}
-    out = []
-    for row, r in zip(rows, readings, strict=True):
-        ordered = [_sequence(row, row_of, int(number), r) for number in queries]
-        out.append(np.stack(ordered) if ordered else np.zeros((0, len(profiles))))
-    return out
+    out = [_sequence(rows, row_of, int(number), reading) for number in queries]
+    return np.stack(out) if out else np.zeros((0, len(profiles)))
 
 
 def candidate_errors(scores: Array, truth: Truth) -> CandidateErrors:
@@ -218,24 +213,6 @@ def _average_precision(precision: Array, recall: Array) -> float:
     return float(np.sum(np.diff(recall, prepend=0.0) * precision))
 
 
-def all_readings(max_shift: int = 16) -> Iterable[tuple[str, int, Reading]]:
-    """Name, row bands (1 or 4) and reading of every mode: the seed's, RGB, depth, both, four bands, sequences."""
-    seed: tuple[Mode, ...] = ("literal", "ratio", "signed", "plain")
-    for mode in seed:
-        yield mode, 1, Reading(mode, max_shift=max_shift)
-    for name, mu_r in (("RGB", 1.0), ("depth", 0.0)):
-        yield f"plain, {name}", 1, Reading("plain", mu_r, 1.0 - mu_r, max_shift)
-    yield "four-band", 4, Reading("four-band", max_shift=max_shift)
-    for name, mu_r in (("RGB", 1.0), ("depth", 0.0)):
-        yield f"four-band, {name}", 4, Reading("four-band", mu_r, 1.0 - mu_r, max_shift)
-    for bands, sequenced in ((1, "plain"), (4, "four-band")):
-        mode = "plain" if sequenced == "plain" else "four-band"
-        yield f"{sequenced}, 5 in a row", bands, Reading(mode, max_shift=max_shift, sequence=5)
-
-
-Progress = Callable[[int, int | None], None]
-
-
 @dataclass(frozen=True, slots=True)
 class ViewSettings:
     """What of a session its profiles and their comparison depend on; `circular`: its laser sees all around."""
@@ -243,7 +220,6 @@ class ViewSettings:
     profile: ProfileConfig
     matching: MatchingConfig
     mode: Mode
-    max_width_px: int
     circular: bool
 
 
@@ -281,51 +257,8 @@ def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
         circular,
     )
     pairs = judge_pairs(stamps, truth, FROM_ANY_SIDE if circular else DEFAULT_LIMITS)
-    errors = candidate_errors(score_matrix(profiles, pairs.queries, [reading])[0], pairs)
+    errors = candidate_errors(score_matrix(profiles, pairs.queries, reading), pairs)
     return candidate_metrics(mode, errors)
-
-
-def every_mode(
-    folder: Path, reference: Path | None = None, progress: Progress | None = None
-) -> Iterator[tuple[str, CandidateErrors]]:
-    """Judge every mode on the frames of a session, with its own sizes of profiles and shifts; of a laser: as fan and circle.
-
-    Yields:
-        Name of the mode, and its figures.
-
-    Raises:
-        StoreError: no session there.
-        EvaluationError: no truth, or neither frames nor scans.
-    """
-    truth = truth_of(folder, reference)
-    named = list(all_readings())
-    with MapStore.open(folder) as store:
-        settings, stamps = view_settings(store), node_stamps(store)
-        stored = stored_profiles(store)
-        if not stored or len(stored[0]) == 1:
-            yield from _modes_of_ranges(store, settings, stamps, truth)
-            return
-        pairs = judge_pairs(stamps, truth)
-        for bands in (1, 4):
-            profiles = profiles_again(store, settings, bands, len(stamps), progress)
-            readings = [(name, reading) for name, of, reading in named if of == bands]
-            rows = score_matrix(profiles, pairs.queries, [reading for _, reading in readings])
-            for (name, _), row in zip(readings, rows, strict=True):
-                yield name, candidate_errors(row, pairs)
-
-
-def _modes_of_ranges(
-    store: MapStore, settings: ViewSettings, stamps: np.ndarray[Any, np.dtype[np.int64]], truth: Trajectory
-) -> Iterator[tuple[str, CandidateErrors]]:
-    profiles = stored_profiles(store)
-    if not profiles:
-        raise EvaluationError(f"{store.path}: its nodes hold no views: there are no candidates to judge")
-    for circular in (False, True) if settings.circular else (False,):
-        pairs = judge_pairs(stamps, truth, FROM_ANY_SIDE if circular else DEFAULT_LIMITS)
-        readings = [Reading("plain", max_shift=settings.profile.max_shift, sequence=n, circular=circular) for n in (1, 5)]
-        for reading, row in zip(readings, score_matrix(profiles, pairs.queries, readings), strict=True):
-            name = "full circle, from any side" if circular else "fan, from the same side"
-            yield name + (f", {reading.sequence} in a row" if reading.sequence > 1 else ""), candidate_errors(row, pairs)
 
 
 def candidate_metrics(mode: str, errors: CandidateErrors) -> list[Metric]:
@@ -361,7 +294,6 @@ def view_settings(store: MapStore) -> ViewSettings:
         ProfileConfig.model_validate(tree.get("profile") or {}),
         MatchingConfig.model_validate(tree.get("matching") or {}),
         rgbd.get("matching", "four-band"),
-        int(rgbd.get("max_width_px", 320)),
         sees_all_around(store.rig),
     )
 
@@ -375,25 +307,3 @@ def stored_profiles(store: MapStore) -> list[Profile]:
     """The profiles that a session stored, one a node; empty if it stored none."""
     profiles = [store.keyframe(node).get("profile") for node in range(len(store.map()))]
     return [profile for profile in profiles if profile is not None]
-
-
-def profiles_again(
-    store: MapStore, settings: ViewSettings, bands: int, count: int, progress: Progress | None = None
-) -> list[Profile]:
-    """Profiles with another number of row bands, from the stored frames.
-
-    Raises:
-        EvaluationError: a node holds no frame.
-    """
-    from hybridmap.vision.rgbd.keyframe import image_profile_again
-
-    rig = store.rig
-    out = []
-    for node in range(count):
-        profile = image_profile_again(store.keyframe(node), rig, settings.max_width_px, settings.profile, bands)
-        if profile is None:
-            raise EvaluationError(f"{store.path}: node {node} holds no colour with depth; expected an RGB-D session")
-        out.append(profile)
-        if progress is not None:
-            progress(node + 1, count)
-    return out

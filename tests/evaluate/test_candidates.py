@@ -11,7 +11,6 @@ from hybridmap.evaluate.loops import (
     CandidateLimits,
     Reading,
     Truth,
-    all_readings,
     candidate_errors,
     judge_pairs,
     score_matrix,
@@ -25,6 +24,15 @@ from hybridmap.trajectory import Trajectory
 from hybridmap.vision.profile import image_profile
 
 SECOND = 1_000_000_000
+
+READINGS = {
+    **{mode: (1, Reading(mode)) for mode in ("literal", "ratio", "signed", "plain")},
+    "plain, depth": (1, Reading("plain", 0.0, 1.0)),
+    "four-band": (4, Reading("four-band")),
+    "four-band, depth": (4, Reading("four-band", 0.0, 1.0)),
+    "four-band, 5 in a row": (4, Reading("four-band", sequence=5)),
+}
+"""Name -> row bands of the profiles, and how they are scored."""
 
 
 def truth_table(same, different):
@@ -90,10 +98,8 @@ def office():
 def test_the_literal_rule_is_inverted_and_four_bands_beat_one(office):
     profiles, truth = office
     found: dict[str, CandidateErrors] = {}
-    for bands in (1, 4):
-        readings = {name: reading for name, of, reading in all_readings() if of == bands}
-        rows = score_matrix(profiles[bands], truth.queries, list(readings.values()))
-        found |= {name: candidate_errors(row, truth) for name, row in zip(readings, rows, strict=True)}
+    for name, (bands, reading) in READINGS.items():
+        found[name] = candidate_errors(score_matrix(profiles[bands], truth.queries, reading), truth)
     assert found["literal"].revisits == 24
     assert found["literal"].pair_auc < 0.3
     assert found["literal"].top1 < 0.1
@@ -110,9 +116,8 @@ def test_the_literal_rule_is_inverted_and_four_bands_beat_one(office):
 def test_a_sequence_is_the_mean_over_its_views():
     rng = np.random.default_rng(4)
     profiles = list(rng.normal(size=(9, 2, 16)).astype(np.float32))
-    single, double = score_matrix(
-        profiles, np.array([7, 8]), [Reading("plain", max_shift=2), Reading("plain", max_shift=2, sequence=2)]
-    )
+    readings = Reading("plain", max_shift=2), Reading("plain", max_shift=2, sequence=2)
+    single, double = (score_matrix(profiles, np.array([7, 8]), reading) for reading in readings)
     before = min(single[0, 3], single[0, 4], single[0, 5])
     assert double[1, 5] == pytest.approx(0.5 * (single[1, 5] + before))
     assert np.isinf(double[0, 7:]).all()

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.vision import ProfileConfig
-from hybridmap.streams.base import Rig
-from hybridmap.streams.rgbd import RGBD, Camera, RgbdFrame
-from hybridmap.vision.profile import Profile, image_profile
+from hybridmap.streams.rgbd import Camera, RgbdFrame
+from hybridmap.vision.profile import Profile
 from hybridmap.vision.rgbd.depth_grid import Surface, reduced
 from hybridmap.vision.rgbd.features import Features
 
@@ -68,14 +65,3 @@ def working_image(frame: RgbdFrame, factor: int) -> WorkingImage:
         half = factor // 2
         depth = np.ascontiguousarray(depth[half::factor, half::factor][:height, :width])
     return WorkingImage(grey, depth)
-
-
-def image_profile_again(
-    kept: Mapping[str, NDArray[np.generic]], rig: Rig, max_width_px: int, settings: ProfileConfig, bands: int
-) -> Profile | None:
-    """Profile of a stored keyframe with another number of row bands; None where it or the rig has no colour with depth."""
-    frame, camera = RGBD.restore(kept, 0), rig.sensors.get(RGBD.sensor_name)
-    if not isinstance(frame, RgbdFrame) or camera is None:
-        return None
-    image = working_image(frame, working_factor(camera, max_width_px))
-    return image_profile(image.grey, image.depth_m, settings.width, bands, settings.normalise)
