@@ -15,6 +15,7 @@ from hybridmap.mapper import Mapper
 from hybridmap.streams.base import SelfMotion
 from hybridmap.streams.laser import LaserScan
 from hybridmap.trajectory import Trajectory
+from hybridmap.verification.shadow import overwrite
 from tests.narrowing import known
 from tests.streams_for_tests import RoomDrive
 
@@ -79,7 +80,7 @@ def test_the_pose_follows_the_activity():
     for i in range(20):
         mapper.add_odometry(0.1 * i, [0.05 * i, 0.0, 0.0])
     before = mapper.integrator.pose
-    mapper.integrator.shift_activity(np.array([0.1, 0.05]))
+    overwrite(mapper.integrator, "both", np.array([0.1, 0.05]))
     moved = known(mapper.add_odometry(2.0, [0.95, 0.0, 0.0]))
     assert np.allclose(moved.pose_odom_robot[:2] - before[:2], [0.1, 0.05], atol=1e-4)
 

@@ -153,13 +153,6 @@ class PathIntegrator:
         metres = np.linalg.solve(waves, offset[..., None])[..., 0]
         return np.asarray(np.linalg.norm(metres, axis=1) / self.spacings_m)
 
-    def shift_activity(self, displacement_m: ArrayLike) -> None:
-        """Overwrite the sheets and rings with themselves moved by a displacement (2,), m, as if the robot stood there."""
-        move = np.asarray(displacement_m, dtype=np.float64)
-        shift = self.bands.wave_vectors @ move
-        self.bands.activity = self.bands.rates_at(self.bands.phases() + shift)
-        self.grid.activity = shift_sheets(self.grid.activity, shift[:, [0, 2]])
-
     def snapshot(self) -> Snapshot:
         """Return what a node stores so that `restore` puts the network back where it is now (some 8 kB).
 

@@ -83,7 +83,7 @@ def _positions_after(config: NeuralConfig, drive: ExactDrive, cells: Cells | Non
     for delta in drive.deltas[:-STEPS_ON]:
         integrator.step(delta, 1.0 / drive.hz)
     if cells is not None and way_m is not None:
-        _overwrite(integrator, cells, way_m)
+        overwrite(integrator, cells, way_m)
     positions = [integrator.pose[:2]]
     for delta in drive.deltas[-STEPS_ON:]:
         integrator.step(delta, 1.0 / drive.hz)
@@ -91,7 +91,7 @@ def _positions_after(config: NeuralConfig, drive: ExactDrive, cells: Cells | Non
     return np.array(positions)
 
 
-def _overwrite(integrator: PathIntegrator, cells: Cells, way_m: Array) -> None:
+def overwrite(integrator: PathIntegrator, cells: Cells, way_m: Array) -> None:
     """Put cells where they would be had the robot been displaced by `way_m` (2,)."""
     shift = integrator.bands.wave_vectors @ way_m
     if cells != "sheets":

@@ -9,6 +9,7 @@ from hybridmap.errors import StreamError
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.band import BandMotion
 from hybridmap.neural.grid import shift_sheets
+from hybridmap.verification.shadow import overwrite
 from tests.neural.neural_drives import arc, wander
 
 
@@ -104,7 +105,7 @@ def test_overwritten_activity_is_where_integration_goes_on(dtype):
     integrator = PathIntegrator(NeuralConfig(), dtype=dtype)
     integrator.step((0.4, 0.1, 0.0), 1.0)
     before = integrator.pose
-    integrator.shift_activity((0.31, -0.22))
+    overwrite(integrator, "both", np.array([0.31, -0.22]))
     for _ in range(30):
         integrator.step((0.02, 0.0, 0.0), 1 / 30)
     assert integrator.pose - before == pytest.approx([0.91, -0.22, 0.0], abs=5e-4)

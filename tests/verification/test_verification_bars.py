@@ -9,6 +9,7 @@ from hybridmap.config.mapping import NeuralConfig
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.place import PlaceAttractor
 from hybridmap.verification import path_error, rate_maps, rows_of, shadow
+from hybridmap.verification.shadow import overwrite
 from tests.verification.cells_for_tests import TINY
 
 SEED = np.random.SeedSequence(11)
@@ -180,7 +181,7 @@ class Shadowed(PathIntegrator):
         c, s = np.cos(self._heading), np.sin(self._heading)
         self._position = self._position + np.array((c * dx - s * dy, s * dx + c * dy))
         self._heading += turn
-        self.shift_activity(self._position - self.decode().position_m)
+        overwrite(self, "both", self._position - self.decode().position_m)
 
 
 def test_a_shadow_integrator_that_puts_the_sheets_back_is_found(monkeypatch, result):
