@@ -55,12 +55,10 @@ def compare(
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Compare back-ends on one graph.
+    """Compare back-ends on one graph: chi2, status, iterations, CPU seconds, rejected loops, and a proof of optimality if found.
 
-    The table shows chi2, status, iterations, CPU seconds, rejected loops and whether the solution is proved optimal. For a
-    session with a ground truth or verified relations it also shows their errors (m).
-    A session's graph is solved in one batch and replayed incrementally, in two rows per back-end. A back-end that fails
-    keeps its row, with the reason.
+    A session with ground truth or verified relations also gets errors (m). A session's graph is solved in batch and
+    incrementally: two rows per back-end. A back-end that fails keeps its row, with the reason.
     """
     from hybridmap.backends import comparison
     from hybridmap.cli.graphs import open_graph, settings_of

@@ -1,4 +1,4 @@
-"""Every setting: one frozen section a stage. Command line > file > defaults; the resolved file is saved with each result."""
+"""Every setting, one frozen section per stage. Command line overrides file, file overrides defaults. Results store them all."""
 
 from hybridmap.config.root import Config, named_configs
 

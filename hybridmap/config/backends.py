@@ -10,7 +10,7 @@ from hybridmap.config.section import Section
 
 
 class RelaxationConfig(Section):
-    """The paper's correction rule and its stable relatives."""
+    """Relaxation: the paper's correction rule and stable variants."""
 
     theta: float = Field(default=0.5, gt=0, le=1)
     """Correction rate, the paper's vartheta.
@@ -19,57 +19,66 @@ class RelaxationConfig(Section):
     theta_decay: float = Field(default=1.0, gt=0, le=1)
     """`relaxation-ratslam`, `-robust`: factor on theta after every sweep of one call.
 
-    Watch: with 1 the last sweeps go round in a limit cycle; far below 1 they stop before the map has settled."""
+    Watch: with 1 the last sweeps end in a limit cycle; far below 1 they stop before the map has converged.
+    """
     sweeps_per_node: int = Field(default=20, ge=1)
-    """Sweeps each time the graph has grown.
+    """Sweeps after each growth of the graph.
 
-    Watch: each costs time in proportion to the edges of the whole graph."""
+    Watch: the time of a sweep grows with the edges of the whole graph.
+    """
     solve_sweeps: int = Field(default=5000, ge=1)
     """Most sweeps when a whole graph is solved at once.
 
-    Watch: far ends of a long chain need many."""
+    Watch: a long chain needs many.
+    """
     on_unstable: Literal["refuse", "normalise", "run"] = "run"
-    """`relaxation-paper` where theta is too large: report `diverged` without a sweep, divide theta by each node's degree, or
-    run it and report what happened.
+    """`relaxation-paper` if theta is too large: report `diverged` without a sweep, divide theta by each node's degree, or run
+    and report the outcome.
 
-    Watch: it never returns a worse map than it got."""
+    Watch: in no case is a worse map returned than the initial one.
+    """
 
 
 class GncConfig(Section):
-    """Graduated non-convexity (truncated least squares) on the loop edges; other edges are known inliers."""
+    """Graduated non-convexity (truncated least squares) on the loop edges; all other edges count as inliers."""
 
     start: Literal["auto", "batch", "grow"] = "auto"
-    """`batch` anneals the whole graph from its initial poses, `grow` adds the nodes by chunks, `auto` grows in two ways (and
-    starts from the map at the end of a drive, where there is one) and takes the lowest truncated cost.
+    """`batch` anneals the whole graph from its initial poses; `grow` adds the nodes in chunks; `auto` grows in two ways, at the
+    end of a drive starts from its map as well, and takes the solution with the lowest truncated cost.
 
-    Watch: `auto` takes the most time, and survives worse starts."""
+    Watch: `auto` takes the most time, and tolerates worse initial poses.
+    """
     quantile: float = Field(default=0.99, gt=0.5, lt=1)
-    """A loop is an inlier while its squared Mahalanobis residual is below this quantile of chi2 with 3 degrees of freedom.
+    """A loop is an inlier if its squared Mahalanobis residual is below this quantile of chi2 with 3 degrees of freedom.
 
-    Watch: one in a hundred true loops of honest noise lies beyond 0.99."""
+    Watch: with 0.99, one in a hundred true loops with correct covariance is rejected.
+    """
 
 
 class RobustConfig(Section):
-    """Kernels on the loop edges, and on the edges of motion where wheels have drop-outs."""
+    """Robust kernels on the loop edges, and on odometry and registration edges if wheels have drop-outs."""
 
     cauchy_scale: float = Field(default=1.0, gt=0)
-    """Whitened residual at which a Cauchy weight of a loop is one half.
+    """Whitened residual at which the Cauchy weight of a loop is one half.
 
-    Watch: smaller resists more false loops, and bends less towards true ones after a drift."""
+    Watch: a smaller scale resists more false loops, and follows true loops less after drift.
+    """
     odometry: Literal["none", "huber", "cauchy", "geman-mcclure"] = "none"
-    """Kernel on odometry and registration edges: in `gtsam-isam2`, `gtsam-gnc`, `gtsam-calibrated` and the back-ends named by
-    a kernel.
+    """Kernel on odometry and registration edges, used by `gtsam-isam2`, `gtsam-gnc`, `gtsam-calibrated` and the back-ends named
+    after a kernel.
 
-    Watch: edges of a weight below a tenth, and nodes that hang on such edges alone, are in the report."""
+    Watch: the report lists edges with a weight below a tenth, and counts nodes that only such edges hold.
+    """
 
 
 class ConsistencyConfig(Section):
-    """Pairwise consistency of loops through the chain, judged before a whole graph is solved by any back-end."""
+    """Pre-filter: pairwise consistency of loops through the chain, tested before any back-end solves a whole graph."""
 
     enabled: bool = False
-    """Leave out loops that are not consistent with the others, and try them again from the solution.
+    """Leave out loops that are not consistent with others, and test them again against the solution.
 
-    Watch: a true loop with no other near it is left out too."""
+    Watch: a true loop without another one nearby is left out as well.
+    """
 
 
 class Isam2Config(Section):
@@ -80,16 +89,18 @@ class Isam2Config(Section):
 
 
 class BackendsConfig(Section):
-    """Which back-ends follow the graph; the first is the primary and drives `map -> odom`."""
+    """The back-ends that follow the graph. The first is the primary one and sets the robot's pose (`map -> odom`)."""
 
     names: tuple[str, ...] = Field(default=("gtsam-gnc", "relaxation-ratslam"), min_length=1)
     """Names; the first is the primary.
 
-    Watch: every one costs its own time at each node."""
+    Watch: each back-end takes its own time at every node.
+    """
     max_iterations: int = Field(default=100, ge=1)
     """Most iterations of a batch optimiser.
 
-    Watch: a back-end that stops there says so in its report."""
+    Watch: a back-end that stops at the limit says so in its report.
+    """
     relaxation: RelaxationConfig = RelaxationConfig()
     """Relaxation rules."""
     robust: RobustConfig = RobustConfig()

@@ -1,4 +1,4 @@
-"""Settings that have gone: one line for whoever still sets one, and old configurations without them."""
+"""Removed settings: what became of each, and reading old configurations that still have them."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ OTHERWISE: dict[str, str] = {
 
 @cache
 def constants() -> dict[str, tuple[str, str]]:
-    """Old dotted key -> module (path below `hybridmap/`) and name of the constant that it has become."""
+    """Old dotted key -> module (path below `hybridmap/`) and name of the constant that replaced it."""
     found = {}
     for section, module, *keys in map(str.split, _CONSTANTS.strip().splitlines()):
         for key in keys:
@@ -123,11 +123,11 @@ def constants() -> dict[str, tuple[str, str]]:
 
 
 def what_became_of(key: str, value: Any = None) -> str | None:
-    """One line on a setting that has gone; None if there never was one.
+    """One line on a removed setting; None if there never was such a setting.
 
     Args:
         key: dotted.
-        value: what it was set to; where `key` is a section that has gone, its first key is looked up.
+        value: its value; if `key` is a removed section, the first key of that section is looked up.
     """
     if isinstance(value, Mapping) and value and key not in {*RENAMED, *OTHERWISE}:
         name = next(iter(value))
@@ -143,11 +143,11 @@ def what_became_of(key: str, value: Any = None) -> str | None:
 
 
 def without_gone(tree: Mapping[str, Any], at: str = "") -> dict[str, Any]:
-    """A stored configuration without the settings that have gone; those that were renamed have their new names.
+    """A stored configuration without removed settings, and with the new names of renamed ones.
 
     Args:
         tree: nested mapping of sections.
-        at: dotted name of the section that it is; empty for the whole configuration.
+        at: dotted name of the section that `tree` is; empty for the whole configuration.
     """
     kept: dict[str, Any] = {}
     for dotted, value in _leaves(tree, at):

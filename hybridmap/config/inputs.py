@@ -1,4 +1,4 @@
-"""What comes in: the sensors of a recording or robot, and the simulated world with its sensors."""
+"""Settings of the input: the sensors of a recording or robot, and the simulated world with its sensors."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from hybridmap.config.section import Section
 
 
 class LaserMounting(Section):
-    """Where the laser sits on the base; takes the place of the recording's transforms."""
+    """Pose of the laser on the base; replaces the recording's transforms."""
 
     x_m: float = 0.0
-    """Forward of the base's origin, m."""
+    """Position forward of the base's origin, m."""
     y_m: float = 0.0
-    """To the left of the base's origin, m."""
+    """Position to the left of the base's origin, m."""
     yaw_rad: float = 0.0
-    """Direction of the laser's x axis seen from the base, rad."""
+    """Direction of the laser's x axis in the base frame, rad."""
     upside_down: bool = False
     """Whether the laser hangs upside down: its beams then turn the other way."""
 
 
 class CameraMounting(Section):
-    """Where the camera's OPTICAL frame (x right, y down, z forward) sits on the base; takes the place of the recording's."""
+    """Pose of the camera's OPTICAL frame (x right, y down, z forward) on the base; replaces the recording's."""
 
     translation_m: tuple[float, float, float]
     """Origin of the optical frame in the base, m."""
@@ -34,7 +34,7 @@ class CameraMounting(Section):
 
 
 class CameraIntrinsics(Section):
-    """Calibration of the colour camera; takes the place of the recording's."""
+    """Calibration of the colour camera; replaces the recording's."""
 
     width_px: int = Field(gt=0)
     """Image width, pixels."""
@@ -53,10 +53,10 @@ class CameraIntrinsics(Section):
 
 
 class SensorsConfig(Section):
-    """Where the sensor data come from; None means: find it."""
+    """Source of the sensor data; None means: found automatically."""
 
     odometry_topic: str | None = None
-    """Topic of nav_msgs/Odometry, or a tf2_msgs/TFMessage topic to take `odom_frame` -> base from."""
+    """Topic of nav_msgs/Odometry, or of tf2_msgs/TFMessage with the transform `odom_frame` -> base."""
     scan_topic: str | None = None
     """Topic of sensor_msgs/LaserScan."""
     color_topic: str | None = None
@@ -72,7 +72,7 @@ class SensorsConfig(Section):
     odometry_file: str | None = None
     """File of a TUM folder with the odometry; None: `odometry.txt`."""
     odom_frame: str = "odom"
-    """Frame that odometry in /tf starts from, where there is no Odometry topic."""
+    """Parent frame of the odometry in /tf, used if there is no Odometry topic."""
     base_frame: str | None = None
     """Frame of the robot that is mapped; None: the child frame of the odometry."""
     laser_mounting: LaserMounting | None = None
@@ -90,21 +90,25 @@ class SensorsConfig(Section):
 
     Watch: while the robot turns, a pair this far apart shows two different views."""
     latency_s: float = Field(default=0.0, ge=0)
-    """Live input: how long samples wait to be sorted by stamp, s; recordings are sorted by their reader.
+    """Live input: time for which samples are held back to be sorted by stamp, s. Recordings are sorted by their reader.
 
-    Watch: the pose comes later by as much."""
+    Watch: the pose is delayed by this time.
+    """
     odometry_delay_s: float = Field(default=0.0, ge=-1, le=1)
-    """Added to the stamps of odometry: how much later views are stamped than odometry, s. `hybridmap calibrate` finds it.
+    """Time added to the stamps of odometry, s: by how much scans and images are stamped later. `hybridmap calibrate` finds it.
 
-    Watch: updates of a live robot come later by as much."""
+    Watch: updates of a live robot are delayed by this time.
+    """
     range_min_m: float | None = Field(default=None, ge=0)
-    """Laser returns nearer than this are dropped, m; None: the recording's limit alone.
+    """Laser returns nearer than this are dropped, m; None: only the recording's limit applies.
 
-    Watch: set it where the laser sees the robot itself."""
+    Watch: set it if the laser sees the robot itself.
+    """
     range_max_m: float | None = Field(default=None, gt=0)
-    """Laser returns at or beyond this are dropped, m; None: the recording's limit alone.
+    """Laser returns at or beyond this are dropped, m; None: only the recording's limit applies.
 
-    Watch: a long hall needs the far walls."""
+    Watch: a long hall needs the far walls.
+    """
     depth_min_m: float | None = Field(default=None, ge=0)
     """Depth nearer than this is dropped, m; None: all depth is kept.
 
@@ -116,7 +120,7 @@ class SensorsConfig(Section):
 
 
 class WheelErrorConfig(Section):
-    """How wrong the simulated wheel odometry is."""
+    """Errors of the simulated wheel odometry."""
 
     scale_bias: float = Field(default=0.02, gt=-1)
     """Relative error of every distance; 0.02 reports 2 % too much."""
@@ -129,7 +133,8 @@ class WheelErrorConfig(Section):
     noise: float = Field(default=1.0, ge=0, le=100)
     """Factor on the white noise and on the number and size of slips; 0: none.
 
-    Watch: the noise of odometry edges (`edges`) does not follow it."""
+    Watch: the noise assumed for odometry edges (section `edges`) does not change with it.
+    """
 
 
 class CameraConfig(Section):
@@ -153,7 +158,7 @@ class LaserScannerConfig(Section):
     beams: int = Field(default=180, ge=8, le=4096)
     """Beams a scan."""
     field_of_view_deg: float = Field(default=180.0, gt=1, le=360)
-    """Angle between the first and the last beam, degrees; 360 leaves out the last, which is the first again."""
+    """Angle between the first and the last beam, degrees. With 360 the last beam is left out, as it would repeat the first."""
     rate_hz: float = Field(default=5.0, gt=0, le=60)
     """Scans a second."""
     range_max_m: float = Field(default=12.0, gt=0)
@@ -166,16 +171,17 @@ class SimulationConfig(Section):
     world: str = "lab"
     """Name of the world and its drive."""
     sensors: Literal["rgbd", "laser", "both"] = "rgbd"
-    """What the robot carries besides its wheels."""
+    """Sensors of the robot besides its wheels."""
     noise: float = Field(default=1.0, ge=0, le=10)
-    """Factor on the noise of these sensors: of depth, colour and ranges, holes, lost beams and changes of exposure; 0: none."""
+    """Factor on the noise of camera and laser: depth, colour, ranges, holes, lost beams and exposure changes; 0: none."""
     duration_s: float | None = Field(default=None, gt=0)
-    """Stop the drive after so many seconds; None: drive to its end."""
+    """Stop the drive after this many seconds; None: drive to the end."""
     carried_m: float | None = Field(default=None, gt=0)
-    """Kidnap the robot in the middle of its drive: put it down in a known place so far away, m. The wheels feel nothing and
-    there are no frames. None: never.
+    """Kidnap the robot in the middle of the drive: carry it about this far, m, to a place that it has visited. Meanwhile the
+    odometry reports no motion and there are no frames. None: never.
 
-    Watch: in a smaller world it is put down as far away as there is a known place."""
+    Watch: in a smaller world the distance is that of the farthest visited place.
+    """
     wheels: WheelErrorConfig = WheelErrorConfig()
     """Errors of the wheel odometry."""
     camera: CameraConfig = CameraConfig()

@@ -1,4 +1,4 @@
-"""Settings of the map: the cells, when a node is made, how sure its edges are, and the gains of the odometry."""
+"""Settings of the map: path integration cells, creation of nodes, noise of edges, and online calibration of odometry."""
 
 from __future__ import annotations
 
@@ -10,16 +10,18 @@ from hybridmap.config.section import Section
 
 
 class PlaceConfig(Section):
-    """Grid -> place learning and the place attractor."""
+    """Place cells learned from the grid cells, and the place attractor."""
 
     attractor_side: int = Field(default=32, ge=8, le=256)
     """Cells along a side of the place attractor; the place code has side * side entries.
 
-    Watch: every step costs in proportion to side * side, and every node stores as many numbers."""
+    Watch: the time of a step and the size of a node in the map file grow with side * side.
+    """
     attractor_cell_m: float = Field(default=0.16, ge=0.01, le=10)
-    """Metres a cell of the place attractor.
+    """Size of one cell of the place attractor, m.
 
-    Watch: the sheet repeats after side * cell metres; the place code tells places apart that are some three cells apart."""
+    Watch: the sheet repeats after side * size metres; the place code resolves about three cells.
+    """
     learning_rate: float = Field(default=0.0005, ge=0, le=1)
     """eta of the Hebbian rule, per learning step.
 
@@ -27,7 +29,8 @@ class PlaceConfig(Section):
     attractor_input: float = Field(default=0.0, ge=0, lt=1)
     """Share of the place cells' input in the attractor's activity at each learning step.
 
-    Watch: with 0 the attractor is moved by self-motion alone."""
+    Watch: with 0 only self-motion moves the attractor.
+    """
 
 
 class NeuralConfig(Section):
@@ -36,60 +39,73 @@ class NeuralConfig(Section):
     head_direction_cells: int = Field(default=360, ge=8, le=100_000)
     """m, cells of the head-direction ring.
 
-    Watch: the heading is exact with any number; more cells only make noise average out."""
+    Watch: the heading is exact with any number; more cells only average out more noise.
+    """
     modules: int = Field(default=8, ge=3, le=32)
-    """M, grid modules; their spacings are geometric between the two limits.
+    """M, number of grid modules; their spacings form a geometric series between the two limits.
 
-    Watch: fewer make the code of positions repeat sooner; the cost of a step is in proportion."""
+    Watch: with fewer, the position code repeats sooner; the time of a step grows with the number.
+    """
     sheet_side: int = Field(default=32, ge=12, le=128, multiple_of=4)
     """Cells along a side of a grid sheet.
 
-    Watch: the cost of a step is in proportion to side * side."""
+    Watch: the time of a step grows with side * side.
+    """
     spacing_min_m: float = Field(default=0.12, ge=0.02, le=100)
     """Grid spacing of the finest module, m.
 
-    Watch: a step of the odometry must be well below half of it."""
+    Watch: a step of the odometry must be well below half of this spacing.
+    """
     spacing_max_m: float = Field(default=0.52, ge=0.02, le=100)
     """Grid spacing of the coarsest module, m.
 
-    Watch: place fields must be narrower than a quarter of it."""
+    Watch: place fields must be narrower than a quarter of this spacing.
+    """
     metric: Literal["hexagonal", "square"] = "hexagonal"
     """Metric of the sheets; `square` has bands at 0 and 90 degrees and fires on a square lattice (for comparison)."""
     rectifier: Literal["relu", "softplus"] = "relu"
-    """f of the grid sheets: `relu` is the paper's, `softplus` the accurate one.
+    """f of the grid sheets: `relu` is the paper's, `softplus` is more accurate.
 
-    Watch: `softplus` takes more time a step."""
+    Watch: `softplus` makes a step slower.
+    """
     kernel: Literal["two-amplitudes", "printed"] = "two-amplitudes"
-    """Recurrent weights: a difference of two Gaussians with an amplitude each, or with the printed single one.
+    """Recurrent weights: a difference of two Gaussians, each with its own amplitude, or with the paper's single amplitude.
 
-    Watch: the printed one is unstable at one step a time constant; it is refused with the name of what happens."""
+    Watch: the printed kernel is unstable with one step per time constant; it is refused, with the instability named.
+    """
     band_drive: float = Field(default=0.1, ge=0, le=1)
-    """Gain of the band stripes' excitatory input to the sheets; the uniform input is 1.
+    """Gain of the band cells' excitatory input to the sheets; the uniform input is 1.
 
-    Watch: 0 leaves only the shift, and a slow robot's motion is then lost with `relu`."""
+    Watch: with 0 and `relu` the motion of a slow robot is lost.
+    """
     neuron_noise: float = Field(default=0.0, ge=0, le=0.5)
-    """Standard deviation of the noise that multiplies the rate of every cell that a step updates; 0.05 is 5 %.
+    """Standard deviation of the multiplicative noise on the rate of every updated cell; 0.05 is 5 %.
 
-    Watch: the pose wanders off by what the noise leaves; 5 % cost about 0.3 m in 40 m."""
+    Watch: the integrated pose drifts; 5 % costs about 0.3 m in 40 m.
+    """
     gain: float = Field(default=1.0, gt=0, le=10)
-    """k_m, metres of path integration a metre of odometry.
+    """k_m, metres of path integration per metre of odometry.
 
-    Watch: `hybridmap calibrate` finds this and the next two."""
+    Watch: `hybridmap calibrate` finds this and the next two.
+    """
     turn_gain: float = Field(default=1.0, gt=0, le=10)
-    """k_w, radians of path integration a radian of odometry.
+    """k_w, radians of path integration per radian of odometry.
 
-    Watch: an error of 1 % is 3.6 degrees a full turn."""
+    Watch: an error of 1 % is 3.6 degrees per full turn.
+    """
     heading_bias_rad_m: float = Field(default=0.0, ge=-1, le=1)
-    """Radians added to the heading for each metre forward.
+    """Radians added to the heading for each metre driven forward.
 
-    Watch: of the three gains it matters most on a long way."""
+    Watch: on a long drive this matters more than the two gains.
+    """
     reanchor_weight: float = Field(default=0.0, ge=0, le=1)
-    """How far a loop closure pulls the cells to the activity stored at the matched node, moved by the measured relative pose.
+    """How far a loop closure pulls the cells to the activity stored at the matched node, shifted by the measured relative pose.
 
-    Watch: 1 puts it back hard, 0 leaves the cells alone; after a false closure they are at a wrong place. The pose in
-    `odom` stays continuous either way."""
+    Watch: 1 replaces the activity, 0 leaves the cells alone; after a false closure the cells show a wrong place. The pose in
+    `odom` stays continuous either way.
+    """
     place: PlaceConfig = PlaceConfig()
-    """Grid -> place learning and the place attractor."""
+    """Place cells and place attractor."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -99,62 +115,72 @@ class NeuralConfig(Section):
 
 
 class NodesConfig(Section):
-    """Novelty: a node is made when the rule says so."""
+    """When a node is made."""
 
     rule: Literal["travel", "novelty"] = "travel"
-    """`travel`: every so many metres or degrees; `novelty`: the paper's, by place code and view template.
+    """`travel`: after some distance or rotation; `novelty`: the paper's rule, by place code and view template.
 
-    Watch: under `novelty` a known place gives no node, and so no closure."""
+    Watch: under `novelty` a known place makes no node, and hence no loop closure.
+    """
     distance_m: float = Field(default=0.25, gt=0)
-    """`travel`: metres since the last node.
+    """`travel`: distance between nodes, m.
 
-    Watch: the cost of a drive is in proportion to its nodes; with far ones consecutive views share too little."""
+    Watch: time grows with the number of nodes; with a large distance consecutive views overlap too little.
+    """
     angle_deg: float = Field(default=15.0, gt=0, le=180)
-    """`travel`: degrees turned since the last node.
+    """`travel`: rotation between nodes, degrees.
 
-    Watch: keep it well below a camera's field of view."""
+    Watch: keep it well below a camera's field of view.
+    """
     place_threshold: float = Field(default=0.4, gt=0, le=1)
-    """`novelty`: S_th, the least distance (1 - cosine) of the place code to that of every node.
+    """`novelty`: S_th. A node is made if its place code differs from that of every node by at least this (1 - cosine).
 
-    Watch: a smaller one makes more nodes."""
+    Watch: a smaller threshold makes more nodes.
+    """
 
 
 class EdgesConfig(Section):
-    """Odometry edges, and how a closure enters the map."""
+    """Noise of odometry edges, and how a loop closure enters the map."""
 
     hanging: Literal["chain", "ratslam"] = "chain"
-    """`chain` keeps consecutive nodes joined and adds a loop edge; `ratslam` hangs the next node on the matched one, as
+    """`chain` keeps consecutive nodes joined and adds a loop edge; `ratslam` joins the next node to the matched one, as
     OpenRatSLAM does (a baseline).
 
-    Watch: with `ratslam` one false match breaks the chain for good."""
+    Watch: with `ratslam` one false match breaks the chain for good.
+    """
     gate: Literal["map", "odometry"] = "map"
-    """Whose poses gate closures: the primary back-end's, or the integrator's alone.
+    """Poses that gate loop closures: those of the primary back-end (`map`) or of the path integrator (`odometry`).
 
-    Watch: with `odometry` the graph owes nothing to a back-end, and long drives drift out of the gate."""
+    Watch: with `odometry` the graph does not depend on a back-end, and long drives drift out of the gate.
+    """
     drop_contradicted: bool = True
-    """Drop an odometry edge that a good registration of the same two nodes contradicts.
+    """Drop an odometry edge if a good registration of the same two nodes contradicts it.
 
-    Watch: where wheels drop out, the edge that is kept bends the map."""
+    Watch: if wheel odometry has drop-outs, a kept edge bends the map.
+    """
     translation_floor_m: float = Field(default=0.005, gt=0)
-    """Standard deviation of an odometry edge at no travel, m."""
+    """Standard deviation of an odometry edge's translation without travel, m."""
     rotation_floor_deg: float = Field(default=0.2, gt=0)
-    """Standard deviation of an odometry edge's heading at no travel, degrees."""
+    """Standard deviation of an odometry edge's heading without travel, degrees."""
     translation_per_sqrt_m: float = Field(default=0.02, ge=0)
     """Growth of the translation's standard deviation, m per sqrt(m) of travel.
 
-    Watch: too small, and the edge holds a better registration back; too large, and a false loop bends it."""
+    Watch: too small, and the edge outweighs a better registration; too large, and a false loop bends the chain.
+    """
     rotation_deg_per_sqrt_m: float = Field(default=0.6, ge=0)
     """Growth of the heading's standard deviation, degrees per sqrt(m) of travel.
 
-    Watch: wheels err in heading most; the gate of loop closures grows with it."""
+    Watch: heading is the largest error of wheel odometry; the gate of loop closures grows with this value.
+    """
     rotation_per_turn: float = Field(default=0.02, ge=0)
     """Growth of the heading's standard deviation, radians per sqrt(radian) turned."""
 
 
 class CalibrationConfig(Section):
-    """Odometry gains estimated from the map as it grows; every change is logged, and kept in the map file."""
+    """Online calibration of odometry from the map as it grows. Every change of the gains is logged and stored in the map."""
 
     online: bool = False
-    """Change the path integrator's gains while driving, where the estimate differs from those in use by three sigma.
+    """Change the path integrator's gains while driving, when the estimate differs from them by more than three sigma.
 
-    Watch: edges that are in the map stay as they were measured."""
+    Watch: existing edges keep the gains with which they were made.
+    """

@@ -1,4 +1,4 @@
-"""The whole configuration, and how it is read: by name or path, with `extends`, and with overrides on top."""
+"""The whole configuration, and reading it: by name or path, with `extends` and overrides."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from hybridmap.errors import ConfigError
 
 
 class Config(Section):
-    """Everything that determines a map, one section a stage, in the order in which a sample meets them."""
+    """Everything that determines a map: one section per stage, in the order in which a sample passes them."""
 
     seed: int = Field(default=0, ge=0)
-    """Seed of every random draw (the simulator's world and noise, RANSAC)."""
+    """Random seed of the run (the simulator's world and noise, RANSAC)."""
     simulation: SimulationConfig = SimulationConfig()
     """The simulated world and drive; ignored for recordings."""
     sensors: SensorsConfig = SensorsConfig()
-    """Topics, mounting, synchronisation."""
+    """Topics, mountings, synchronisation."""
     neural: NeuralConfig = NeuralConfig()
     """Head-direction, band, grid and place cells; the place attractor."""
     nodes: NodesConfig = NodesConfig()
-    """When an experience is made."""
+    """When a node is made."""
     vision: VisionConfig = VisionConfig()
     """Scanline profiles, loop closure, registration."""
     edges: EdgesConfig = EdgesConfig()
-    """Noise of odometry edges; how closures enter the map."""
+    """Noise of odometry edges; how loop closures enter the map."""
     backends: BackendsConfig = BackendsConfig()
     """Which back-ends run, and their settings."""
     calibration: CalibrationConfig = CalibrationConfig()
-    """Odometry gains that follow the map while driving."""
+    """Online calibration of odometry."""
 
     @classmethod
     def load(
@@ -50,11 +50,11 @@ class Config(Section):
         *,
         overridden_by: str = "command line",
     ) -> Self:
-        """Read a configuration by name (`rgbd`) or path, with `overrides` (`{"nodes.distance_m": 0.3}`) on top.
+        """Read a configuration by name (`rgbd`) or path and apply `overrides` (`{"nodes.distance_m": 0.3}`).
 
         Raises:
-            ConfigError: no such file, not YAML, an unknown key (named with its path) or a value out of range. It names
-                the file, or `overridden_by` where the file by itself is sound.
+            ConfigError: no such file, not YAML, an unknown key (named with its path) or a value out of range. The message names
+                the file, or `overridden_by` if an override caused the error.
         """
         tree: dict[str, Any] = {} if source is None else _read_tree(source, seen=())
         changed = deepcopy(tree)
@@ -80,7 +80,7 @@ class Config(Section):
 
     @classmethod
     def stored(cls, text: str, origin: str) -> Self:
-        """The configuration that a session was saved with, without the settings that have gone since.
+        """The configuration stored with a session, without settings that have been removed since.
 
         Raises:
             ConfigError: as `load`.

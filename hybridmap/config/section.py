@@ -15,18 +15,18 @@ _WORDS = {"tuple_type": "a list", "list_type": "a list", "dict_type": "keys with
 
 
 class Section(BaseModel):
-    """Frozen, with unknown keys refused.
+    """A section of the configuration. It is frozen and refuses unknown keys.
 
-    The docstring under each field is its help text; what follows on "Watch:" says what to watch when changing it.
+    The docstring under each field is its help text; the part after "Watch:" says what to watch when changing it.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
 
 
 def said(error: ValidationError, section: str = "") -> str:
-    """The first of pydantic's complaints in the form of every other error: where, what was expected, what was found.
+    """The first error of pydantic as one line: the key, what was expected, what was found.
 
-    An unknown key comes before all others: one that is missing may be the same key, misspelt.
+    Unknown keys are reported first: a missing key may be the same key, misspelt.
 
     Args:
         error: of a section.
@@ -55,10 +55,10 @@ def said(error: ValidationError, section: str = "") -> str:
 
 
 def read_mapping(path: Path, error: type[HybridMapError] = ConfigError) -> dict[str, Any]:
-    """The mapping that a YAML file holds; an empty file holds an empty one.
+    """Read a YAML file that holds a mapping; an empty file gives an empty mapping.
 
     Raises:
-        HybridMapError: of the type `error`: the file is no YAML, named with the line, or no mapping.
+        HybridMapError: of the type `error`: the file is not YAML (the message names the line), or holds no mapping.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -68,7 +68,7 @@ def read_mapping(path: Path, error: type[HybridMapError] = ConfigError) -> dict[
 
 
 def mapping_of(text: str, origin: str, error: type[HybridMapError] = ConfigError) -> dict[str, Any]:
-    """The same for a text; `origin` names it in errors."""
+    """Read a YAML text that holds a mapping; `origin` names the text in errors."""
     tree = value_of(text, origin, error)
     if tree is None:
         return {}
@@ -78,7 +78,7 @@ def mapping_of(text: str, origin: str, error: type[HybridMapError] = ConfigError
 
 
 def value_of(text: str, origin: str, error: type[HybridMapError] = ConfigError) -> Any:
-    """Any value that is written as YAML."""
+    """Read one YAML value."""
     try:
         return yaml.safe_load(text)
     except yaml.YAMLError as mistake:
