@@ -19,43 +19,48 @@ _DEFAULT = "odometry,relaxation-ratslam,gtsam-lm,gtsam-cauchy,gtsam-gnc"
 _WIDTH = 180  # columns of a table that goes into a file
 _ERRORS = {"ate_rmse": "ATE (m)", "relation_trans_mean": "relations (m)", "relation_loop_trans_mean": "of loops (m)"}
 
+_Batch = Annotated[
+    bool,
+    typer.Option(
+        "--batch",
+        help="Solve the whole graph at once, from dead reckoning or from the poses in the file. Default for files.",
+    ),
+]
+_Incremental = Annotated[
+    bool,
+    typer.Option(
+        "--incremental",
+        help="Add the graph node by node, as while driving. Default for session folders: --batch and --incremental.",
+    ),
+]
+_Reference = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="GT.tum", help="Sessions only: ground truth of base_link (TUM format). Default: the session's own, if any."
+    ),
+]
+_Relations = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Sessions only: verified relative poses, lines `t1 t2 dx dy dyaw` (s, m, rad)."),
+]
+
 
 def compare(
     source: Annotated[Path, typer.Argument(metavar="DIR_OR_GRAPH", help="Session folder, or planar g2o or TORO file.")],
     backends: Annotated[str, typer.Option(metavar="A,B,...", help="Back-ends, separated by commas.")] = _DEFAULT,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for maps.png and comparison.html.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing comparison.")] = False,
-    batch: Annotated[
-        bool,
-        typer.Option(
-            "--batch",
-            help="Solve the whole graph at once, from dead reckoning or from the poses in the file. Default for files.",
-        ),
-    ] = False,
-    incremental: Annotated[
-        bool,
-        typer.Option(
-            "--incremental",
-            help="Add the graph node by node, as while driving. Default for session folders: --batch and --incremental.",
-        ),
-    ] = False,
-    reference: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="GT.tum", help="Sessions only: ground truth of base_link (TUM format). Default: the session's own, if any."
-        ),
-    ] = None,
-    relations: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Sessions only: verified relative poses, lines `t1 t2 dx dy dyaw` (s, m, rad)."),
-    ] = None,
+    batch: _Batch = False,
+    incremental: _Incremental = False,
+    reference: _Reference = None,
+    relations: _Relations = None,
     config: Annotated[
         str | None, typer.Option(help="Configuration with the settings of the back-ends: a name or a file.")
     ] = None,
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Compare back-ends on one graph: chi2, status, iterations, CPU seconds, rejected loops, and a proof of optimality if found.
+    """Compare back-ends on one graph: chi2, status, iterations, CPU seconds, rejected loops, and proof of optimality if found.
 
     A session with ground truth or verified relations also gets errors (m). A session's graph is solved in batch and
     incrementally: two rows per back-end. A back-end that fails keeps its row, with the reason.
