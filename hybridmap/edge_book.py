@@ -1,21 +1,114 @@
-"""What vision proposes, written into the map as edges; and what a back-end thinks of them, brought back to vision."""
+"""The mapper's books: where the robot is, and which edge of the map a proposal of vision became."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hybridmap.backends.base import SolveReport
 from hybridmap.config.mapping import EdgesConfig
-from hybridmap.geometry import Array, RelativePose
+from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search
 from hybridmap.graph.experience_map import ExperienceMap
-from hybridmap.graph.paths import covariances_from
+from hybridmap.graph.paths import covariances_from, odometry_covariance
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.streams.synchronise import Ready
 from hybridmap.trajectory import NS_PER_S
 from hybridmap.vision.base import Belief
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """What one instant did to the map, and why.
+
+    Attributes:
+        stamp_ns: of the sample.
+        pose_odom_robot: (3,) decoded from the path integrator's activity; `odom` begins where the drive begins.
+        pose_map_robot: (3,) by the primary back-end.
+        poses_map_robot: the same by every back-end, by name.
+        at_node, delta_node_robot: the node that the robot is at (-1 before the first) and its pose (3,) seen from it.
+        new_node: the experience made here, None if none was.
+        edges: numbers of the edges that are new or changed their status.
+        reason: why a node was made, or why not.
+    """
+
+    stamp_ns: int
+    pose_odom_robot: Array
+    pose_map_robot: Array
+    poses_map_robot: Mapping[str, Array]
+    at_node: int
+    delta_node_robot: Array
+    reason: str
+    new_node: int | None = None
+    edges: tuple[int, ...] = ()
+
+
+class Position:
+    """Follows the robot from node to node.
+
+    Attributes:
+        stamp_ns: of the last motion.
+        pose_odom: (3,) in `odom`, as the cells have it.
+        pose_odom_given: (3,) in the odometry as it came in.
+        travel_m: path length so far.
+        at_node: the node that the robot is at, -1 before the first.
+        pose_odom_at_node: (3,) of that node in `odom`.
+        pose_map_at_node: (3,) of that node by every back-end, by name.
+    """
+
+    def __init__(self, config: EdgesConfig, primary: str) -> None:
+        """Start before the first node; `primary` is the back-end that says where the robot is."""
+        self._config = config
+        self._primary = primary
+        self._driven = (0.0, 0.0)  # since the last node was made: m and rad
+        self.stamp_ns = 0
+        self.pose_odom: Array = IDENTITY
+        self.pose_odom_given: Array = IDENTITY
+        self.travel_m = 0.0
+        self.at_node = -1
+        self.pose_odom_at_node: Array = IDENTITY
+        self.pose_map_at_node: Mapping[str, Array] = {}
+
+    @property
+    def moved(self) -> Array:
+        """(3,) the robot seen from the node that it is at."""
+        return between(self.pose_odom_at_node, self.pose_odom)
+
+    def drive(self, ready: Ready, pose_odom: Array) -> None:
+        """The robot moved; `pose_odom` (3,) is where the cells have it now."""
+        self.stamp_ns, self.pose_odom_given, self.pose_odom = ready.stamp_ns, ready.pose_odom_robot, pose_odom
+        travel_m, turn_rad = float(np.hypot(ready.delta_robot[0], ready.delta_robot[1])), abs(float(ready.delta_robot[2]))
+        self.travel_m += travel_m
+        self._driven = (self._driven[0] + travel_m, self._driven[1] + turn_rad)
+
+    def odometry(self, pose_odom_before: Array) -> RelativePose:
+        """The motion from a pose (3,) in `odom` to here, as unsure as the way since the last node makes it."""
+        return RelativePose(between(pose_odom_before, self.pose_odom), odometry_covariance(self._config, *self._driven))
+
+    def rest(self) -> None:
+        """All that belongs to the new node was done: the way to the next one begins."""
+        self._driven = (0.0, 0.0)
+
+    def hang(self, node: int, pose_odom_node: Array) -> None:
+        """From now on the robot is seen from a node, which lies at a pose (3,) in `odom`."""
+        self.at_node, self.pose_odom_at_node = node, pose_odom_node
+
+    def correct(self, poses_of: Mapping[str, Array]) -> None:
+        """The back-ends have the nodes at poses (N, 3), by name."""
+        self.pose_map_at_node = {name: poses[self.at_node] for name, poses in poses_of.items()}
+
+    def pose_map(self, pose_odom: Array) -> Array:
+        """(3,) a pose in `odom` on the map of the primary back-end."""
+        at_node = self.pose_map_at_node.get(self._primary)
+        return pose_odom if at_node is None else compose(at_node, between(self.pose_odom_at_node, pose_odom))
+
+    def update(self, reason: str, node: int | None = None, edges: Sequence[int] = ()) -> Update:
+        """What there is to say now."""
+        moved, pose_map = self.moved, self.pose_map(self.pose_odom)
+        on_map = {name: compose(pose, moved) for name, pose in self.pose_map_at_node.items()}
+        return Update(self.stamp_ns, self.pose_odom, pose_map, on_map, self.at_node, moved, reason, node, tuple(edges))
 
 
 class EdgeBook:

@@ -9,17 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridmap.backends.base import Backend
-from hybridmap.backends.ensemble import Ensemble
+from hybridmap.backends.driver import Ensemble
 from hybridmap.calibration.online import OnlineCalibration
 from hybridmap.config import Config
-from hybridmap.edge_book import EdgeBook
+from hybridmap.edge_book import EdgeBook, Position, Update
 from hybridmap.geometry import IDENTITY, Array, between, compose, inverse
 from hybridmap.graph.edges import Edge, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node, Novelty
 from hybridmap.metrics import StageClock
 from hybridmap.neural.path_integrator import PathIntegrator, Reanchoring
 from hybridmap.odometry_model import Gains
-from hybridmap.position import Position, Update
 from hybridmap.streams.base import Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
@@ -60,7 +59,7 @@ class Mapper:
         self.cells = Reanchoring(self.integrator, config.neural.reanchor_weight)
         self.vision = create_front_end(config.vision, rig or rig_of(config.sensors), config.seed, self.clock)
         self.backends = Ensemble(config.backends, self.clock, backends)
-        self.calibration = OnlineCalibration(config.calibration, Gains.of(config.neural))
+        self.calibration = OnlineCalibration(Gains.of(config.neural)) if config.calibration.online else None
         self.anchors = NO_ANCHORS
         self._synchroniser = Synchroniser(latency_s=config.sensors.latency_s, odometry_delay_s=config.sensors.odometry_delay_s)
         self._novelty = Novelty(config.nodes)
@@ -189,14 +188,15 @@ class Mapper:
 
     def _calibrate(self) -> str:
         """Let the gains follow the map, where the map is sure; returns what to add to the reason."""
-        change = self.calibration.follow(self._position.stamp_ns, self.map.pose_graph, self.poses)
+        change = self.calibration.follow(self._position.stamp_ns, self.map.pose_graph, self.poses) if self.calibration else None
         if change is None:
             return ""
         self.integrator.gains = change.gains
         return f"; {change}"
 
     def _path_integrate(self, ready: Ready) -> None:
-        self.calibration.observe(ready.stamp_ns, ready.delta_robot)
+        if self.calibration is not None:
+            self.calibration.observe(ready.stamp_ns, ready.delta_robot)
         with self.clock.stage("neural"):
             self.integrator.step(ready.delta_robot, ready.dt_s)
             self._position.drive(ready, self.cells.pose_odom_robot)

@@ -12,8 +12,10 @@ import numpy as np
 
 from hybridmap.backends import objective
 from hybridmap.backends.base import ODOMETRY, SolveReport
+from hybridmap.calibration.online import GainChange
 from hybridmap.calibration.sessions import GAIN_CHANGES
 from hybridmap.config import Config
+from hybridmap.edge_book import Update
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.edges import EdgeKind, Status
@@ -21,7 +23,6 @@ from hybridmap.graph.gaps import carries, unobserved
 from hybridmap.graph.io import graph_hash
 from hybridmap.mapper import Mapper
 from hybridmap.metrics import Metric, figure
-from hybridmap.position import Update
 from hybridmap.store import MapStore
 from hybridmap.store.session_folder import SessionFolder
 from hybridmap.store.track import trajectory_of
@@ -132,7 +133,7 @@ class _Recorder:
         self.store.add_node(number, mapper.map.node(number), initial, keyframe, mapper.cells.activity_at(number))
 
     def _write_gain_changes(self) -> None:
-        changes = self._mapper.calibration.changes
+        changes = _gain_changes(self._mapper)
         if len(changes) > self._gain_changes:
             self._gain_changes = len(changes)
             self.store.put_info(GAIN_CHANGES, [change.row for change in changes])
@@ -192,7 +193,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
         "stream": dict(stream.report.counts),
         "remarks": [
             *stream.report.remarks,
-            *map(str, mapper.calibration.changes),
+            *map(str, _gain_changes(mapper)),
             *([str(free)] if free is not None and free.matters else []),
             *map(str, carries(mapper.map)),
             *_lost(mapper),
@@ -206,6 +207,10 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
     for key in ("graph_hash", "primary_backend"):
         store.put_info(key, head[key])
     return Session(folder, head, metrics)
+
+
+def _gain_changes(mapper: Mapper) -> list[GainChange]:
+    return mapper.calibration.changes if mapper.calibration is not None else []
 
 
 def _lost(mapper: Mapper) -> list[str]:

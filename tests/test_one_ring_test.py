@@ -12,10 +12,9 @@ from hybridmap.graph.agreement import BOUND, Ring
 from hybridmap.graph.edges import Edge, EdgeKind, Search, Status
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.vision.base import Belief
-from hybridmap.vision.gating import Whereabouts
 from hybridmap.vision.laser.clusters import Commitment
 from hybridmap.vision.laser.hypotheses import Hypothesis as LaserHypothesis
-from hybridmap.vision.relocalising import Relocaliser, Sighting
+from hybridmap.vision.relocalising import Relocaliser, Sighting, Whereabouts
 from hybridmap.vision.rgbd.support import Hypothesis, Support
 
 NODES, AGAIN = 60, 30

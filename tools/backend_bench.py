@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 
 from hybridmap import backends
 from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph, values
-from hybridmap.backends.relaxation import sweeps
-from hybridmap.backends.relaxation.sweeps import relax_links
+from hybridmap.backends.relaxation import ratslam as sweeps
+from hybridmap.backends.relaxation.ratslam import relax_links
 from hybridmap.config.backends import RelaxationConfig
 from hybridmap.geometry import Array, between, compose, exp, wrap_angle
 from hybridmap.graph.edges import EdgeKind

@@ -1,9 +1,10 @@
-"""Following a growing graph: one driver for every solver, which is a function from (graph, start) to an outcome."""
+"""Following a growing graph: one driver for every solver, and any number of back-ends side by side on one graph."""
 
 from __future__ import annotations
 
+import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from enum import Enum
 
@@ -11,13 +12,14 @@ import numpy as np
 
 from hybridmap.backends.base import Backend, Outcome, Solution, Solver, SolveReport, SolveStatus, SupportsPoseGraph
 from hybridmap.backends.judging.clusters import rejected_clusters
-from hybridmap.backends.judging.weak import hanging_nodes, weak_edges
-from hybridmap.backends.objective import chi2, gate_of, squared_norms, total, unit_variance
+from hybridmap.backends.objective import chi2, gate_of, hanging_nodes, squared_norms, total, unit_variance, weak_edges
+from hybridmap.backends.registry import create
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.paths import extend, require_connected
 from hybridmap.graph.pose_graph import Change, PoseGraph, difference, prefix
+from hybridmap.metrics import StageClock
 
 _ROUNDING = 1e-9  # of chi2: a chain without loops has none, and no solver finds less
 
@@ -231,3 +233,63 @@ def replay(backend: Backend, graph: PoseGraph) -> Iterator[Solution]:
 def _first_line(error: BaseException) -> str:
     text = str(error).strip()
     return text.splitlines()[0] if text else type(error).__name__
+
+
+log = logging.getLogger(__name__)
+
+
+class Ensemble:
+    """Feeds every back-end the same graph, in the same order; one that fails is reported and keeps its last poses.
+
+    Attributes:
+        names: of the back-ends, in order.
+        primary: name of the first.
+        solutions: latest of each, by name.
+        failures: why one failed the last time, by name.
+    """
+
+    def __init__(self, config: BackendsConfig, clock: StageClock, backends: Sequence[str | Backend] | None = None) -> None:
+        """Create the back-ends.
+
+        Args:
+            config: their settings, and their names.
+            clock: gets a stage `backend/<name>` for each.
+            backends: names, or back-ends in a fresh state, in place of those that `config` names.
+
+        Raises:
+            BackendError: an unknown name, none at all, or one that is there twice.
+        """
+        made = [create(backend, config) for backend in (config.names if backends is None else backends)]
+        self.solutions: dict[str, Solution] = {}
+        self.failures: dict[str, str] = {}
+        self._clock = clock
+        self._backends: dict[str, Backend] = {backend.name: backend for backend in made}
+        if not made or len(self._backends) < len(made):
+            raise BackendError(f"back-ends: expected one or more, each once, found {[backend.name for backend in made]}")
+        self.names = tuple(self._backends)
+        self.primary = self.names[0]
+
+    def poses(self, graph: PoseGraph, name: str | None = None) -> Array:
+        """(N, 3) latest poses of a back-end (default: the primary), carried on to newer nodes by their consecutive edges."""
+        solution = self.solutions.get(name or self.primary)
+        return extend(graph, solution.poses if solution is not None else graph.initial[:1])
+
+    def update(self, graph: PoseGraph) -> None:
+        """Let every back-end follow the graph."""
+        for name, backend in self._backends.items():
+            self._run(name, backend, graph, final=False)
+
+    def finish(self, graph: PoseGraph) -> None:
+        """Let every back-end come to its final solution."""
+        for name, backend in self._backends.items():
+            self._run(name, backend, graph, final=True)
+
+    def _run(self, name: str, backend: Backend, graph: PoseGraph, *, final: bool) -> None:
+        try:
+            with self._clock.stage(f"backend/{name}"):
+                self.solutions[name] = backend.finish(graph) if final else backend.update(graph)
+            self.failures.pop(name, None)
+        except BackendError as error:
+            if name not in self.failures:
+                log.warning("%s failed at node %d and keeps its last poses: %s", name, graph.n_nodes - 1, error)
+            self.failures[name] = str(error)

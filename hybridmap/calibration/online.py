@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.legs import Motion
 from hybridmap.calibration.regression import Sighting, regress
-from hybridmap.config.mapping import CalibrationConfig
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array
 from hybridmap.graph.edges import EdgeKind
@@ -50,15 +49,14 @@ class GainChange:
 
 
 class OnlineCalibration:
-    """Collects raw odometry, and from time to time regresses it on the map; does nothing where it is switched off.
+    """Collects raw odometry, and from time to time regresses it on the map.
 
     The odometry edges that are in the map stay as they were measured; new gains hold for the way ahead.
     """
 
-    def __init__(self, config: CalibrationConfig, gains: Gains) -> None:
+    def __init__(self, gains: Gains) -> None:
         """Start with the gains that the path integrator uses."""
         self.changes: list[GainChange] = []
-        self._config = config
         self._in_use = gains
         self._stamps_ns: list[int] = []
         self._steps: list[Array] = []
@@ -68,7 +66,7 @@ class OnlineCalibration:
 
     def observe(self, stamp_ns: int, delta_robot: Array) -> None:
         """Take in a raw step (3,) that ends at a stamp; a second step at one stamp must not move."""
-        if not self._config.online or (self._stamps_ns and stamp_ns <= self._stamps_ns[-1]):
+        if self._stamps_ns and stamp_ns <= self._stamps_ns[-1]:
             return
         if self._stamps_ns:
             self._steps.append(delta_robot)
@@ -83,8 +81,6 @@ class OnlineCalibration:
             graph: gives nodes and accepted edges, the new node included; called only when an estimate is due, as is
             poses: gives (N, 3) of all nodes on the map.
         """
-        if not self._config.online:
-            return None
         self._node_stamps_ns.append(stamp_ns)
         if self._travel_m < self._due_m or not np.any(graph().kinds != EdgeKind.ODOMETRY):
             return None

@@ -26,9 +26,9 @@ neural.place neural/place.py attractor_width_cells
 neural.place neural/place.py grid_inputs_side recruit_threshold inhibition max_cells
 calibration calibration/online.py first_m every_m
 backends.relaxation backends/relaxation/relaxing.py tolerance_m
-backends.relaxation backends/relaxation/sweeps.py robust_scale_m robust_scale_rad robust_start
+backends.relaxation backends/relaxation/ratslam.py robust_scale_m robust_scale_rad robust_start
 backends.robust backends/gtsam/factors.py huber_scale dcs_phi geman_mcclure_scale
-backends.robust backends/judging/weak.py odometry_scale
+backends.robust backends/objective.py odometry_scale
 backends.gnc backends/gtsam/gnc.py chunk_nodes mu_factor max_rounds
 backends.consistency backends/judging/prefilter.py neighbours
 backends.consistency graph/agreement.py quantile
@@ -39,8 +39,8 @@ vision.relocalising vision/relocalising.py support mismatch_max mismatch_scale w
 vision.relocalising vision/rgbd/closing.py span_m doubt_nodes unrecognised_nodes known_m known_deg:KNOWN_RAD
 vision.relocalising vision/rgbd/whole_map.py separation doubtful_m
 vision.laser.scan vision/laser/cloud.py range_max_m cell_m
-vision.laser.registration vision/laser/likelihood.py reach_m field_sigma_m
-vision.laser.registration vision/laser/registration.py cauchy_scale_m iterations inlier_m sigma_m spurious
+vision.laser.registration vision/laser/cloud.py reach_m:PARTNER_M field_sigma_m
+vision.laser.registration vision/laser/scan_matching.py cauchy_scale_m iterations inlier_m sigma_m spurious
 vision.laser.tracking vision/laser/tracking.py submap_nodes narrow wide lost inliers_sure contradiction_m contradiction_deg
 vision.laser.tracking vision/laser/tracking.py floor_m floor_deg
 vision.laser.tracking vision/laser/checks.py inliers_min inliers_weak translation_max_m
@@ -51,8 +51,8 @@ vision.laser.commitment vision/laser/clusters.py wait_m probes span_m span_per_e
 vision.laser.commitment vision/laser/hypotheses.py sure_sigma_m
 vision.laser.commitment vision/laser/checks.py rival
 vision.laser.relocalising vision/relocalising.py support mismatch_max mismatch_scale wait_m
-vision.laser.relocalising vision/laser/whole_map.py span_m unrecognised_probes from_m often_m submaps misfit
-vision.laser.relocalising vision/laser/continuity.py map_violation sure_m
+vision.laser.relocalising vision/laser/kidnapping.py span_m unrecognised_probes from_m often_m submaps misfit
+vision.laser.relocalising vision/laser/kidnapping.py map_violation sure_m
 vision.laser.relocalising vision/laser/checks.py contradiction_sigmas violation:WAY_VIOLATION
 vision.laser.relocalising vision/laser/hypotheses.py modes:MODES_ANYWHERE
 vision.laser.revisits vision/laser/revisits.py radius_m every_m apart_m partners probe_half_m target_half_m

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hybridmap.backends.base import ODOMETRY, Solution
 from hybridmap.config import Config
+from hybridmap.edge_book import Update
 from hybridmap.errors import StudyError
 from hybridmap.evaluate.association import known_at
 from hybridmap.evaluate.edge_errors import ClosureLimits, closure_errors, edge_errors, normalised_errors
@@ -23,7 +24,6 @@ from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.gaps import grounded
 from hybridmap.mapper import Mapper
 from hybridmap.metrics import StageClock
-from hybridmap.position import Update
 from hybridmap.simulation import SimulatedStream
 from hybridmap.store.track import Track, trajectory_of
 from hybridmap.streams import open_stream

@@ -5,7 +5,7 @@ import pytest
 
 from hybridmap import backends
 from hybridmap.backends.comparison import compare
-from hybridmap.backends.ensemble import Ensemble
+from hybridmap.backends.driver import Ensemble
 from hybridmap.config import Config
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError

@@ -13,9 +13,9 @@ from numba import njit
 
 from hybridmap import backends, compiled
 from hybridmap.backends.base import Outcome, SolveStatus
-from hybridmap.backends.relaxation import sweeps
+from hybridmap.backends.relaxation import ratslam as sweeps
+from hybridmap.backends.relaxation.ratslam import relax_links
 from hybridmap.backends.relaxation.relaxing import TOLERANCE_M, swept
-from hybridmap.backends.relaxation.sweeps import relax_links
 from hybridmap.config.backends import RelaxationConfig
 from hybridmap.errors import GraphError
 from hybridmap.geometry import compose, wrap_angle
@@ -25,7 +25,7 @@ from tests.backends.graphs_for_tests import laps, star
 ELSEWHERE = """
 import sys, numba, numpy as np
 from tests.backends.graphs_for_tests import laps
-from hybridmap.backends.relaxation.sweeps import relax_links
+from hybridmap.backends.relaxation.ratslam import relax_links
 from hybridmap.config.backends import RelaxationConfig
 graph = laps(np.random.default_rng(0), noise=3.0)[0]
 print(numba.config.DISABLE_JIT, relax_links(graph, graph.initial, 10, RelaxationConfig(), robust=True).poses.tobytes().hex())

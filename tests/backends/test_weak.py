@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridmap import backends
-from hybridmap.backends.judging import weak
-from hybridmap.backends.judging.weak import WEAK, hanging_nodes, motion_weights, truncated_cost, weak_edges
-from hybridmap.backends.objective import squared_norms
+from hybridmap.backends import objective
+from hybridmap.backends.objective import WEAK, hanging_nodes, motion_weights, squared_norms, truncated_cost, weak_edges
 from hybridmap.config.backends import BackendsConfig, RobustConfig
 from hybridmap.errors import GraphError
 from hybridmap.geometry import align, transform_points
@@ -54,7 +53,7 @@ def test_weights_and_costs_are_those_of_gtsams_kernels(name, off_m, scale):
     kernel, config = KERNELS[name].Create(scale), RobustConfig(odometry=name)
     whitened = np.sqrt(squared).tolist()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(weak, "ODOMETRY_SCALE", scale)
+        patch.setattr(objective, "ODOMETRY_SCALE", scale)
         assert motion_weights(graph, squared, config) == pytest.approx([kernel.weight(r) for r in whitened])
         assert truncated_cost(graph, poses, 1.0, config) == pytest.approx(2.0 * sum(map(kernel.loss, whitened)), abs=1e-12)
 

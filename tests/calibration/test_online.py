@@ -11,15 +11,12 @@ from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.online import OnlineCalibration
 from hybridmap.calibration.regression import regress
 from hybridmap.config import Config
-from hybridmap.config.mapping import CalibrationConfig
 from hybridmap.geometry import compose
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.mapper import Mapper
 from hybridmap.odometry_model import NEUTRAL, Gains, remove
 from tests.calibration.drives import GAINS, STEP_NS, drive, experience_map
 from tests.narrowing import known
-
-ON = CalibrationConfig(online=True)
 
 
 @pytest.fixture(autouse=True)
@@ -28,12 +25,12 @@ def soon(monkeypatch):
     monkeypatch.setattr(online, "EVERY_M", 20.0)
 
 
-def run(config, gains, registered=True, seed=0):
+def run(gains, registered=True, seed=0):
     """Feed a drive; the map's poses are the truth. Returns the stage and the changes it asked for."""
     rng = np.random.default_rng(seed)
     one = drive(rng, laps=4, gains=gains)
     experiences, chosen = experience_map(one, rng, registered=registered)
-    graph, stage = experiences.pose_graph(), OnlineCalibration(config, NEUTRAL)
+    graph, stage = experiences.pose_graph(), OnlineCalibration(NEUTRAL)
     changes: list[online.GainChange | None] = []
     node = {int(at): k for k, at in enumerate(chosen)}
     for index, stamp in enumerate(one.motion.stamps_ns):
@@ -45,14 +42,12 @@ def run(config, gains, registered=True, seed=0):
 
 
 def test_off_by_default():
-    assert not Config().calibration.online
-    stage, changes = run(CalibrationConfig(), GAINS)
-    assert changes == stage.changes == []
+    assert Mapper(Config.from_tree({"vision": {"sensor": "none"}}, "test")).calibration is None
 
 
 def test_a_clear_error_is_corrected_and_said(caplog):
     with caplog.at_level(logging.WARNING):
-        stage, changes = run(ON, GAINS)
+        stage, changes = run(GAINS)
     assert changes
     assert changes == stage.changes
     assert changes[-1].gains.heading_bias_rad_m == pytest.approx(GAINS.heading_bias_rad_m, abs=0.01)
@@ -64,7 +59,7 @@ def test_a_gain_that_was_not_measured_stays_and_is_not_said(monkeypatch):
     covariance = np.diag([np.inf, 1e-6, 1e-6, 1e-4])
     estimate = Estimate(Gains(1.0, 0.9, 0.02), 0.0, covariance, 4.0, 20.0, 80.0, 1.0, 0.0)
     monkeypatch.setattr(online, "regress", lambda _: estimate)
-    stage = OnlineCalibration(ON, Gains(1.05, 1.0, 0.0))
+    stage = OnlineCalibration(Gains(1.05, 1.0, 0.0))
     rng = np.random.default_rng(0)
     graph = experience_map(drive(rng, laps=1), rng, registered=True)[0].pose_graph()
     for k in range(100):
@@ -75,7 +70,7 @@ def test_a_gain_that_was_not_measured_stays_and_is_not_said(monkeypatch):
 
 
 def test_right_odometry_is_left_alone():
-    assert sum(len(run(ON, NEUTRAL, seed=seed)[1]) for seed in range(4)) <= 1
+    assert sum(len(run(NEUTRAL, seed=seed)[1]) for seed in range(4)) <= 1
 
 
 def test_a_map_of_odometry_alone_says_nothing():
@@ -83,7 +78,7 @@ def test_a_map_of_odometry_alone_says_nothing():
     one = drive(rng, laps=2)
 
     experiences, chosen = experience_map(one, rng)
-    graph, stage = experiences.pose_graph().only(EdgeKind.ODOMETRY), OnlineCalibration(ON, NEUTRAL)
+    graph, stage = experiences.pose_graph().only(EdgeKind.ODOMETRY), OnlineCalibration(NEUTRAL)
     for index, stamp in enumerate(one.motion.stamps_ns):
         stage.observe(int(stamp), one.motion.steps[index - 1] if index else np.zeros(3))
     assert stage.follow(int(one.motion.stamps_ns[chosen[-1]]), lambda: graph, lambda: one.truth[chosen]) is None

@@ -9,8 +9,7 @@ from hybridmap.geometry import RelativePose, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
 from hybridmap.vision import relocalising
 from hybridmap.vision.base import Belief
-from hybridmap.vision.gating import Chain, Whereabouts
-from hybridmap.vision.relocalising import Relocaliser, Sighting
+from hybridmap.vision.relocalising import Chain, Relocaliser, Sighting, Whereabouts
 
 STEP_M = 0.3
 X = (STEP_M * np.arange(200)).astype(np.float64)

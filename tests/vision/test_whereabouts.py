@@ -1,6 +1,6 @@
 """When a robot counts as lost, and where its chain broke."""
 
-from hybridmap.vision.gating import Chain, Whereabouts
+from hybridmap.vision.relocalising import Chain, Whereabouts
 
 
 def test_places_that_are_known_and_not_recognised_make_it_lost():

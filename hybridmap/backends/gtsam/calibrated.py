@@ -19,8 +19,7 @@ from hybridmap.backends.gtsam.batch import run
 from hybridmap.backends.gtsam.covariance import Covariances
 from hybridmap.backends.gtsam.factors import factor_graph, noise_models
 from hybridmap.backends.judging.clusters import rejected_clusters
-from hybridmap.backends.judging.weak import softened, truncated_cost
-from hybridmap.backends.objective import gate_of, residuals
+from hybridmap.backends.objective import gate_of, residuals, softened, truncated_cost
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array, adjoint, between, log
 from hybridmap.graph.paths import own_odometry

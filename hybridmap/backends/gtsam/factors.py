@@ -8,7 +8,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from hybridmap.backends.judging.weak import ODOMETRY_SCALE
+from hybridmap.backends.objective import ODOMETRY_SCALE
 from hybridmap.config.backends import RobustConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph

@@ -22,8 +22,7 @@ from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph, factors,
 from hybridmap.backends.gtsam.initial import best_start, trusted_start
 from hybridmap.backends.gtsam.robust import WarmKernel, with_kernel
 from hybridmap.backends.judging.clusters import neighbouring_pairs, rejected_clusters
-from hybridmap.backends.judging.weak import softened, truncated_cost, weak_edges
-from hybridmap.backends.objective import SLACK, gate_of, squared_norms, unit_variance
+from hybridmap.backends.objective import SLACK, gate_of, softened, squared_norms, truncated_cost, unit_variance, weak_edges
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.paths import extend

@@ -22,8 +22,7 @@ from hybridmap.backends.gtsam.factors import (
 )
 from hybridmap.backends.gtsam.initial import angular_start
 from hybridmap.backends.gtsam.robust import judged
-from hybridmap.backends.judging.weak import truncated_cost
-from hybridmap.backends.objective import gate_of, squared_norms, total
+from hybridmap.backends.objective import gate_of, squared_norms, total, truncated_cost
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array, compose, exp
 from hybridmap.graph.pose_graph import Change, PoseGraph, difference, prefix

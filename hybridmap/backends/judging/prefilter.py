@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from hybridmap.backends.base import Backend, Solution, SupportsPoseGraph
 from hybridmap.backends.gtsam.covariance import expected_loops
 from hybridmap.backends.judging.clusters import loops_of, neighbouring_pairs, rejected_clusters
-from hybridmap.backends.judging.weak import softened, truncated_cost
-from hybridmap.backends.objective import SLACK, chi2, gate_of
+from hybridmap.backends.objective import SLACK, chi2, gate_of, softened, truncated_cost
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import GraphError
 from hybridmap.graph.agreement import BOUND, agreement, chi2_quantile, largest_consistent_set, ring

@@ -1,4 +1,4 @@
-"""One scan as points with normals in `base_link`, and the merging of many into one cloud."""
+"""One scan as points with normals in `base_link`, many merged into one cloud, and the likelihood field of a cloud."""
 
 from __future__ import annotations
 
@@ -24,6 +24,10 @@ AGREEING = 0.3
 """Length of the sum of the normals in a cell below which they contradict one another, and the cell has none."""
 NEIGHBOURS = 3
 """Beams to either side of a point that give it its normal."""
+PARTNER_M = 0.3
+"""A point farther than this from every target point has no partner, m: a chair's width, less than a corridor's."""
+FIELD_SIGMA_M = 0.12
+"""Width of the likelihood field on which starts are scored, m: about a step of the grid of starts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,3 +158,86 @@ def _normals(points: Array, reach_m: Array, scan: NDArray[np.int64]) -> Array:
     is_line = (total >= 3.0) & ((xx + yy - spread) <= THIN * (xx + yy + spread))
     normal *= np.where((normal * points).sum(axis=1) > 0.0, -1.0, 1.0)[:, None]
     return np.where(is_line[:, None], normal, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class LikelihoodField:
+    """A grid about a cloud.
+
+    Attributes:
+        low: (2,) corner of cell (0, 0), m.
+        cell_m: side of a cell.
+        shape: cells in x and y.
+        margin: empty cells at each border, so that a clipped look-up meets nothing.
+        labels: (cells,) int32, 1 + index of the nearest point of the cloud within reach, 0 for none.
+        likelihood: (cells,) uint8, 255 exp(-d^2 / 2 sigma^2) of the distance d to that point.
+        lines: (3, 1 + P) the line through each point: its normal, and its distance from the origin along that; 0 for none.
+    """
+
+    low: Array
+    cell_m: float
+    shape: tuple[int, int]
+    margin: int
+    labels: NDArray[np.int32]
+    likelihood: NDArray[np.uint8]
+    lines: Array
+
+    def cells(self, x: Array, y: Array) -> NDArray[np.int64]:
+        """Flat cell numbers of coordinates of any shape; those outside fall on the empty border."""
+        nx, ny = self.shape
+        column = _bounded((x - self.low[0]) * (1.0 / self.cell_m), self.margin, nx - 1 - self.margin)
+        row = _bounded((y - self.low[1]) * (1.0 / self.cell_m), self.margin, ny - 1 - self.margin)
+        return np.asarray(column * ny + row)
+
+
+def _bounded(cells: Array, low: int, high: int) -> NDArray[np.int64]:
+    np.maximum(cells, low, out=cells)
+    np.minimum(cells, high, out=cells)
+    return cells.astype(np.int64)
+
+
+def build_field(
+    cloud: Cloud,
+    cell_m: float = CELL_M,
+    reach_m: float = PARTNER_M,
+    sigma_m: float = FIELD_SIGMA_M,
+    search_m: float = 0.0,
+) -> LikelihoodField:
+    """Grow every point with a normal into its surroundings, the far cells first so that the nearest point wins.
+
+    Args:
+        cloud: P points with normals.
+        cell_m: side of a cell.
+        reach_m: how far a point reaches.
+        sigma_m: width of the likelihood.
+        search_m: largest translation of the starts that will be scored on this field.
+    """
+    usable = np.flatnonzero(cloud.normals[:, 0] ** 2 + cloud.normals[:, 1] ** 2 > 0.5)
+    points, normals = cloud.points[usable].T, cloud.normals[usable].T
+    reach, margin = int(np.ceil(reach_m / cell_m)), int(np.ceil(search_m / cell_m)) + 1
+    border = reach + 2 * margin + 1
+    if len(usable) == 0:
+        points, normals = np.zeros((2, 1)), np.zeros((2, 1))
+    low = np.array([coordinate.min() for coordinate in points]) - border * cell_m
+    column, row = ((coordinate - least) / cell_m for coordinate, least in zip(points, low, strict=True))
+    column, row = column.astype(np.int64), row.astype(np.int64)
+    nx, ny = int(column.max()) + border + 1, int(row.max()) + border + 1
+    offsets, distance_m = _disc(reach, cell_m)
+    index = (column * ny + row)[None] + (offsets[:, 0] * ny + offsets[:, 1])[:, None]
+    value = np.maximum(1.0, 255.0 * np.exp(-0.5 * (distance_m / sigma_m) ** 2)).astype(np.int32)
+    both = np.zeros(nx * ny, np.int32)  # label and likelihood in one number: the scattered write is what costs
+    both[index] = (np.arange(1, points.shape[1] + 1, dtype=np.int32) << 8)[None] | value[:, None]
+    labels, likelihood = both >> 8, (both & 255).astype(np.uint8)
+    lines = np.zeros((3, 1 + points.shape[1]))
+    lines[:2, 1:], lines[2, 1:] = normals, normals[0] * points[0] + normals[1] * points[1]
+    return LikelihoodField(low, cell_m, (nx, ny), margin, labels, likelihood, lines)
+
+
+def _disc(reach: int, cell_m: float) -> tuple[NDArray[np.int64], Array]:
+    """Cell offsets (O, 2) within reach and their length (O,) m, the longest first."""
+    side = np.arange(-reach, reach + 1)
+    offsets = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+    length = np.sqrt((offsets**2).sum(axis=1).astype(np.float64))
+    order = np.argsort(-length, kind="stable")
+    order = order[length[order] <= reach]
+    return offsets[order], length[order] * cell_m

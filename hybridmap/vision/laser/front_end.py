@@ -18,13 +18,12 @@ from hybridmap.trajectory import Anchors
 from hybridmap.vision.base import Belief, View
 from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan
 from hybridmap.vision.laser.clusters import Commitment
-from hybridmap.vision.laser.continuity import Continuity
 from hybridmap.vision.laser.hypotheses import Prober
+from hybridmap.vision.laser.kidnapping import Continuity, WholeMap
 from hybridmap.vision.laser.retrace import Retracer, SeenScan
 from hybridmap.vision.laser.revisits import Reviser
 from hybridmap.vision.laser.submap import Atlas
 from hybridmap.vision.laser.tracking import Step, Tracker
-from hybridmap.vision.laser.whole_map import WholeMap
 from hybridmap.vision.profile import laser_profile
 from hybridmap.vision.templates import ViewTemplates
 

@@ -13,10 +13,18 @@ from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, p
 from hybridmap.streams.laser import Laser
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser import checks
-from hybridmap.vision.laser.likelihood import STEP_DEG, STEP_M, Start, sharpened, spaced, square, survivors
-from hybridmap.vision.laser.registration import align, ambiguity_of
-from hybridmap.vision.laser.submap import Atlas, Field, Submap
-from hybridmap.vision.laser.visibility import violation_both_ways
+from hybridmap.vision.laser.scan_matching import (
+    STEP_DEG,
+    STEP_M,
+    Start,
+    align,
+    ambiguity_of,
+    sharpened,
+    spaced,
+    square,
+    survivors,
+)
+from hybridmap.vision.laser.submap import Atlas, Field, Submap, violation_both_ways
 
 LENGTH_M = 10.0
 """Travel that a probe covers, m: long enough that a corner or a door is in it."""

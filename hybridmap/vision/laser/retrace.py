@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from hybridmap.geometry import Array, between, compose, interpolate, wrap_angle
 from hybridmap.streams.laser import Laser, LaserScan
 from hybridmap.trajectory import Anchors, anchors_on
-from hybridmap.vision.laser.cloud import Cloud, clouds_of_scans, merged_at
-from hybridmap.vision.laser.likelihood import build_field
-from hybridmap.vision.laser.registration import Prior, align
+from hybridmap.vision.laser.cloud import Cloud, build_field, clouds_of_scans, merged_at
+from hybridmap.vision.laser.scan_matching import Prior, align
 from hybridmap.vision.laser.submap import Atlas
 
 BLOCK_NODES = 8

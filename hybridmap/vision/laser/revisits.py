@@ -12,10 +12,8 @@ from hybridmap.streams.laser import Laser
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser import checks
 from hybridmap.vision.laser.hypotheses import Hypothesis
-from hybridmap.vision.laser.likelihood import score_starts, spaced, square
-from hybridmap.vision.laser.registration import Prior, align, ambiguity_of
-from hybridmap.vision.laser.submap import Atlas, Field
-from hybridmap.vision.laser.visibility import violation_both_ways
+from hybridmap.vision.laser.scan_matching import Prior, align, ambiguity_of, score_starts, spaced, square
+from hybridmap.vision.laser.submap import Atlas, Field, violation_both_ways
 
 RADIUS_M = 2.5
 """Nodes nearer than this are registered again, m: they see the same room."""

@@ -10,9 +10,8 @@ import numpy as np
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, wrap_angle
 from hybridmap.graph.edges import Check, passed
 from hybridmap.vision.laser import checks
-from hybridmap.vision.laser.cloud import CELL_M, Cloud, merged
-from hybridmap.vision.laser.likelihood import LikelihoodField, build_field, score_starts, spaced, square
-from hybridmap.vision.laser.registration import Alignment, Prior, align
+from hybridmap.vision.laser.cloud import CELL_M, Cloud, LikelihoodField, build_field, merged
+from hybridmap.vision.laser.scan_matching import Alignment, Prior, align, score_starts, spaced, square
 from hybridmap.vision.laser.submap import Atlas
 
 SUBMAP_NODES = 25

@@ -13,9 +13,9 @@ from hybridmap.geometry import Array, RelativePose, between, wrap_angle
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status
 from hybridmap.metrics import StageClock
 from hybridmap.vision.base import Belief
-from hybridmap.vision.gating import Chain, Gate, Whereabouts, nodes_within
+from hybridmap.vision.gating import Gate, nodes_within
 from hybridmap.vision.profile import Profile
-from hybridmap.vision.relocalising import Relocaliser, Sighting
+from hybridmap.vision.relocalising import Chain, Relocaliser, Sighting, Whereabouts
 from hybridmap.vision.rgbd import checks
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp import Candidate, Verification, Verifier

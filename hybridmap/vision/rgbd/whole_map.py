@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hybridmap.geometry import loosest_direction
 from hybridmap.graph.edges import Edge, Lack, Search, Status
-from hybridmap.vision.gating import Chain
+from hybridmap.vision.relocalising import Chain
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp import Candidate, Verifier
 from hybridmap.vision.templates import Matcher

@@ -5,8 +5,7 @@ import pytest
 
 from hybridmap.geometry import IDENTITY
 from hybridmap.vision.laser.cloud import EMPTY, Cloud, cloud_of_scan, merged
-from hybridmap.vision.laser.submap import Atlas
-from hybridmap.vision.laser.visibility import violation
+from hybridmap.vision.laser.submap import Atlas, violation
 from tests.vision.laser.laser_worlds import LASER, cast, corridor, room
 
 

@@ -9,7 +9,7 @@ from hybridmap.graph.edges import Edge, EdgeKind, Status, at_least
 from hybridmap.streams.laser import LaserScan
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.cloud import cloud_of_scan
-from hybridmap.vision.laser.continuity import Continuity
+from hybridmap.vision.laser.kidnapping import Continuity
 from hybridmap.vision.laser.submap import Atlas
 from hybridmap.vision.laser.tracking import Step, Tracker
 from tests.vision.laser.laser_worlds import LASER, box, cast, ring, ring_drive, room

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from hybridmap.geometry import IDENTITY, between, compose, log
-from hybridmap.vision.laser.cloud import EMPTY, cloud_of_scan
-from hybridmap.vision.laser.likelihood import (
+from hybridmap.vision.laser.cloud import EMPTY, LikelihoodField, build_field, cloud_of_scan
+from hybridmap.vision.laser.scan_matching import (
     STEP_DEG,
     STEP_M,
-    LikelihoodField,
-    build_field,
+    Prior,
+    align,
+    ambiguity_of,
     score_poses,
     score_starts,
     separated,
@@ -20,7 +21,6 @@ from hybridmap.vision.laser.likelihood import (
     square,
     survivors,
 )
-from hybridmap.vision.laser.registration import Prior, align, ambiguity_of
 from hybridmap.vision.laser.submap import Atlas, Field
 from tests.vision.laser.laser_worlds import LASER, cast, corridor, room
 

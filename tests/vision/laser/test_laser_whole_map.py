@@ -7,7 +7,7 @@ from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind, Lack, Method, Search, Status
 from hybridmap.vision import relocalising
-from hybridmap.vision.laser import whole_map
+from hybridmap.vision.laser import kidnapping
 from hybridmap.vision.laser.hypotheses import WINDOW_M, Prober
 from tests.vision.laser.laser_worlds import LASER, Run, drifting, ring, ring_drive
 
@@ -78,7 +78,7 @@ def test_what_was_sought_on_the_whole_map_stays_with_its_figures(found):
 def test_mismatch_is_held_against_how_well_the_scans_of_the_drive_fit(found):
     run, down = found
     steps = {p.target: 1.0 - p.figures["fit"] for p in run.proposals if p.method is Method.SCANS and p.search is Search.CHAIN}
-    usual = whole_map.MISFIT
+    usual = kidnapping.MISFIT
     sightings = [p for p in last_words(run) if "mismatch" in p.figures]
     assert len(sightings) >= 4
     for p in sightings:
@@ -113,7 +113,7 @@ def test_of_many_submaps_those_with_the_likeliest_views_are_searched(found, monk
     searched = run.front_end.whole_map
     anchors = Prober(VisionConfig(), run.front_end.atlas, LASER).anchors_before(down)
     assert searched.likeliest(down + 2, anchors) == anchors
-    monkeypatch.setattr(whole_map, "SUBMAPS", 3)
+    monkeypatch.setattr(kidnapping, "SUBMAPS", 3)
     places = run.truth[run.node_at]
     near = []
     for node in range(down + 2, down + 8):

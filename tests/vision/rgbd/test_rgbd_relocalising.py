@@ -14,7 +14,7 @@ from hybridmap.geometry import RelativePose, align, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import Rig
-from hybridmap.vision.gating import Chain
+from hybridmap.vision.relocalising import Chain
 from hybridmap.vision.rgbd import checks, whole_map
 from hybridmap.vision.rgbd.pnp import Verification, Verifier
 from hybridmap.vision.rgbd.whole_map import WholeMap, chain_of
