@@ -124,7 +124,7 @@ def _lines(done: Study, measure: str, others: list[str]) -> list[list[str]]:
 
     by_row: dict[tuple[str, str], dict[str, Summary]] = {}
     for one in done.summaries:
-        by_row.setdefault((one.label, one.backend), {})[one.measure] = one
+        by_row.setdefault((one.cell.label, one.cell.backend), {})[one.measure] = one
     lines = []
     for (label, backend), found in by_row.items():
         error = found[measure]

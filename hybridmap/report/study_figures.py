@@ -134,7 +134,7 @@ def paired_groups(summaries: Sequence[Summary], measure: str) -> dict[str, list[
     groups: dict[str, list[Summary]] = {}
     for one in summaries:
         if one.measure == measure and one.difference is not None and one.difference.count > 1:
-            groups.setdefault(one.label, []).append(one)
+            groups.setdefault(one.cell.label, []).append(one)
     return groups
 
 
@@ -154,7 +154,7 @@ def difference_figure(groups: Mapping[str, Sequence[Summary]]) -> str:
             axes.axvline(0.0, color="#444444", linewidth=0.8)
             axes.set_xscale("symlog", linthresh=_LINEAR_M)
             axes.set_xlim(*_reach(ones))
-            axes.set_yticks(range(len(ones)), [one.backend for one in ones])
+            axes.set_yticks(range(len(ones)), [one.cell.backend for one in ones])
             axes.set_ylim(len(ones) - 0.5, -0.5)
             axes.set_title(label, fontsize=9.0)
             axes.set_xlabel(f"ATE minus that of {quoted(ones[0].baseline)} (m)")

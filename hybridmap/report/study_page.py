@@ -220,7 +220,7 @@ def groups_of(study: Study) -> list[Group]:
     measure, others = error_of(study), _others(study)
     found: dict[str, dict[str, dict[str, Summary]]] = {}
     for one in study.summaries:
-        found.setdefault(one.label, {}).setdefault(one.backend, {})[one.measure] = one
+        found.setdefault(one.cell.label, {}).setdefault(one.cell.backend, {})[one.measure] = one
     return [_group(label, by_backend, measure, others) for label, by_backend in found.items()]
 
 
@@ -237,7 +237,7 @@ def _line(by_measure: dict[str, Summary], measure: str, others: Sequence[str]) -
     if apart is not None and apart.excludes_zero and abs(apart.value) >= SHOWN_M:
         verdict = "lower" if apart.high < 0.0 else "higher"
     return Line(
-        backend=ate.backend,
+        backend=ate.cell.backend,
         solved=f"{ate.solved} of {ate.cells}",
         median=tables.number(ate.median),
         mean=_mean(ate.mean, ate.cells),

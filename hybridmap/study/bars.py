@@ -10,7 +10,7 @@ import numpy as np
 
 from hybridmap.backends.base import ODOMETRY
 from hybridmap.study.cell import CellResult
-from hybridmap.study.grid import Cell, Grid
+from hybridmap.study.grid import Cell, Grid, Group
 from hybridmap.study.measures import unit_of
 from hybridmap.study.model import BarConfig
 
@@ -69,9 +69,7 @@ class Verdict:
 
 def judge(grid: Grid, results: Mapping[str, CellResult]) -> list[Verdict]:
     """Hold every bar of the study against every group that it is for, in their order."""
-    groups: dict[tuple[tuple[str, str, str, float], str], list[Cell]] = {}
-    for cell in grid.cells:
-        groups.setdefault((cell.group, cell.backend), []).append(cell)
+    groups = grid.groups()
     return [
         _verdict(bar, cells, groups, results)
         for bar in grid.study.bars
@@ -91,7 +89,7 @@ def _is_for(bar: BarConfig, cell: Cell, grid: Grid) -> bool:
 def _verdict(
     bar: BarConfig,
     cells: Sequence[Cell],
-    groups: Mapping[tuple[tuple[str, str, str, float], str], Sequence[Cell]],
+    groups: Mapping[tuple[Group, str], Sequence[Cell]],
     results: Mapping[str, CellResult],
 ) -> Verdict:
     values = tuple(results[cell.key].figure(bar.figure) for cell in cells)

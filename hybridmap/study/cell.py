@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,6 @@ from hybridmap.backends.gtsam.initial import angular_start
 from hybridmap.backends.objective import chi2
 from hybridmap.backends.odometry import dead_reckoning
 from hybridmap.backends.registry import create
-from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError, HybridMapError
 from hybridmap.geometry import Array, align, between, compose
 from hybridmap.graph.paths import chain
@@ -25,7 +23,7 @@ from hybridmap.study import provenance
 from hybridmap.study.false_loops import Kind, with_drift, with_false_loops
 from hybridmap.study.frozen import Frozen
 from hybridmap.study.measures import KEPT, NEAR_M
-from hybridmap.study.model import BackendVariant, DriftConfig, Start, Way
+from hybridmap.study.model import BackendVariant, DriftConfig, backend_settings
 
 UNMAPPED, MAPPED = "unmapped", "mapped"
 """Status of a cell whose source gave no graph, and of one that is judged as its drive was mapped."""
@@ -39,7 +37,7 @@ class CellTask:
         key: digest of all that determines the figures.
         frozen: the graph with its reference, packed.
         drift, kind, rate, seed: what is done to it first.
-        backend, settings, start, way: as in `model.BackendVariant`.
+        variant: through which back-end, and how.
     """
 
     key: str
@@ -48,10 +46,7 @@ class CellTask:
     kind: Kind
     rate: float
     seed: int
-    backend: str
-    settings: BackendsConfig
-    start: Start
-    way: Way
+    variant: BackendVariant
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,26 +65,23 @@ class CellResult:
     key: str
     status: str
     message: str
-    figures: dict[str, float | None]
-    timings: dict[str, float]
-    code: str
+    figures: dict[str, float | None] = field(default_factory=dict)
+    timings: dict[str, float] = field(default_factory=dict)
+    code: str = field(default_factory=lambda: provenance.solving())
 
     def figure(self, name: str) -> float | None:
         """Any figure or timing; None where there is none."""
         return self.figures.get(name, self.timings.get(name))
 
 
-def key_of(
-    source_key: str, drift: DriftConfig, false_loops: tuple[str, float, int], variant: BackendVariant, settings: Any
-) -> str:
+def key_of(source_key: str, drift: DriftConfig, false_loops: tuple[str, float, int], variant: BackendVariant) -> str:
     """Digest of all that determines a cell; what plays no part (a rate of 0 has no kind and no seed) does not enter.
 
     Args:
         source_key: of the clean graph.
         drift: put on its odometry.
         false_loops: kind, rate and seed.
-        variant: the back-end's name, start and way.
-        settings: its whole section, a `BackendsConfig`.
+        variant: the back-end's name, settings, start and way.
     """
     kind, rate, seed = false_loops
     return provenance.digest(
@@ -100,7 +92,7 @@ def key_of(
             "drift_seed": seed if drift.by_chance else None,
             "false_loops": [kind, rate, seed] if rate > 0.0 else None,
             "backend": [variant.backend, variant.start, variant.way],
-            "settings": settings.model_dump(mode="json", exclude={"names"}),
+            "settings": backend_settings(variant).model_dump(mode="json", exclude={"names"}),
         }
     )
 
@@ -109,39 +101,37 @@ def run(task: CellTask) -> CellResult:
     """Disturb the graph, solve it, judge it. A typed error is a result; anything else is a mistake of ours and raised."""
     frozen = Frozen.unpack(task.frozen)
     if frozen.graph is None:
-        return CellResult(task.key, UNMAPPED, frozen.failure, {}, {}, provenance.solving())
-    if task.way == "mapped":
+        return CellResult(task.key, UNMAPPED, frozen.failure)
+    if task.variant.way == "mapped":
         return _as_mapped(task, frozen)
-    started = time.process_time()
-    counts: dict[str, float | None] = {}
+    started, counts = time.process_time(), dict[str, float | None]()
     try:
         drifted = with_drift(frozen.graph, task.drift, task.seed)
         graph = with_false_loops(drifted, task.kind, task.rate, task.seed)
         counts = _counts(drifted, graph)
         started = time.process_time()
-        solution = _solve(task, _begun(graph, task.start, frozen.reference))
+        solution = _solve(task, _begun(graph, task.variant.start, frozen.reference))
     except HybridMapError as error:
-        message = " ".join(str(error).split())
         spent = {"cpu_s": time.process_time() - started}
-        return CellResult(task.key, str(SolveStatus.FAILED), message, counts, spent, provenance.solving())
+        return CellResult(task.key, str(SolveStatus.FAILED), " ".join(str(error).split()), counts, spent)
     spent = {"cpu_s": time.process_time() - started}
     report = solution.report
     figures = counts | {"iterations": float(report.iterations), "chi2_initial": _finite(report.chi2_initial)}
     if report.status not in (SolveStatus.FAILED, SolveStatus.DIVERGED):
         figures |= judge(drifted, graph, solution, frozen.reference)
-    return CellResult(task.key, str(report.status), report.message, figures, spent, provenance.solving())
+    return CellResult(task.key, str(report.status), report.message, figures, spent)
 
 
 def _as_mapped(task: CellTask, frozen: Frozen) -> CellResult:
     """What the drive itself came to; the time of mapping is that of the back-end that drove."""
     assert frozen.mapped is not None
-    name = frozen.mapped.primary if task.backend == "primary" else task.backend
+    name = frozen.mapped.primary if task.variant.backend == "primary" else task.variant.backend
     if name not in frozen.mapped.figures:
         known = ", ".join(frozen.mapped.figures)
         message = f"{name}: did not follow the drive; there are {known} (`backends.names` of its configuration)"
-        return CellResult(task.key, str(SolveStatus.FAILED), message, {}, {}, provenance.solving())
+        return CellResult(task.key, str(SolveStatus.FAILED), message)
     timings = dict(frozen.mapped.timings) if name == frozen.mapped.primary else {}
-    return CellResult(task.key, MAPPED, "", dict(frozen.mapped.figures[name]), timings, provenance.solving())
+    return CellResult(task.key, MAPPED, "", dict(frozen.mapped.figures[name]), timings)
 
 
 def judge(own: PoseGraph, graph: PoseGraph, solution: Solution, reference: Array) -> dict[str, float | None]:
@@ -176,13 +166,13 @@ def errors(poses: Array, reference: Array) -> tuple[float, float]:
 
 def _solve(task: CellTask, graph: PoseGraph) -> Solution:
     """At once, node by node, or node by node with the end of the drive; the report counts everything."""
-    backend = create(task.backend, task.settings)
-    if task.way == "solve":
+    backend = create(task.variant.backend, backend_settings(task.variant))
+    if task.variant.way == "solve":
         return backend.solve(graph)
     iterations, last = 0, None
     for last in replay(backend, graph):
         iterations += last.report.iterations
-    if task.way == "drive":
+    if task.variant.way == "drive":
         last = backend.finish(graph)
         iterations += last.report.iterations
     assert last is not None
@@ -225,11 +215,10 @@ def _fates(graph: PoseGraph, solution: Solution) -> tuple[NDArray[np.bool_], NDA
 
 
 def _counts(own: PoseGraph, graph: PoseGraph) -> dict[str, float | None]:
-    loops = float(np.count_nonzero(own.is_loop))
     return {
         "nodes": float(graph.n_nodes),
         "edges": float(graph.n_edges),
-        "own_loops": loops,
+        "own_loops": float(np.count_nonzero(own.is_loop)),
         "false_loops": float(graph.n_edges - own.n_edges),
     }
 

@@ -87,15 +87,13 @@ def check(name: str, strength: float | tuple[float, ...], origin: str) -> None:
         raise ConfigError(f"{origin}: disturb: {name}: expected [picked up, put down, end], seconds from the first stamp")
 
 
-def scan_range_m(ranges: Ranges, limit_m: float, rng: np.random.Generator) -> Ranges:
+def scan_range_m(ranges: Ranges, limit_m: float, _rng: np.random.Generator) -> Ranges:
     """Returns beyond this are lost, m."""
-    del rng
     return np.where(ranges < limit_m, ranges, np.float32(np.nan))
 
 
-def scan_covered(ranges: Ranges, share: float, rng: np.random.Generator) -> Ranges:
+def scan_covered(ranges: Ranges, share: float, _rng: np.random.Generator) -> Ranges:
     """This share of the fan is covered, half of it at either end."""
-    del rng
     ranges, covered = ranges.copy(), round(0.5 * share * len(ranges))
     ranges[:covered] = ranges[len(ranges) - covered :] = np.nan
     return ranges
@@ -117,9 +115,8 @@ def beams_short(ranges: Ranges, share: float, rng: np.random.Generator) -> Range
     return np.where(stopped < share, where * ranges, ranges)
 
 
-def blur_s(samples: Samples, exposure_s: float, rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
+def blur_s(samples: Samples, exposure_s: float, _rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
     """Pictures are smeared along their rows by what the robot turns within this exposure, s."""
-    del rng
     newest: SelfMotion | None = None
     rate_rad_s, camera = 0.0, rig.sensors.get("camera")
     for sample in samples:
@@ -134,9 +131,8 @@ def blur_s(samples: Samples, exposure_s: float, rng: np.random.Generator, rig: R
         yield sample
 
 
-def darker(frame: RgbdFrame, share: float, rng: np.random.Generator) -> RgbdFrame:
+def darker(frame: RgbdFrame, share: float, _rng: np.random.Generator) -> RgbdFrame:
     """Every colour value is less by this share: 0.9 is dusk, 1 is night."""
-    del rng
     return replace(frame, color=np.rint(round(1.0 - share, 9) * frame.color).astype(np.uint8))
 
 
@@ -153,9 +149,8 @@ def depth_noise_m(frame: RgbdFrame, sigma_m: float, rng: np.random.Generator) ->
     return replace(frame, depth_m=np.where(frame.depth_m > 0.0, np.maximum(noisy, 0.0), frame.depth_m))
 
 
-def depth_range_m(frame: RgbdFrame, limit_m: float, rng: np.random.Generator) -> RgbdFrame:
+def depth_range_m(frame: RgbdFrame, limit_m: float, _rng: np.random.Generator) -> RgbdFrame:
     """Depth beyond this is lost, m."""
-    del rng
     return replace(frame, depth_m=np.where(frame.depth_m > limit_m, np.float32(0.0), frame.depth_m))
 
 
@@ -165,23 +160,20 @@ def depth_lost(frame: RgbdFrame, share: float, rng: np.random.Generator) -> Rgbd
     return replace(frame, depth_m=np.where(gone, np.float32(0.0), frame.depth_m))
 
 
-def wheel_scale(step: Array, share: float, rng: np.random.Generator) -> Array:
+def wheel_scale(step: Array, share: float, _rng: np.random.Generator) -> Array:
     """Every distance is reported too long by this share."""
-    del rng
     factors: Array = np.array([1.0 + share, 1.0 + share, 1.0])
     return step * factors
 
 
-def wheel_turn_scale(step: Array, share: float, rng: np.random.Generator) -> Array:
+def wheel_turn_scale(step: Array, share: float, _rng: np.random.Generator) -> Array:
     """Every turn is reported too large by this share."""
-    del rng
     factors: Array = np.array([1.0, 1.0, 1.0 + share])
     return step * factors
 
 
-def wheel_pull_deg_per_m(step: Array, bias_deg: float, rng: np.random.Generator) -> Array:
+def wheel_pull_deg_per_m(step: Array, bias_deg: float, _rng: np.random.Generator) -> Array:
     """A pull to the left, degrees per metre driven."""
-    del rng
     return _turned(step, math.radians(bias_deg) * math.hypot(step[0], step[1]))
 
 
@@ -201,9 +193,8 @@ def wheel_slips_per_m(step: Array, rate: float, rng: np.random.Generator) -> Arr
     return step + slip if hit else step
 
 
-def views_lost(samples: Samples, share: float, rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
+def views_lost(samples: Samples, share: float, _rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
     """This share of the scans and frames is lost, at regular intervals: a lower rate."""
-    del rng, rig
     number, kept = 0, 1.0 - share
     for sample in samples:
         if isinstance(sample, Observation):
@@ -213,9 +204,8 @@ def views_lost(samples: Samples, share: float, rng: np.random.Generator, rig: Ri
         yield sample
 
 
-def views_late_s(samples: Samples, late_s: float, rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
+def views_late_s(samples: Samples, late_s: float, _rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
     """Scans and frames are stamped so much later than they were taken, s."""
-    del rng, rig
     held: deque[Observation] = deque()
     for sample in samples:
         while held and held[0].stamp_ns < sample.stamp_ns:
@@ -227,12 +217,13 @@ def views_late_s(samples: Samples, late_s: float, rng: np.random.Generator, rig:
     yield from held
 
 
-def kidnapped_s(samples: Samples, times_s: tuple[float, float, float], rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
+def kidnapped_s(
+    samples: Samples, times_s: tuple[float, float, float], _rng: np.random.Generator, _rig: Rig
+) -> Iterator[Sample]:
     """The robot is picked up at the first time and put down at the second, and the drive ends at the third, s.
 
     What lies between is left out, and the odometry goes on where it was: the wheels felt nothing.
     """
-    del rng, rig
     up_ns = down_ns = end_ns = -1
     held, onward = IDENTITY, None
     for sample in samples:
@@ -255,8 +246,7 @@ def _scans(
 ) -> Disturbance:
     """Of every scan alone."""
 
-    def apply(samples: Samples, strength: float, rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
-        del rig
+    def apply(samples: Samples, strength: float, rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
         for sample in samples:
             yield replace(sample, ranges_m=change(sample.ranges_m, strength, rng)) if isinstance(sample, LaserScan) else sample
 
@@ -268,8 +258,7 @@ def _frames(
 ) -> Disturbance:
     """Of every frame alone."""
 
-    def apply(samples: Samples, strength: float, rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
-        del rig
+    def apply(samples: Samples, strength: float, rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
         for sample in samples:
             yield change(sample, strength, rng) if isinstance(sample, RgbdFrame) else sample
 
@@ -279,8 +268,7 @@ def _frames(
 def _wheels(change: Callable[[Array, float, np.random.Generator], Array], *, by_chance: bool = False) -> Disturbance:
     """Of every step between two odometry messages, in the robot's frame."""
 
-    def apply(samples: Samples, strength: float, rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
-        del rig
+    def apply(samples: Samples, strength: float, rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
         before: Array | None = None
         pose = IDENTITY
         for sample in samples:

@@ -9,8 +9,11 @@ from itertools import product
 
 from hybridmap.study.cell import CellTask, key_of
 from hybridmap.study.false_loops import Kind
-from hybridmap.study.model import SettingConfig, SourceConfig, StudyConfig, backend_settings
+from hybridmap.study.model import SettingConfig, SourceConfig, StudyConfig
 from hybridmap.study.sources import Source, SourceTask, open_source
+
+Group = tuple[str, str, str, float]
+"""Source, setting, and kind and rate of false loops."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +44,7 @@ class Cell:
         return f"{self.source}/{self.setting}" + (f"/{self.kind} {100 * self.rate:g} %" if self.kind else "")
 
     @property
-    def group(self) -> tuple[str, str, str, float]:
+    def group(self) -> Group:
         """What the cells of all back-ends and seeds have in common that are summed up together."""
         return self.source, self.setting, self.kind, self.rate
 
@@ -60,23 +63,19 @@ class Grid:
     cells: tuple[Cell, ...]
     sources: dict[str, SourceTask]
 
+    def groups(self) -> dict[tuple[Group, str], list[Cell]]:
+        """Group and back-end -> its cells, one a seed, in their order."""
+        found: dict[tuple[Group, str], list[Cell]] = {}
+        for cell in self.cells:
+            found.setdefault((cell.group, cell.backend), []).append(cell)
+        return found
+
     def task(self, cell: Cell, frozen: bytes) -> CellTask:
         """The work of a cell on its packed graph."""
         setting = next(setting for setting in self.study.settings if setting.name == cell.setting)
         variant = next(variant for variant in self.study.backends if variant.title == cell.backend)
         kind: Kind = "aliased" if cell.kind == "aliased" else "random"
-        return CellTask(
-            key=cell.key,
-            frozen=frozen,
-            drift=setting.drift,
-            kind=kind,
-            rate=cell.rate,
-            seed=cell.seed or 0,
-            backend=variant.backend,
-            settings=backend_settings(variant),
-            start=variant.start,
-            way=variant.way,
-        )
+        return CellTask(cell.key, frozen, setting.drift, kind, cell.rate, cell.seed or 0, variant)
 
 
 def lay_out(study: StudyConfig) -> Grid:
@@ -91,15 +90,14 @@ def lay_out(study: StudyConfig) -> Grid:
     opened = {source.title: open_source(source, maps=study.maps) for source in study.sources}
     cells: list[Cell] = []
     tasks: dict[str, SourceTask] = {}
-    variants = [(variant, backend_settings(variant)) for variant in study.backends]
     for source, setting in product(study.sources, study.settings):
         key_at = cache(partial(_enter, tasks, opened[source.title], setting))
         drawn = opened[source.title].by_chance(setting)
         for kind, rate in _false_loops(study):
             for seed in _seeds(study, source, drawn or rate > 0.0 or setting.drift.by_chance):
                 source_key = key_at((seed or 0) if drawn else 0)
-                for variant, settings in variants:
-                    key = key_of(source_key, setting.drift, (kind, rate, seed or 0), variant, settings)
+                for variant in study.backends:
+                    key = key_of(source_key, setting.drift, (kind, rate, seed or 0), variant)
                     cells.append(Cell(source.title, setting.name, kind, rate, seed, variant.title, source_key, key))
     return Grid(study, tuple(cells), tasks)
 

@@ -108,7 +108,7 @@ def _kept(key: str, outcome: CellResult | Lost, folder: StudyFolder) -> CellResu
 
 def _crashed(key: str, loss: Lost) -> CellResult:
     log.warning("a cell crashed: %s", loss.message)
-    return CellResult(key, CRASHED, loss.message, {}, {}, provenance.solving())
+    return CellResult(key, CRASHED, loss.message)
 
 
 def _require_same_code(code: str) -> None:

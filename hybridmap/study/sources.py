@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -27,29 +28,19 @@ from hybridmap.study.model import SettingConfig, SourceConfig, SyntheticConfig
 _BLOCK = 1 << 20
 
 
-class Maker(Protocol):
-    """Comes to a graph; it may be sent to another machine."""
-
-    def make(self) -> Frozen:
-        """The graph, with its truth where that is known.
-
-        Raises:
-            HybridMapError: there is none to be had.
-        """
-
-
 @dataclass(frozen=True, slots=True)
 class SourceTask:
     """How to come to a frozen graph with a reference.
 
     Attributes:
         key: digest of all that determines the graph and its reference.
-        maker: comes to the graph.
+        make: comes to the graph, with its truth where that is known, or raises a `HybridMapError`; it may be sent to
+            another machine.
         first_nodes: keep only so many of its nodes.
     """
 
     key: str
-    maker: Maker
+    make: Callable[[], Frozen]
     first_nodes: int | None = None
 
 
@@ -87,33 +78,10 @@ def open_source(source: SourceConfig, *, maps: bool = False) -> Source:
 def prepare(task: SourceTask) -> SourceResult:
     """Do what a task says: make the graph, and find its reference. A typed error is a frozen failure."""
     try:
-        frozen = _with_reference(_cut(task.maker.make(), task.first_nodes))
+        frozen = _with_reference(_cut(task.make(), task.first_nodes))
     except HybridMapError as error:
         frozen = Frozen(None, np.zeros((0, 3)), failure=" ".join(str(error).split()))
     return SourceResult(frozen.pack(), provenance.solving())
-
-
-@dataclass(frozen=True, slots=True)
-class Given:
-    """A graph that is there already."""
-
-    clean: bytes
-
-    def make(self) -> Frozen:
-        """Unpack it."""
-        return Frozen.unpack(self.clean)
-
-
-@dataclass(frozen=True, slots=True)
-class Laps:
-    """A graph made up from the seed."""
-
-    config: SyntheticConfig
-    seed: int
-
-    def make(self) -> Frozen:
-        """Draw it."""
-        return laps(self.config, np.random.default_rng(self.seed))
 
 
 class _Synthetic:
@@ -128,8 +96,8 @@ class _Synthetic:
 
     def task(self, setting: SettingConfig, seed: int) -> SourceTask:
         del setting
-        identity = {"synthetic": self._config.model_dump(), "seed": seed, "first": self._first}
-        return SourceTask(provenance.digest({**identity, "code": provenance.solving()}), Laps(self._config, seed), self._first)
+        identity = {"synthetic": self._config.model_dump(), "seed": seed, "first": self._first, "code": provenance.solving()}
+        return SourceTask(provenance.digest(identity), partial(laps, self._config, seed), self._first)
 
 
 class _Known:
@@ -139,7 +107,7 @@ class _Known:
         del maps
         clean = (_read_graph(source.graph) if source.graph is not None else _read_session(source.session)).pack()
         content = {"content": hashlib.sha256(clean).hexdigest(), "first": source.first_nodes, "code": provenance.solving()}
-        self._task = SourceTask(provenance.digest(content), Given(clean), source.first_nodes)
+        self._task = SourceTask(provenance.digest(content), partial(Frozen.unpack, clean), source.first_nodes)
 
     def by_chance(self, setting: SettingConfig) -> bool:
         del setting
@@ -188,7 +156,7 @@ class _Drive:
             "first": source.first_nodes,
             "code": [provenance.mapping(), provenance.solving()],
         }
-        return SourceTask(provenance.digest(identity), drive, source.first_nodes)
+        return SourceTask(provenance.digest(identity), drive.make, source.first_nodes)
 
 
 KINDS: Mapping[str, Callable[[SourceConfig, bool], Source]] = {
@@ -241,7 +209,7 @@ def _read_session(path: Path | None) -> Frozen:
     return Frozen(graph, truth_at(read_tum(folder.groundtruth), stamps), of_truth=True)
 
 
-def laps(config: SyntheticConfig, rng: np.random.Generator) -> Frozen:
+def laps(config: SyntheticConfig, seed: int) -> Frozen:
     """A drive round and round with white noise on every measurement; node k sees node k - per_lap again."""
     step = np.array([config.step_m, 0.0, 2.0 * np.pi / config.per_lap])
     truth = np.zeros((config.nodes, 3))
@@ -255,7 +223,8 @@ def laps(config: SyntheticConfig, rng: np.random.Generator) -> Frozen:
     order = np.lexsort((loop, np.maximum(sources, targets)))
     sources, targets, loop = sources[order], targets[order], loop[order]
     sigma = np.array([config.translation_m, config.translation_m, config.rotation_rad])
-    deltas = compose(between(truth[sources], truth[targets]), exp(rng.standard_normal((len(sources), 3)) * sigma))
+    noise = np.random.default_rng(seed).standard_normal((len(sources), 3)) * sigma
+    deltas = compose(between(truth[sources], truth[targets]), exp(noise))
     graph = PoseGraph(
         initial=truth,
         sources=sources.astype(np.int64),

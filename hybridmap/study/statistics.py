@@ -12,8 +12,8 @@ import numpy as np
 from hybridmap.geometry import Array
 from hybridmap.study.cell import CellResult
 from hybridmap.study.grid import Cell, Grid
-from hybridmap.study.measures import measures_of
-from hybridmap.study.model import StatisticsConfig
+from hybridmap.study.measures import measures_of, unit_of
+from hybridmap.study.model import StatisticsConfig, StudyConfig
 
 LEAST = {"t": 3, "bootstrap": 5}
 """Method -> values that an interval needs. Two give Student's t one degree of freedom, hence limits of no use; of a few
@@ -57,7 +57,8 @@ class Summary:
     """One measure of one back-end over the seeds of one group (source, setting, kind and rate of false loops).
 
     Attributes:
-        source, setting, kind, rate, backend, measure, unit: what is summed up.
+        cell: the first cell of the group; its labels are those of all but for the seed.
+        measure: what is summed up.
         cells, solved: in the group, and those of them that have the figure; the others are not part of the sums.
         median, mean: over the seeds.
         baseline: the first back-end.
@@ -66,13 +67,8 @@ class Summary:
         better: share of these seeds in which this back-end's figure is the lower one; NaN without any.
     """
 
-    source: str
-    setting: str
-    kind: str
-    rate: float
-    backend: str
+    cell: Cell
     measure: str
-    unit: str
     cells: int
     solved: int
     median: float
@@ -82,24 +78,19 @@ class Summary:
     better: float
 
     @property
-    def label(self) -> str:
-        """The group in words."""
-        return f"{self.source}/{self.setting}" + (f"/{self.kind} {100 * self.rate:g} %" if self.kind else "")
+    def unit(self) -> str:
+        """Of the measure."""
+        return unit_of(self.measure)
 
 
 def summarise(grid: Grid, results: Mapping[str, CellResult]) -> list[Summary]:
     """A summary for each group, back-end and measure, in the order of the grid."""
-    groups: dict[tuple[str, str, str, float], dict[str, dict[int | None, CellResult]]] = {}
-    for cell in grid.cells:
-        groups.setdefault(cell.group, {}).setdefault(cell.backend, {})[cell.seed] = results[cell.key]
-    baseline = grid.study.backends[0].title
-    rows = []
-    for group, by_backend in groups.items():
-        for backend, by_seed in by_backend.items():
-            against = None if backend == baseline else by_backend[baseline]
-            for measure, (unit, _) in measures_of(grid.study).items():
-                rows.append(_summary(group, backend, (measure, unit), by_seed, baseline, against, grid.study.statistics))
-    return rows
+    baseline, groups = grid.study.backends[0].title, grid.groups()
+    return [
+        _summary(cells, None if backend == baseline else groups[group, baseline], measure, results, grid.study)
+        for (group, backend), cells in groups.items()
+        for measure in measures_of(grid.study)
+    ]
 
 
 def mean_of(values: Array, config: StatisticsConfig) -> Interval:
@@ -149,38 +140,25 @@ def _bootstrap(values: Array, config: StatisticsConfig) -> tuple[float, float]:
 
 
 def _summary(
-    group: tuple[str, str, str, float],
-    backend: str,
-    measure: tuple[str, str],
-    by_seed: Mapping[int | None, CellResult],
-    baseline: str,
-    against: Mapping[int | None, CellResult] | None,
-    config: StatisticsConfig,
+    cells: Sequence[Cell],
+    against: Sequence[Cell] | None,
+    measure: str,
+    results: Mapping[str, CellResult],
+    study: StudyConfig,
 ) -> Summary:
-    name, unit = measure
-    values = _figures(by_seed, name)
+    values = _figures(cells, measure, results)
     difference, better = None, math.nan
     if against is not None:
-        other = _figures(against, name)
+        other = _figures(against, measure, results)
         pairs = np.array([[values[seed], other[seed]] for seed in values if seed in other]).reshape(-1, 2)
-        difference = mean_of(pairs[:, 0] - pairs[:, 1], config)
+        difference = mean_of(pairs[:, 0] - pairs[:, 1], study.statistics)
         better = float(np.mean(pairs[:, 0] < pairs[:, 1])) if len(pairs) else math.nan
     every = np.array(list(values.values()))
     median = float(np.median(every)) if len(every) else math.nan
-    counts = (len(by_seed), len(values), median, mean_of(every, config))
-    return Summary(*group, backend, name, unit, *counts, baseline, difference, better)
+    mean, baseline = mean_of(every, study.statistics), study.backends[0].title
+    return Summary(cells[0], measure, len(cells), len(values), median, mean, baseline, difference, better)
 
 
-def _figures(by_seed: Mapping[int | None, CellResult], measure: str) -> dict[int | None, float]:
-    found = {seed: result.figures.get(measure) for seed, result in by_seed.items()}
+def _figures(cells: Sequence[Cell], measure: str, results: Mapping[str, CellResult]) -> dict[int | None, float]:
+    found = {cell.seed: results[cell.key].figures.get(measure) for cell in cells}
     return {seed: value for seed, value in found.items() if value is not None}
-
-
-def of_measure(summaries: Sequence[Summary], measure: str) -> list[Summary]:
-    """Those of one measure."""
-    return [one for one in summaries if one.measure == measure]
-
-
-def in_group(cell: Cell, one: Summary) -> bool:
-    """Whether a cell is part of a summary."""
-    return (*cell.group, cell.backend) == (one.source, one.setting, one.kind, one.rate, one.backend)

@@ -104,7 +104,7 @@ def _metrics(summaries: Sequence[Summary], verdicts: Sequence[Verdict]) -> list[
     """Median and mean of each measure, the mean difference to the baseline, and every bar: `<figure>/<group>/<back-end>`."""
     metrics = []
     for one in summaries:
-        stage = f"{one.label}/{one.backend}"
+        stage = f"{one.cell.label}/{one.cell.backend}"
         stem = _stem(one.measure, one.unit)
         metrics.append(Metric(f"{stem}_median/{stage}", one.median, one.unit, f"median of {one.solved} of {one.cells} cells"))
         metrics.append(Metric(f"{stem}_mean/{stage}", one.mean.value, one.unit, f"mean, {one.mean}"))

@@ -15,9 +15,10 @@ from hybridmap.study.measures import TIMINGS
 from hybridmap.study.statistics import Summary
 
 _LABELS = ("source", "setting", "false_loop_kind", "false_loop_rate", "seed", "backend")
+_GROUP_LABELS = tuple(label for label in _LABELS if label != "seed")
 _COUNTS = ("nodes", "edges", "own_loops", "false_loops")
 SUMMARY_COLUMNS = (
-    *(label for label in _LABELS if label != "seed"),
+    *_GROUP_LABELS,
     *("measure", "unit", "cells", "solved", "median", "mean", "mean_low", "mean_high"),
     *("baseline", "pairs", "difference_mean", "difference_low", "difference_high", "share_lower"),
 )
@@ -25,7 +26,7 @@ SUMMARY_COLUMNS = (
 TIMING_COLUMNS = (*_LABELS, *TIMINGS, "key")
 """Of `timings.csv`."""
 BAR_COLUMNS = (
-    *(label for label in _LABELS if label != "seed"),
+    *_GROUP_LABELS,
     *("figure", "unit", "statistic", "value", "side", "bar", "passed", "median", "worst", "values"),
 )
 """Of `bars.csv`."""
@@ -57,8 +58,12 @@ def shown(value: float | None) -> str:
 
 
 def _labels(cell: Cell) -> tuple[str, ...]:
-    seed = "" if cell.seed is None else str(cell.seed)
-    return cell.source, cell.setting, cell.kind, shown(cell.rate), seed, cell.backend
+    *group, backend = _group_labels(cell)
+    return *group, "" if cell.seed is None else str(cell.seed), backend
+
+
+def _group_labels(cell: Cell) -> tuple[str, ...]:
+    return cell.source, cell.setting, cell.kind, shown(cell.rate), cell.backend
 
 
 def _cell_row(cell: Cell, result: CellResult, names: Sequence[str]) -> tuple[str, ...]:
@@ -80,7 +85,7 @@ def summary_csv(summaries: Sequence[Summary]) -> str:
 
 
 def _summary_row(one: Summary) -> tuple[str, ...]:
-    labels = (one.source, one.setting, one.kind, shown(one.rate), one.backend, one.measure, one.unit)
+    labels = (*_group_labels(one.cell), one.measure, one.unit)
     sums = (one.cells, one.solved, *(_known(value) for value in (one.median, one.mean.value, one.mean.low, one.mean.high)))
     if one.difference is None:
         return (*labels, *map(str, sums), one.baseline, *[""] * 5)
@@ -94,8 +99,8 @@ def _known(value: float) -> str:
 
 
 def _bar_row(one: Verdict) -> tuple[str, ...]:
-    cell, bar = one.cell, one.bar
-    labels = (cell.source, cell.setting, cell.kind, shown(cell.rate), cell.backend, bar.figure, one.unit)
+    bar = one.bar
+    labels = (*_group_labels(one.cell), bar.figure, one.unit)
     values = " ".join("-" if value is None else shown(value) for value in one.values)
     judged = (bar.statistic, _known(one.value), bar.side, _known(one.limit), "yes" if one.passed else "no")
     return (*labels, *judged, _known(one.median), _known(one.worst), values)

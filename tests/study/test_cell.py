@@ -1,5 +1,7 @@
 """One cell: what is disturbed, solved and judged, and that a failure is a result."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -14,14 +16,14 @@ from hybridmap.study.false_loops import with_drift, with_false_loops
 from hybridmap.study.frozen import Frozen
 from hybridmap.study.grid import lay_out
 from hybridmap.study.model import DriftConfig, SyntheticConfig
-from hybridmap.study.sources import Given, SourceTask, laps, prepare
+from hybridmap.study.sources import SourceTask, laps, prepare
 from tests.narrowing import known
 from tests.study.studies import small
 
 
 @pytest.fixture(scope="module")
 def frozen():
-    return laps(SyntheticConfig(nodes=40, per_lap=16), np.random.default_rng(3))
+    return laps(SyntheticConfig(nodes=40, per_lap=16), 3)
 
 
 def figures_of(frozen, **changes):
@@ -137,16 +139,16 @@ def test_the_same_seed_gives_every_back_end_the_same_false_loops(frozen):
 
 def test_without_truth_the_reference_is_the_clean_optimum(frozen):
     unknown = Frozen(frozen.graph, np.full((40, 3), np.nan))
-    made = Frozen.unpack(prepare(SourceTask("key", Given(unknown.pack()))).frozen)
+    made = Frozen.unpack(prepare(SourceTask("key", partial(Frozen.unpack, unknown.pack()))).frozen)
     assert not made.of_truth
     assert figures_of(made, backends=["gtsam-lm"])["gtsam-lm", ""].figures["ate_m"] < 1e-6
-    kept = Frozen.unpack(prepare(SourceTask("key", Given(frozen.pack()), first_nodes=30)).frozen)
+    kept = Frozen.unpack(prepare(SourceTask("key", partial(Frozen.unpack, frozen.pack()), first_nodes=30)).frozen)
     assert np.array_equal(kept.reference, frozen.reference[:30])
     assert known(kept.graph).n_nodes == 30
 
 
 def test_a_source_that_cannot_be_had_is_a_status_of_its_cells():
-    result = prepare(SourceTask("key", Drive("lab", {"nodes": {"distance_m": -1.0}})))
+    result = prepare(SourceTask("key", Drive("lab", {"nodes": {"distance_m": -1.0}}).make))
     failed = Frozen.unpack(result.frozen)
     assert failed.graph is None
     found = figures_of(failed, backends=["gtsam-lm"])["gtsam-lm", "random"]

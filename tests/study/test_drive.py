@@ -151,7 +151,7 @@ def test_a_recording_that_a_worker_lacks_is_tried_again(recording, source, tmp_p
     (recording / "drive.mcap").rename(tmp_path / "away.mcap")
     try:
         with pytest.raises(FileNotFoundError, match="at the same path on every worker"):
-            task.maker.make()
+            task.make()
     finally:
         (tmp_path / "away.mcap").rename(recording / "drive.mcap")
 

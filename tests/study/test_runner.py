@@ -2,6 +2,7 @@
 
 import json
 import multiprocessing
+import time
 from dataclasses import replace
 
 import pytest
@@ -81,6 +82,18 @@ def test_a_study_that_is_stopped_twice_gives_the_same_bytes(alone, page, tmp_pat
     assert not list(tmp_path.rglob("*.partial"))
 
 
+def test_a_study_whose_process_is_killed_gives_the_same_bytes(alone, tmp_path):
+    run = multiprocessing.get_context("spawn").Process(target=run_study, args=(small(), tmp_path, ThisProcess()))
+    run.start()
+    while run.is_alive() and len(list((tmp_path / "cells").glob("*/*.json"))) < 3:
+        time.sleep(0.01)
+    run.kill()
+    run.join()
+    done = run_study(small(), tmp_path, ThisProcess())
+    assert done.computed <= 18 - 3
+    assert tables(done) == alone[1]
+
+
 def test_two_processes_give_the_same_bytes(alone, tmp_path):
     assert tables(run_study(small(), tmp_path, LocalProcesses(2))) == alone[1]
 
@@ -118,7 +131,7 @@ def test_a_mistake_of_ours_is_a_row_and_tried_again(alone, tmp_path, monkeypatch
     run_one = cells.run
 
     def sometimes(task):
-        if task.backend == "odometry" and task.rate > 0.0:
+        if task.variant.backend == "odometry" and task.rate > 0.0:
             raise ZeroDivisionError("oh\nno")
         return run_one(task)
 

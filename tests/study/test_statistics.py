@@ -96,7 +96,7 @@ def test_differences_are_paired_by_seed_and_cells_without_a_map_left_out():
 def test_a_back_end_that_never_has_a_map_has_no_figures():
     grid = lay_out(small(backends=["gtsam-lm", "odometry"], false_loops={}))
     rows = summarise(grid, results_of(grid, lambda backend, seed: None if backend == "odometry" else 1.0))
-    lost = next(one for one in rows if (one.backend, one.measure) == ("odometry", "ate_m"))
+    lost = next(one for one in rows if (one.cell.backend, one.measure) == ("odometry", "ate_m"))
     assert (lost.solved, known(lost.difference).count) == (0, 0)
     assert math.isnan(lost.median)
     assert math.isnan(known(lost.difference).value)

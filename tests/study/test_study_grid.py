@@ -23,7 +23,7 @@ def keys(**changes):
 
 @pytest.fixture
 def graph_file(tmp_path):
-    graph = known(laps(SyntheticConfig(nodes=30, per_lap=12), np.random.default_rng(1)).graph)
+    graph = known(laps(SyntheticConfig(nodes=30, per_lap=12), 1).graph)
     write_g2o(tmp_path / "graph.g2o", graph, graph.initial)
     return tmp_path / "graph.g2o"
 
@@ -126,7 +126,7 @@ def test_a_damaged_graph_ends_it_before_anything_is_done(tmp_path):
 
 
 def test_no_true_loop_is_taken_for_a_false_one():
-    graph = known(laps(SyntheticConfig(nodes=30, per_lap=12), np.random.default_rng(1)).graph)
+    graph = known(laps(SyntheticConfig(nodes=30, per_lap=12), 1).graph)
     more = inject(graph, 0.3, "random", np.random.default_rng(0))
     assert np.array_equal(more.edge_ids[: graph.n_edges], graph.edge_ids)
     assert replace(more, initial=graph.initial).n_edges > graph.n_edges
