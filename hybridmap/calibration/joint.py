@@ -19,10 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap import backends
-from hybridmap.backends.gtsam.factors import NoiseModels, anchor, factors, poses_of
+from hybridmap.backends.gtsam.factors import NoiseModels, anchor, collected, factors, poses_of, values
+from hybridmap.backends.objective import squared_norms
 from hybridmap.backends.registry import RELAXATION
 from hybridmap.calibration.estimate import Estimate
-from hybridmap.calibration.legs import Motion
+from hybridmap.calibration.legs import Motion, corrected
 from hybridmap.calibration.odometry_terms import OdometryTerms, terms_of
 from hybridmap.calibration.regression import CAUCHY, NotToldError, Sighting, require_delay, require_told_by
 from hybridmap.config.backends import BackendsConfig
@@ -128,7 +129,7 @@ class Problem:
     def __init__(self, graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config: BackendsConfig) -> None:
         self.graph, self.config = graph, config
         self.motion, self.stamps_ns = motion, stamps_ns
-        self.own = own_odometry(graph)
+        self.others = graph.with_edges(np.setdiff1d(np.arange(graph.n_edges), own_odometry(graph)))
         self.key = graph.n_nodes
         self.terms = terms_of(graph, motion, stamps_ns, NEUTRAL)
         self._evaluated: tuple[bytes, Array, Array] | None = None
@@ -140,10 +141,7 @@ class Problem:
 
     def grown(self, start: Gains) -> Array:
         """Poses (N, 3) by relaxation as the graph grew, with odometry as this start has it."""
-        deltas = self.graph.deltas.copy()
-        legs = terms_of(self.graph, self.motion, self.stamps_ns, start, consecutive=True).legs
-        deltas[self.own] = legs.predict(start)
-        graph = chain(replace(self.graph, deltas=deltas))
+        graph = chain(corrected(self.graph, self.motion, self.stamps_ns, start))
         poses = graph.initial
         for solution in backends.replay(backends.create(RELAXATION, self.config), graph):
             poses = solution.poses
@@ -154,15 +152,13 @@ class Problem:
         gains = Gains.from_array(variable[:3])
         self.terms = terms_of(self.graph, self.motion, self.stamps_ns, gains).scaled(scale)
         self._evaluated = None
-        nonlinear, values = self._factors(), gtsam.Values()
-        for number, pose in enumerate(poses.tolist()):
-            values.insert(number, gtsam.Pose2(*pose))
-        values.insert(self.key, variable)
+        nonlinear, begun = self._factors(), values(poses)
+        begun.insert(self.key, variable)
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(_ITERATIONS)
         params.setRelativeErrorTol(1e-6)
         try:
-            solved = gtsam.LevenbergMarquardtOptimizer(nonlinear, values, params).optimize()
+            solved = gtsam.LevenbergMarquardtOptimizer(nonlinear, begun, params).optimize()
             marginal = gtsam.Marginals(nonlinear, solved).marginalCovariance(self.key)
         except RuntimeError as error:
             _logger.info("from %.3f rad/m: %s", bias_start_rad_m, str(error).strip().splitlines()[:1])
@@ -181,21 +177,12 @@ class Problem:
         Raises:
             NotToldError: fewer than three edges besides odometry count at least half on it.
         """
-        graph = self.graph.with_edges(self._others())
-        off = compose(inverse(graph.deltas), between(poses[graph.sources], poses[graph.targets]))
-        squared = np.einsum("ei,eij,ej->e", off, graph.information, off)
-        held = int(np.count_nonzero(squared <= self.config.robust.cauchy_scale**2))
+        held = int(np.count_nonzero(squared_norms(self.others, poses) <= self.config.robust.cauchy_scale**2))
         if held < _HELD:
             raise NotToldError(
-                f"calibration: found {held} of {graph.n_edges} loop closures that hold on the map, expected {_HELD} or more; "
-                f"give a drive that comes back to more places"
+                f"calibration: found {held} of {self.others.n_edges} loop closures that hold on the map, "
+                f"expected {_HELD} or more; give a drive that comes back to more places"
             )
-
-    def _others(self) -> NDArray[np.bool_]:
-        """(E,) the edges that are no odometry between consecutive nodes."""
-        others = np.ones(self.graph.n_edges, dtype=bool)
-        others[self.own] = False
-        return others
 
     def _residuals(self, poses: Array, variable: Array) -> Array:
         predicted, _ = self.evaluate(variable)
@@ -234,18 +221,12 @@ class Problem:
 
     def _factors(self) -> Any:
         loops = gtsam.noiseModel.mEstimator.Cauchy.Create(self.config.robust.cauchy_scale)
-        models = NoiseModels(loops)
-        out = gtsam.NonlinearFactorGraph()
-        for factor in factors(self.graph.with_edges(self._others()), models):
-            out.push_back(factor)
         kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY)
         unit = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Unit.Create(3))
         ends = zip(self.terms.sources.tolist(), self.terms.targets.tolist(), strict=True)
-        for index, (source, target) in enumerate(ends):
-            out.push_back(gtsam.CustomFactor(unit, [source, target, self.key], leg_error(self, self.terms, index)))
-        out.push_back(anchor(self.graph.initial[0]))
-        out.push_back(gtsam.PriorFactorVector(self.key, _NEUTRAL, gtsam.noiseModel.Diagonal.Sigmas(PRIOR)))
-        return out
+        legs = [gtsam.CustomFactor(unit, [*pair, self.key], leg_error(self, self.terms, k)) for k, pair in enumerate(ends)]
+        prior = gtsam.PriorFactorVector(self.key, _NEUTRAL, gtsam.noiseModel.Diagonal.Sigmas(PRIOR))
+        return collected([*factors(self.others, NoiseModels(loops)), *legs, anchor(self.graph.initial[0]), prior])
 
 
 def leg_error(problem: Problem, terms: OdometryTerms, index: int) -> Callable[[Any, Any, Any], Array]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.geometry import Array, between, log
+from hybridmap.graph.paths import own_odometry
+from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.odometry_model import Gains, apply, chord_of_arc, twists
 from hybridmap.trajectory import NS_PER_S
 
@@ -122,6 +124,14 @@ class Legs:
         share = (wanted - times[right - 1]) / (times[right] - times[right - 1])
         share = share.reshape(-1, *([1] * (values.ndim - 1)))
         return np.asarray(values[right - 1] + share * (values[right] - values[right - 1]))
+
+
+def corrected(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], gains: Gains, delay_s: float = 0.0) -> PoseGraph:
+    """A graph, of nodes at some stamps (N,), with the odometry edges of calibrated odometry; uncertainties stay."""
+    own, deltas = own_odometry(graph), graph.deltas.copy()
+    legs = Legs(motion, stamps_ns[graph.sources[own]], stamps_ns[graph.targets[own]])
+    deltas[own] = legs.predict(gains, delay_s)
+    return replace(graph, deltas=deltas)
 
 
 def chain(steps: Array) -> Array:

@@ -46,9 +46,7 @@ class OdometryTerms:
         return replace(self, whiten=self.whiten / scale)
 
 
-def terms_of(
-    graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], gains: Gains, *, consecutive: bool = False
-) -> OdometryTerms:
+def terms_of(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], gains: Gains) -> OdometryTerms:
     """The odometry terms of a graph.
 
     Args:
@@ -56,13 +54,11 @@ def terms_of(
         motion: raw odometry.
         stamps_ns: (N,) of the nodes.
         gains: by which the direction of a long leg's chord is taken.
-        consecutive: one term for every odometry edge, whatever registrations there are.
     """
     own = own_odometry(graph)
     carried = np.zeros(graph.n_nodes, dtype=bool)  # node k: joined to k + 1 by a registration
-    if not consecutive:
-        near = (graph.kinds == EdgeKind.REGISTRATION) & (np.abs(graph.targets - graph.sources) == 1)
-        carried[np.minimum(graph.sources, graph.targets)[near]] = True
+    near = (graph.kinds == EdgeKind.REGISTRATION) & (np.abs(graph.targets - graph.sources) == 1)
+    carried[np.minimum(graph.sources, graph.targets)[near]] = True
     kept = own[~carried[graph.sources[own]]]
     source, target = _long_legs(carried, stamps_ns, motion)
     overlap = float(_OVERLAP) if len(source) else 1.0

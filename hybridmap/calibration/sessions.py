@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 
 from hybridmap.backends.base import ODOMETRY
 from hybridmap.calibration.estimate import Estimate
-from hybridmap.calibration.legs import Legs, Motion
+from hybridmap.calibration.legs import Motion, corrected
 from hybridmap.calibration.regression import Sighting, regress, require_leg
 from hybridmap.config import Config
 from hybridmap.config.gone import without_gone
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array, between
 from hybridmap.graph.edges import EdgeKind
-from hybridmap.graph.paths import own_odometry
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.odometry_model import GAIN_KEYS, Gains, remove
 from hybridmap.store import MapStore, SessionFolder
@@ -120,8 +119,15 @@ def estimate_of(
                 *(drives[0].name, drives[0].sensors, drive.name, drive.sensors),
             )
     if references:
-        return by_reference(drives, references, leg_m)
-    return joint_of(drives) if estimator == "joint" else alternating(drives, leg_m)
+        return regress([_seen(drive, truth) for drive, truth in zip(drives, references, strict=True)], leg_m)
+    for drive in drives:
+        require_closures(drive)
+    if estimator != "joint":
+        return alternating(drives, leg_m)
+    from hybridmap.calibration import joint
+
+    (drive,) = drives
+    return joint.solve(drive.graph, drive.motion, drive.stamps_ns, drive.config.backends).estimate
 
 
 def require_options(sessions: int, references: int, estimator: str | None, leg_m: float | None) -> None:
@@ -181,39 +187,13 @@ def common_tree(drives: Sequence[Drive]) -> dict[str, Any]:
     return drives[0].config_tree
 
 
-def joint_of(drives: Sequence[Drive]) -> Estimate:
-    """Calibrate one drive with its map, as variables of one graph.
-
-    Raises:
-        EvaluationError: more than one drive, or a map with nothing but odometry.
-        BackendError: GTSAM could not solve it.
-    """
-    from hybridmap.calibration import joint
-
-    require_options(len(drives), 0, "joint", None)
-    drive = drives[0]
-    require_closures(drive)
-    return joint.solve(drive.graph, drive.motion, drive.stamps_ns, drive.config.backends).estimate
-
-
-def by_reference(drives: Sequence[Drive], references: Sequence[Trajectory], leg_m: float | None = None) -> Estimate:
-    """Calibrate drives against known trajectories of `base_link`, one a drive.
-
-    Raises:
-        EvaluationError: too little in common.
-    """
-    return regress([_seen(drive, truth) for drive, truth in zip(drives, references, strict=True)], leg_m)
-
-
 def alternating(drives: Sequence[Drive], leg_m: float | None = None) -> Estimate:
     """Calibrate drives on their own maps: regress odometry on the map, correct the odometry edges, optimise, and again.
 
     Raises:
-        EvaluationError: a map holds nothing but odometry, or too little travel.
+        EvaluationError: too little travel.
         BackendError: a map cannot be optimised.
     """
-    for drive in drives:
-        require_closures(drive)
     poses = [drive.poses for drive in drives]
     estimate = _regress_on(drives, poses, leg_m)
     for _ in range(_ROUNDS):
@@ -237,16 +217,6 @@ def require_closures(drive: Drive) -> None:
         )
 
 
-def corrected(drive: Drive, gains: Gains, delay_s: float) -> PoseGraph:
-    """The graph with its odometry edges as calibrated odometry would have made them; uncertainties stay."""
-    graph = drive.graph
-    own = own_odometry(graph)
-    deltas = graph.deltas.copy()
-    legs = Legs(drive.motion, drive.stamps_ns[graph.sources[own]], drive.stamps_ns[graph.targets[own]])
-    deltas[own] = legs.predict(gains, delay_s)
-    return replace(graph, deltas=deltas)
-
-
 def _regress_on(drives: Sequence[Drive], poses: Sequence[Array], leg_m: float | None) -> Estimate:
     sightings = [Sighting(drive.motion, drive.stamps_ns, on_map) for drive, on_map in zip(drives, poses, strict=True)]
     return regress(sightings, leg_m)
@@ -255,7 +225,8 @@ def _regress_on(drives: Sequence[Drive], poses: Sequence[Array], leg_m: float | 
 def _optimise(drive: Drive, estimate: Estimate) -> Array:
     from hybridmap.backends.registry import ROBUST, create
 
-    graph = corrected(drive, estimate.kept(Gains.of(drive.config.neural)), estimate.delay_s)
+    gains = estimate.kept(Gains.of(drive.config.neural))
+    graph = corrected(drive.graph, drive.motion, drive.stamps_ns, gains, estimate.delay_s)
     name = drive.config.backends.names[0]
     solver = create(ROBUST if name == ODOMETRY else name, drive.config.backends)
     return solver.solve(graph).poses

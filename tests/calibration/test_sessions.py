@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from hybridmap.calibration.estimate import Estimate
-from hybridmap.calibration.sessions import alternating, by_reference, common_tree, corrected, estimate_of, read_drive
+from hybridmap.calibration.legs import corrected
+from hybridmap.calibration.sessions import common_tree, estimate_of, read_drive
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import between
 from hybridmap.odometry_model import NEUTRAL, Gains
@@ -32,8 +33,8 @@ def test_odometry_is_raw_after_changes_on_the_way(one, tmp_path):
 
 def test_closed_loops_and_a_reference_agree(one, tmp_path):
     read = read_drive(write_session(tmp_path / "s", one, np.random.default_rng(0)))
-    own = alternating([read])
-    known = by_reference([read], [Trajectory(one.motion.stamps_ns, one.truth)])
+    own = estimate_of([read])
+    known = estimate_of([read], [Trajectory(one.motion.stamps_ns, one.truth)])
     for estimate in (own, known):
         assert np.all(np.abs(estimate.off(GAINS)) < 4.0)
         assert estimate.differs(NEUTRAL)
@@ -45,12 +46,12 @@ def test_alternating_optimises_the_map_that_it_regresses_on(one, tmp_path):
     rng = np.random.default_rng(0)
     raw = experience_map(one, rng)[0].initial
     read = read_drive(write_session(tmp_path / "s", one, rng, poses=raw))
-    assert alternating([read]).gains.heading_bias_rad_m == pytest.approx(GAINS.heading_bias_rad_m, abs=0.005)
+    assert estimate_of([read]).gains.heading_bias_rad_m == pytest.approx(GAINS.heading_bias_rad_m, abs=0.005)
 
 
 def test_corrected_edges_are_what_calibrated_odometry_measures(one, tmp_path):
     read = read_drive(write_session(tmp_path / "s", drive(np.random.default_rng(5), noise=0.0), np.random.default_rng(0)))
-    graph = corrected(read, GAINS, 0.0)
+    graph = corrected(read.graph, read.motion, read.stamps_ns, GAINS)
     own = graph.kinds == 0
     truth = read.poses
     np.testing.assert_allclose(graph.deltas[own], between(truth[graph.sources[own]], truth[graph.targets[own]]), atol=1e-6)
@@ -69,7 +70,7 @@ def test_a_reference_of_another_clock_is_refused(one, tmp_path):
     read = read_drive(write_session(tmp_path / "s", one, np.random.default_rng(0)))
     far = Trajectory(one.motion.stamps_ns + 10**15, one.truth)
     with pytest.raises(EvaluationError, match="on the same clock"):
-        by_reference([read], [far])
+        estimate_of([read], [far])
 
 
 def test_a_drive_given_twice_is_refused_even_as_a_copy_or_under_other_gains(one, tmp_path):
@@ -122,11 +123,11 @@ def test_a_gain_that_was_not_measured_stays_in_use_on_the_map_too(tmp_path, monk
     read = read_drive(write_session(tmp_path / "s", drive(rng, laps=2), rng, gains=Gains(1.05, 1.0, 0.0)))
     used: list[Gains] = []
 
-    def noted(drive, gains, delay_s):
+    def noted(graph, motion, stamps_ns, gains, delay_s):
         used.append(gains)
-        return corrected(drive, gains, delay_s)
+        return corrected(graph, motion, stamps_ns, gains, delay_s)
 
     monkeypatch.setattr(sessions, "regress", lambda sightings, leg_m: estimate)
     monkeypatch.setattr(sessions, "corrected", noted)
-    assert not alternating([read]).measured[0]
+    assert not estimate_of([read]).measured[0]
     assert used == [Gains(1.05, 0.97, -0.04)]
