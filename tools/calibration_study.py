@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TextIO
 
 import numpy as np
+from barred import at_least, at_most
 
 from hybridmap import session
 from hybridmap.calibration.estimate import Estimate
@@ -35,6 +36,7 @@ from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
 
 LENGTHS_M = (16.8, 70.0)
 EVERY_M = 0.5
+_OF_RAW = "end error in % of raw"
 BARS = {("fr079", 16.8): 0.6, ("aces", 16.8): 0.6, ("fr079", 70.0): 0.7, ("aces", 70.0): 0.7}
 COLUMNS = (
     "log",
@@ -182,21 +184,17 @@ def judged(rows: list[dict[str, object]]) -> list[Metric]:
         bar = BARS.get((str(found["log"]), length))
         if bar is not None:
             name = f"end_error/{found['log']}-{length:g}m-{found['trained']}"
-            metrics.append(at_most(name, 100.0 * float(str(found["delay_mean"])), 100.0 * bar, "mean over all windows"))
+            metrics.append(
+                at_most(name, 100.0 * float(str(found["delay_mean"])), 100.0 * bar, f"{_OF_RAW}, mean over all windows", "%")
+            )
     for how in ("reference", "reference, all robots"):
         ratios = [float(str(r["delay_mean"])) for r in rows if r["trained"] == how and r["length_m"] == LENGTHS_M[0]]
         if ratios:
             name = f"mrclam6-{how.replace(', ', '-').replace(' ', '-')}"
-            metrics.append(at_most(f"end_error/{name}", 100.0 * float(np.median(ratios)), 75.0, "median over the robots"))
-            better = float(sum(ratio < 1.0 for ratio in ratios))
-            what = f"of {len(ratios)} robots better calibrated than raw; at least 4"
-            metrics.append(Metric(f"better/{name}", better, "1", what, 4.0, better >= 4.0))
+            median, better = 100.0 * float(np.median(ratios)), sum(ratio < 1.0 for ratio in ratios)
+            metrics.append(at_most(f"end_error/{name}", median, 75.0, f"{_OF_RAW}, median over the robots", "%"))
+            metrics.append(at_least(f"better/{name}", better, 4.0, f"of {len(ratios)} robots better calibrated than raw"))
     return metrics
-
-
-def at_most(name: str, percent: float, bar: float, what: str) -> Metric:
-    """An error in % of raw, held against its bar."""
-    return Metric(name, percent, "%", f"end error in % of raw, {what}; at most {bar:g}", bar, percent <= bar)
 
 
 def main() -> None:

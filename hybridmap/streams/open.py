@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from hybridmap.config.root import Config
 from hybridmap.errors import StreamError
+from hybridmap.plugins import loaded
 from hybridmap.streams.base import Rig, Sample, Stream, StreamReport
 from hybridmap.streams.order import Window
 from hybridmap.trajectory import Trajectory
-
-_Opener = Callable[[Path, Config, Window], Stream]
 
 _SIMULATOR = "hybridmap.simulation"
 """A house of its own above this one, known by name alone."""
@@ -24,30 +23,13 @@ EXPECTED = (
 )
 
 
-def _open_bag(path: Path, config: Config, window: Window) -> Stream:
-    from hybridmap.streams.rosbag import BagStream
-
-    return BagStream(path, config, window)
-
-
-def _open_tum(path: Path, config: Config, window: Window) -> Stream:
-    from hybridmap.streams.tum import TumStream
-
-    return TumStream(path, config, window)
-
-
-def _open_velocity(path: Path, config: Config, window: Window) -> Stream:
-    from hybridmap.streams.velocity import VelocityStream
-
-    return VelocityStream(path, config, window)
-
-
-_OPENERS: dict[str, _Opener] = {
-    "ROS 1 bag": _open_bag,
-    "ROS 2 bag": _open_bag,
-    "TUM RGB-D folder": _open_tum,
-    "velocity table": _open_velocity,
+_OPENERS = {
+    "ROS 1 bag": "rosbag:BagStream",
+    "ROS 2 bag": "rosbag:BagStream",
+    "TUM RGB-D folder": "tum:TumStream",
+    "velocity table": "velocity:VelocityStream",
 }
+"""Kind of a source -> what opens it, imported when it is needed."""
 _KIND_OF_SUFFIX = {".bag": "ROS 1 bag", ".mcap": "ROS 2 bag", ".db3": "ROS 2 bag", ".csv": "velocity table"}
 _SIGNS_OF_TUM = ("rgb.txt", "depth.txt", "associations.txt", "rgb", "depth")
 
@@ -115,7 +97,8 @@ def open_stream(source: str | Path, config: Config, *, start_s: float | None = N
         stream: Stream = _simulator().SimulatedStream(simulation, config.seed)
         return stream if window == Window() else WindowedStream(stream, window)
     path = Path(source)
-    return _OPENERS[kind_of(path)](path, config, window)
+    opened: Stream = loaded(f"hybridmap.streams.{_OPENERS[kind_of(path)]}")(path, config, window)
+    return opened
 
 
 def _simulator() -> Any:

@@ -16,6 +16,8 @@ from hybridmap.streams.base import Motion, Observation, Sample, SelfMotion, Stre
 from hybridmap.streams.order import ReorderBuffer
 from hybridmap.trajectory import NS_PER_S, format_stamp
 
+_MAX_HOLD_NS = NS_PER_S  # observations further behind the last odometry are dropped at the end
+
 
 @dataclass(frozen=True, slots=True)
 class Ready:
@@ -47,18 +49,16 @@ class Synchroniser:
     are the same whatever the latency, as long as it covers the delay; a scan that comes behind it is dropped and counted.
     """
 
-    def __init__(self, max_hold_s: float = 1.0, latency_s: float = 0.0, odometry_delay_s: float = 0.0) -> None:
+    def __init__(self, latency_s: float = 0.0, odometry_delay_s: float = 0.0) -> None:
         """Start without any sample.
 
         Args:
             latency_s: samples are held back until the newest stamp is this much ahead of theirs, s; 0 for sorted streams.
             odometry_delay_s: added to the stamps of self-motion, so that they mean the same instants as those of views.
-            max_hold_s: observations further behind the last odometry than this are dropped at the end, not held, s.
         """
         self.report = StreamReport()
         self._arrived = ReorderBuffer(latency_s + abs(odometry_delay_s))
         self._odometry_delay_ns = round(odometry_delay_s * NS_PER_S)
-        self._max_hold_ns = round(max_hold_s * NS_PER_S)
         self._last: tuple[int, Array] | None = None  # newest self-motion: stamp, pose
         self._velocity: Velocity | None = None
         self._kind: type | None = None
@@ -83,7 +83,7 @@ class Synchroniser:
             self._waiting.clear()
             return steps
         stamp_ns, pose = self._last
-        held = [sample for sample in self._waiting if sample.stamp_ns - stamp_ns <= self._max_hold_ns]
+        held = [sample for sample in self._waiting if sample.stamp_ns - stamp_ns <= _MAX_HOLD_NS]
         self._drop("observations after odometry", len(self._waiting) - len(held))
         self._waiting.clear()
         return steps + [self._make(sample.stamp_ns, pose, sample) for sample in held]

@@ -11,7 +11,7 @@ import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -27,6 +27,7 @@ from hybridmap.trajectory import NS_PER_S
 Ranges = NDArray[np.float32]
 Samples = Iterable[Sample]
 KIDNAPPED = "kidnapped_s"
+_Seen = TypeVar("_Seen", bound=Observation)
 
 _NEAR_DEPTH_M = 1.0  # at this depth its noise is as strong as it is told; it grows with the square of the depth
 _SLIP = (0.3, 0.05, math.radians(15.0))  # standard deviations of a slip: ahead, sideways (m), and turn (rad)
@@ -241,28 +242,25 @@ def kidnapped_s(
             yield sample
 
 
-def _scans(
-    change: Callable[[Ranges, float, np.random.Generator], Ranges], *, by_chance: bool = False, most: float = math.inf
+def _each(
+    kind: type[_Seen],
+    change: Callable[[_Seen, float, np.random.Generator], _Seen],
+    *,
+    by_chance: bool = False,
+    most: float = math.inf,
 ) -> Disturbance:
-    """Of every scan alone."""
+    """Of every sample of a kind alone."""
 
     def apply(samples: Samples, strength: float, rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
         for sample in samples:
-            yield replace(sample, ranges_m=change(sample.ranges_m, strength, rng)) if isinstance(sample, LaserScan) else sample
+            yield change(sample, strength, rng) if isinstance(sample, kind) else sample
 
     return Disturbance(apply, by_chance, most)
 
 
-def _frames(
-    change: Callable[[RgbdFrame, float, np.random.Generator], RgbdFrame], *, by_chance: bool = False, most: float = math.inf
-) -> Disturbance:
-    """Of every frame alone."""
-
-    def apply(samples: Samples, strength: float, rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
-        for sample in samples:
-            yield change(sample, strength, rng) if isinstance(sample, RgbdFrame) else sample
-
-    return Disturbance(apply, by_chance, most)
+def _ranges(change: Callable[[Ranges, float, np.random.Generator], Ranges]) -> Callable[..., LaserScan]:
+    """Of a scan's ranges."""
+    return lambda scan, strength, rng: replace(scan, ranges_m=change(scan.ranges_m, strength, rng))
 
 
 def _wheels(change: Callable[[Array, float, np.random.Generator], Array], *, by_chance: bool = False) -> Disturbance:
@@ -282,17 +280,17 @@ def _wheels(change: Callable[[Array, float, np.random.Generator], Array], *, by_
 
 
 TABLE: dict[str, Disturbance] = {
-    "scan_range_m": _scans(scan_range_m),
-    "scan_covered": _scans(scan_covered, most=1.0),
-    "scan_noise_m": _scans(scan_noise_m, by_chance=True),
-    "beams_short": _scans(beams_short, by_chance=True, most=1.0),
-    "beams_lost": _scans(beams_lost, by_chance=True, most=1.0),
+    "scan_range_m": _each(LaserScan, _ranges(scan_range_m)),
+    "scan_covered": _each(LaserScan, _ranges(scan_covered), most=1.0),
+    "scan_noise_m": _each(LaserScan, _ranges(scan_noise_m), by_chance=True),
+    "beams_short": _each(LaserScan, _ranges(beams_short), by_chance=True, most=1.0),
+    "beams_lost": _each(LaserScan, _ranges(beams_lost), by_chance=True, most=1.0),
     "blur_s": Disturbance(blur_s),
-    "darker": _frames(darker, most=1.0),
-    "color_noise": _frames(color_noise, by_chance=True),
-    "depth_noise_m": _frames(depth_noise_m, by_chance=True),
-    "depth_range_m": _frames(depth_range_m),
-    "depth_lost": _frames(depth_lost, by_chance=True, most=1.0),
+    "darker": _each(RgbdFrame, darker, most=1.0),
+    "color_noise": _each(RgbdFrame, color_noise, by_chance=True),
+    "depth_noise_m": _each(RgbdFrame, depth_noise_m, by_chance=True),
+    "depth_range_m": _each(RgbdFrame, depth_range_m),
+    "depth_lost": _each(RgbdFrame, depth_lost, by_chance=True, most=1.0),
     "wheel_scale": _wheels(wheel_scale),
     "wheel_turn_scale": _wheels(wheel_turn_scale),
     "wheel_pull_deg_per_m": _wheels(wheel_pull_deg_per_m),

@@ -10,7 +10,7 @@ from itertools import product
 from hybridmap.study.cell import CellTask, key_of
 from hybridmap.study.false_loops import Kind
 from hybridmap.study.model import SettingConfig, SourceConfig, StudyConfig
-from hybridmap.study.sources import Source, SourceTask, open_source
+from hybridmap.study.sources import KINDS, Source, SourceTask
 
 Group = tuple[str, str, str, float]
 """Source, setting, and kind and rate of false loops."""
@@ -87,7 +87,7 @@ def lay_out(study: StudyConfig) -> Grid:
         GraphError, StoreError, StreamError: a file or session is missing or damaged.
         ConfigError: the mapping configuration of a drive cannot be used.
     """
-    opened = {source.title: open_source(source, maps=study.maps) for source in study.sources}
+    opened = {source.title: KINDS[source.kind](source, study.maps) for source in study.sources}
     cells: list[Cell] = []
     tasks: dict[str, SourceTask] = {}
     for source, setting in product(study.sources, study.settings):

@@ -66,15 +66,6 @@ class Source(Protocol):
         """
 
 
-def open_source(source: SourceConfig, *, maps: bool = False) -> Source:
-    """Open a source of a study; `maps`: its drive is judged as it was mapped.
-
-    Raises:
-        GraphError, StoreError, StreamError: a file or folder is missing or damaged.
-    """
-    return KINDS[source.kind](source, maps)
-
-
 def prepare(task: SourceTask) -> SourceResult:
     """Do what a task says: make the graph, and find its reference. A typed error is a frozen failure."""
     try:
@@ -166,7 +157,7 @@ KINDS: Mapping[str, Callable[[SourceConfig, bool], Source]] = {
     "graph": _Known,
     "synthetic": _Synthetic,
 }
-"""Kind of a source (a field of `model.SourceConfig`) -> what it does."""
+"""Kind of a source -> what opens it, or raises a HybridMapError; the flag: its drive is judged as it was mapped."""
 
 
 def _content(path: Path) -> str:
