@@ -1,4 +1,4 @@
-"""Solvers: one frozen graph in, poses and a typed report out. They know no sensors; `create` makes one by name."""
+"""Back-ends: from a frozen graph to poses and a typed report, without knowledge of sensors. `create` makes one by name."""
 
 from hybridmap.backends.base import Backend, Outcome, Solution, Solver, SolveReport, SolveStatus, SupportsPoseGraph
 from hybridmap.backends.driver import Driver, Works, replay

@@ -1,4 +1,4 @@
-"""What a back-end is, said once: a frozen graph in, poses and a typed report out."""
+"""The interface of a back-end: a frozen graph in, poses and a typed report out."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ ODOMETRY = "odometry"
 
 
 class SolveStatus(StrEnum):
-    """Why a solver stopped; `diverged`, `singular` and `failed` came with no map, but for the one they began with.
+    """Why a solver stopped. After `diverged`, `singular` and `failed` the poses are the initial ones.
 
-    `waiting`: an update only placed new nodes, and measurements beside the chain wait for a closure or the end of the drive.
+    `waiting`: the update only placed new nodes; loops and registrations wait for a loop closure or the end of the drive.
     """
 
     CONVERGED = "converged"
@@ -30,21 +30,21 @@ class SolveStatus(StrEnum):
 
     @property
     def has_map(self) -> bool:
-        """Whether the poses are a result."""
+        """Whether the poses are a result of the solver."""
         return self not in (SolveStatus.DIVERGED, SolveStatus.SINGULAR, SolveStatus.FAILED)
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a solver says.
+    """The result of a solver, before the figures common to all back-ends are added.
 
     Attributes:
         poses: (N, 3) of every node, m and rad.
-        status, message, iterations: why it stopped, and when.
+        status, message, iterations: why the solver stopped, and after how many iterations.
         weights: loop edge id -> final weight.
-        rejected: loops held for false.
-        values: the poses in the solver's own form, to start from again.
-        calibrated: the graph under the odometry calibration that the solver found.
+        rejected: ids of the loops treated as outliers.
+        values: the poses in the solver's own form, for a warm start.
+        calibrated: the graph with the odometry calibration that the solver estimated.
     """
 
     poses: Array
@@ -63,28 +63,27 @@ Solver = Callable[[PoseGraph, Array], Outcome]
 
 @dataclass(frozen=True, slots=True)
 class SolveReport:
-    """How a solution came about.
+    """The report of a solution.
 
     Attributes:
-        backend: its name.
+        backend: name of the back-end.
         status: why it stopped.
         message: one line for people.
         iterations: of the solver (sweeps for relaxation).
-        chi2_initial, chi2: by the one referee, `backends.objective.chi2`, over all edges; never the solver's own cost.
+        chi2_initial, chi2: over all edges, by `backends.objective.chi2` for every back-end; never the solver's own cost.
         cpu_s: process time spent.
-        rejected_edge_ids: loop edges held for false: of weight zero (GNC), or with a residual beyond the gate (kernels).
+        rejected_edge_ids: outlier loops: those of weight zero (GNC), or with a residual beyond the gate (kernels).
         weights: loop edge id -> final weight in [0, 1]; empty for back-ends without a robust kernel.
-        chi2_odometry: share of `chi2` that is not of loops. Where loops were rejected and this is large, the map is wrong.
-        unit_variance: chi2 of the edges that were not rejected per degree of freedom; 1 where the stated noise is the true one.
-        rejected_clusters: groups of rejected loops that agree with each other, the largest first: true loops that were
-            dropped, or a place taken for another one. Only where a whole graph was solved.
-        inconsistent_edge_ids: of the rejected loops, those that the pre-filter (`judging.prefilter`) kept from the solver.
-        weak_edges: odometry and registration edges -> weight, where a kernel on them (`backends.robust.odometry`) leaves less
-            than a tenth. They do not count for the unit variance.
-        hanging_nodes: nodes that only such edges and rejected loops join to node 0: nothing else holds them.
+        chi2_odometry: share of `chi2` from edges that are not loops. A large share with rejected loops means a wrong map.
+        unit_variance: chi2 of the inlier edges per degree of freedom; 1 if the stated covariances are right.
+        rejected_clusters: groups of rejected loops that agree with each other, the largest first: either rejected true
+            loops, or one place mistaken for another. Only if a whole graph was solved.
+        inconsistent_edge_ids: the rejected loops that the pre-filter (`judging.prefilter`) removed before solving.
+        weak_edges: down-weighted odometry and registration edges -> weight, if the kernel `backends.robust.odometry` leaves
+            less than a tenth. They are excluded from the unit variance.
+        hanging_nodes: number of nodes that only down-weighted edges and rejected loops join to node 0.
 
-    Odometry chi2, unit variance, clusters and weak edges are under the calibration of odometry that the back-end found, if
-    it looks for one.
+    If the back-end calibrates odometry, its estimate applies to odometry chi2, unit variance, clusters and down-weighted edges.
     """
 
     backend: str
@@ -105,17 +104,17 @@ class SolveReport:
 
     @property
     def doubt(self) -> str:
-        """What the rejected loops that agree with each other say against the map; empty where there are none."""
+        """A warning about rejected loops that agree with each other; empty if there are none."""
         together, groups = sum(map(len, self.rejected_clusters)), len(self.rejected_clusters)
         if not groups:
             return ""
         where = "one group" if groups == 1 else f"{groups} groups"
         found = f"{together} of {len(self.rejected_edge_ids)} rejected loops agree with each other, in {where}"
-        return f"{found}: false ones that repeat one mistake, or true ones, where odometry errs more than it says"
+        return f"{found}: either false loops with one common error, or true loops and odometry worse than its covariance"
 
     @property
     def summary(self) -> str:
-        """The message, and what speaks against the map."""
+        """The message, with the warning about rejected loops."""
         return "; ".join(filter(None, (self.message, self.doubt)))
 
 
@@ -124,8 +123,8 @@ class Solution:
     """Poses of every node in `map`, with the report.
 
     Attributes:
-        poses: (N, 3) m and rad; node 0 stays where the graph's `initial` has it.
-        report: why and how.
+        poses: (N, 3) m and rad; node 0 keeps its pose of the graph's `initial`.
+        report: how the solution was reached.
     """
 
     poses: Array
@@ -133,35 +132,35 @@ class Solution:
 
 
 class SupportsPoseGraph(Protocol):
-    """Anything that can be frozen into a graph, such as the experience map."""
+    """An object that gives a frozen graph, such as the experience map."""
 
     def pose_graph(self) -> PoseGraph:
         """The accepted edges as arrays."""
 
 
 class Backend(Protocol):
-    """A solver. `update` follows a growing graph while driving; `solve` takes a whole one, from its `initial`."""
+    """A back-end. `update` follows a growing graph while driving; `solve` solves a whole graph from its `initial`."""
 
     @property
     def name(self) -> str:
         """The name by which `create` knows it."""
 
     def update(self, graph: PoseGraph) -> Solution:
-        """Follow the graph as it has grown (or lost edges) since the last call; cheap, warm-started.
+        """Follow the graph as it has grown (or lost edges) since the last call, by a cheap warm start.
 
         Raises:
             BackendError: the graph cannot be solved; the state before the call is kept.
         """
 
     def finish(self, graph: PoseGraph) -> Solution:
-        """End of the drive: the best solution of this back-end, from the state that `update` has reached.
+        """The final solution at the end of a drive, from the state that `update` has reached.
 
         Raises:
             BackendError: the graph cannot be solved; the state before the call is kept.
         """
 
     def solve(self, graph: PoseGraph | SupportsPoseGraph) -> Solution:
-        """Solve a whole graph in a fresh state.
+        """Solve a whole graph, independently of earlier calls.
 
         Raises:
             GraphError: the graph is malformed (see `PoseGraph.validate`).

@@ -1,4 +1,4 @@
-"""One graph through several back-ends: what the tables and pages of a comparison are made of."""
+"""Solve one graph with several back-ends; the results for the tables and pages of a comparison."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Progress = Callable[[int, int], None]
 
 
 class Way(StrEnum):
-    """How a back-end gets the graph: whole, from its initial poses; or node by node as in a drive, to the drive's end."""
+    """How a back-end gets the graph: `batch`, whole, from its initial poses; `incremental`, node by node, as in a drive."""
 
     BATCH = "batch"
     INCREMENTAL = "incremental"
@@ -33,17 +33,17 @@ class Way(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One back-end on the graph.
+    """Result of one back-end on the graph.
 
     Attributes:
         backend: its name.
-        solution: None where the back-end failed.
-        failure: why; empty where it did not.
-        certificate: what could be proved about its solution on the edges that it kept; None where nobody asked.
+        solution: None if the back-end failed.
+        failure: the error; empty if it did not fail.
+        certificate: what was proved about its solution on the inlier edges; None if no proof was asked for.
         way: how it got the graph.
-        title: what sets the row apart from all others: the name, with the way where a back-end has two rows.
-        curve: (K, 2) how it came about, empty where that was not traced. Batch: iterations (or sweeps) and chi2 over the
-            edges kept in the end; incremental: nodes and unit variance of what it kept at the time.
+        title: unique name of the row: that of the back-end, with the way if the back-end has two rows.
+        curve: (K, 2) convergence, empty if not traced. Batch: iterations (or sweeps) and chi2 over the edges that were
+            inliers at the end. Incremental: nodes, and unit variance of the inliers at the time.
     """
 
     backend: str
@@ -61,7 +61,7 @@ class Row:
 
     @property
     def has_map(self) -> bool:
-        """Whether it came to a map of its own, and not to its start alone."""
+        """Whether the back-end has a result of its own, beyond its initial poses."""
         return self.solution is not None and self.solution.report.status.has_map
 
     @property
@@ -71,7 +71,7 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """The message, and why its solution is not certified."""
+        """The message, and why the solution is not certified."""
         doubt = "" if self.certificate is None or self.certificate.certified else self.certificate.message
         return "; ".join(filter(None, (self.message, doubt)))
 
@@ -86,20 +86,20 @@ def compare(
     traced: bool = False,
     progress: Progress | None = None,
 ) -> list[Row]:
-    """Give one frozen graph to each back-end in each way; one that fails is a row that says so.
+    """Solve one frozen graph with each back-end in each way. A back-end that fails gets a row with the error.
 
     Args:
         graph: the graph.
         backends: names, or back-ends in a fresh state, in the order of the rows.
-        config: settings of those that are named.
-        ways: how each gets the graph; dead reckoning is the same in every way and gets the first alone.
+        config: settings of the back-ends given by name.
+        ways: how each gets the graph; dead reckoning is the same in every way and gets only the first.
         certified: try to prove each solution optimal (`backends.judging.certificate`).
-        traced: find out how each solution came about, which takes batch solvers some three times the time.
+        traced: compute convergence curves, which makes batch solvers about three times slower.
         progress: called with the units done and their total.
 
     Raises:
-        GraphError: the graph is malformed: no back-end could take it.
-        BackendError: a name that there is not, or is there twice.
+        GraphError: the graph is malformed.
+        BackendError: an unknown name, or a name that is given twice.
     """
     config = config or BackendsConfig()
     names = [backend if isinstance(backend, str) else backend.name for backend in backends]
@@ -127,10 +127,10 @@ def compare(
 
 
 def convergence(graph: PoseGraph, name: str, config: BackendsConfig, final: Solution) -> Array:
-    """Iterations done and chi2 (K, 2) over the edges that `final` kept, from the graph's own poses to `final`.
+    """Iterations and chi2 (K, 2) over the inlier edges of `final`, from the graph's initial poses to `final`.
 
-    Each point is a solution of its own with that limit, at Fibonacci numbers of iterations or sweeps, so that it takes
-    about two and a half times as long again. Back-ends whose work is no single sequence have only the two ends.
+    Each point is a separate run with that limit, at Fibonacci numbers of iterations or sweeps; together they take about two
+    and a half times as long as one run. Back-ends that do not iterate on one objective get only the first and last point.
 
     Args:
         graph: what was solved.
@@ -150,7 +150,7 @@ def convergence(graph: PoseGraph, name: str, config: BackendsConfig, final: Solu
 
 
 def _limited(config: BackendsConfig, most: int) -> BackendsConfig:
-    """The settings with at most so many iterations, or sweeps; the pre-filter has done its work already."""
+    """The settings with at most this many iterations or sweeps, and without the pre-filter."""
     relaxation = config.relaxation.model_copy(update={"solve_sweeps": min(most, config.relaxation.solve_sweeps)})
     limited = {"max_iterations": min(most, config.max_iterations), "relaxation": relaxation}
     return config.model_copy(update={**limited, "consistency": ConsistencyConfig()})
@@ -166,7 +166,7 @@ def _count(progress: Progress | None, before: int, total: int, done: int) -> Non
 
 
 def _driven(row: Row, backend: Backend, graph: PoseGraph, report: Callable[[int], None]) -> Row:
-    """The row of a whole drive: node by node, then the end; the report has the cost of all updates."""
+    """The row of an incremental run: node by node, then `finish`. The report has the cost of all updates."""
     cpu_s, iterations, curve = 0.0, 0, []
     for done, solution in enumerate(replay(backend, graph), start=1):
         cpu_s += solution.report.cpu_s
@@ -187,7 +187,7 @@ def _driven(row: Row, backend: Backend, graph: PoseGraph, report: Callable[[int]
 
 
 def metrics_of(rows: Sequence[Row]) -> list[Metric]:
-    """Figures `<measure>/<title>` of the rows that have a solution."""
+    """Figures `<measure>/<title>` of the rows with a solution."""
     metrics = []
     for row in rows:
         if row.solution is None:

@@ -1,4 +1,7 @@
-"""Following a growing graph: one driver for every solver, and any number of back-ends side by side on one graph."""
+"""The driver of every solver: it follows a growing graph. `Ensemble` runs several back-ends on one graph.
+
+A solver is a function from (graph, start) to an outcome.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ Extend = Callable[[PoseGraph, Array], Array]
 
 
 class Works(Enum):
-    """When an update asks the solver: where the graph closes (`Change.closes`), whenever it grew, or never."""
+    """When an update calls the solver: if the graph closes a loop (`Change.closes`), at every growth, or never."""
 
     ON_CLOSURES = "on closures"
     ON_GROWTH = "on growth"
@@ -36,9 +39,10 @@ class Works(Enum):
 
 
 class Driver:
-    """A back-end around a solver: follows a growing graph, solves a whole one, and reports on both.
+    """A back-end made of a solver: follows a growing graph, solves a whole one, and reports on both.
 
-    Between two closures an update costs what is new in the graph. What raises leaves the state before the call.
+    Between two loop closures the cost of an update grows with the new part of the graph only. An exception leaves the state
+    before the call.
     """
 
     def __init__(
@@ -55,20 +59,20 @@ class Driver:
         most_rise: float = np.inf,
         softens: bool = False,
     ) -> None:
-        """Put a back-end together.
+        """Make a back-end.
 
         Args:
-            name: the back-end's.
-            config: gives the gate of loops, and the kernel on edges of motion.
-            solve: solves a whole graph from its `initial`, knowing nothing of earlier calls.
-            follow: does an update that asks for work; its start carries on from its last outcome. Default: `solve`.
-            last: the end of the drive is one more update, by this. Default: a whole solution.
-            onward: the end of the drive is a whole solution from the poses that the drive led to, by this. Default: by
-                `solve`, from the graph's `initial`.
-            works: when an update asks for work.
-            place: where new nodes are put.
-            most_rise: relative rise of chi2 over that of the start from which a solution is none.
-            softens: it puts the configured kernel on edges of motion; weak ones are reported.
+            name: of the back-end.
+            config: settings with the gate of loops and the kernel on odometry and registration edges.
+            solve: solves a whole graph from its `initial`, independently of earlier calls.
+            follow: runs an update that calls the solver, from the last outcome. Default: `solve`.
+            last: if given, the end of the drive is one more update by this function. Default: a whole solution.
+            onward: if given, the end of the drive is a whole solution by this function, from the poses reached so far.
+                Default: by `solve`, from the graph's `initial`.
+            works: when an update calls the solver.
+            place: places new nodes.
+            most_rise: relative rise of chi2 above that of the start beyond which a solution is refused.
+            softens: the solver puts the configured kernel on odometry and registration edges; outliers are reported.
         """
         self._name, self._config = name, config
         self._solve, self._follow, self._last, self._onward = solve, follow or solve, last, onward
@@ -78,7 +82,7 @@ class Driver:
         self._squared: Array = np.zeros(0)
         self._weights: dict[int, float] = {}
         self._rejected: tuple[int, ...] = ()
-        self._waiting = 0  # measurements beside the chain that no solver has seen
+        self._waiting = 0  # loops and registrations that no solver has seen
 
     @property
     def name(self) -> str:
@@ -103,7 +107,7 @@ class Driver:
         return self._whole(frozen, self._solve, frozen.initial)
 
     def _advance(self, graph: PoseGraph, always: Solver | None) -> Solution:
-        """Follow the graph: by `always` if given, else as the solver follows, where the graph asks for work."""
+        """Follow the graph: by `always` if given, else by `follow` when the graph calls for the solver."""
         started = time.process_time()
         change = difference(self._graph, graph)
         new = graph.with_edges(change.added)
@@ -118,14 +122,14 @@ class Driver:
         squared = at_start if outcome.poses is start else squared_norms(graph, outcome.poses)
         before = total(at_start)
         if self._rose(before, total(squared)):
-            message = f"{outcome.message}; chi2 rose, the next updates go on from there"
+            message = f"{outcome.message}; chi2 rose; the next update continues from here"
             outcome = replace(outcome, status=SolveStatus.STALLED, message=message)
         self._graph, self._poses, self._squared = graph, outcome.poses, squared
         self._weights, self._rejected, self._waiting = outcome.weights, outcome.rejected, waiting
         return self._solution(graph, outcome, squared, before, started)
 
     def _whole(self, graph: PoseGraph, solver: Solver, start: Array) -> Solution:
-        """Check a whole graph, run a solver on it, check what comes out."""
+        """Check a whole graph, run a solver on it and check the result."""
         started = time.process_time()
         graph.validate()
         require_connected(graph)
@@ -133,7 +137,7 @@ class Driver:
         squared = squared_norms(graph, outcome.poses)
         before = total(squared) if outcome.poses is graph.initial else chi2(graph, graph.initial)
         if self._rose(before, total(squared)):
-            message = f"{outcome.message}; ended worse than it began, kept the start"
+            message = f"{outcome.message}; chi2 did not fall; the initial poses are kept"
             outcome = Outcome(graph.initial, SolveStatus.DIVERGED, message, outcome.iterations)
             squared = squared_norms(graph, graph.initial)
         solution = self._solution(graph, outcome, squared, before, started)
@@ -144,7 +148,7 @@ class Driver:
         return replace(solution, report=replace(solution.report, rejected_clusters=clusters))
 
     def _admit(self, graph: PoseGraph, new: PoseGraph, change: Change) -> Array:
-        """Validate what is new, i.e. the edges of `new`; the poses to extend from."""
+        """Validate the new edges, those of `new`; returns the poses to extend from."""
         new.validate()
         old = self._graph
         if old is None:
@@ -162,20 +166,20 @@ class Driver:
             raise BackendError(f"{self._name}: the solver gave up: {_first_line(error)}") from error
 
     def _extended(self, start: Array, waiting: int) -> Outcome:
-        """What an update without work comes to."""
+        """The outcome of an update without the solver."""
         status, message = SolveStatus.CONVERGED, "extended by odometry"
         if waiting:
-            status, message = SolveStatus.WAITING, f"{message}; {waiting} measurements beside the chain wait for a closure"
+            status, message = SolveStatus.WAITING, f"{message}; {waiting} loops or registrations wait for a loop closure"
         return Outcome(start, status, message, 0, self._weights, self._rejected)
 
     def _rose(self, before: float, after: float) -> bool:
-        """Whether chi2 after is above that before by more than what an optimum leaves open."""
+        """Whether chi2 after is above that before by more than the tolerance of an optimum."""
         return np.isfinite(self._most_rise) and after > before * (1.0 + self._most_rise) + _ROUNDING
 
     def _checked(self, graph: PoseGraph, start: Array, outcome: Outcome) -> Outcome:
-        """Refuse what is not finite, and bring node 0 back to where it is fixed."""
+        """Refuse poses that are not finite, and move node 0 back to its fixed pose."""
         if not np.isfinite(outcome.poses).all():
-            message = "poses were not finite; kept those before"
+            message = "the poses were not finite; the previous ones are kept"
             return Outcome(start, SolveStatus.DIVERGED, message, outcome.iterations)
         if np.array_equal(outcome.poses[0], graph.initial[0]):
             return outcome
@@ -194,13 +198,15 @@ class Driver:
         return squared
 
     def _solution(self, graph: PoseGraph, outcome: Outcome, squared: Array, before: float, started: float) -> Solution:
-        """The outcome with the referee's figures: squared residuals (E,) at its poses, chi2 before."""
+        """The solution with the common figures: squared residuals (E,) at its poses, chi2 before."""
         meant = graph if outcome.calibrated is None else outcome.calibrated
         strain = squared if outcome.calibrated is None else squared_norms(meant, outcome.poses)
         weak = weak_edges(meant, strain, self._config.robust) if self._softens else {}
         without = (*outcome.rejected, *weak)
         hanging = hanging_nodes(graph, without) if weak else 0
-        note = f"; {len(weak)} edges of motion of little weight, {hanging} nodes hang on them alone" if weak else ""
+        note = (
+            f"; {len(weak)} odometry or registration edges down-weighted, {hanging} nodes joined by them alone" if weak else ""
+        )
         report = SolveReport(
             backend=self._name,
             status=outcome.status,
@@ -220,10 +226,10 @@ class Driver:
 
 
 def replay(backend: Backend, graph: PoseGraph) -> Iterator[Solution]:
-    """Feed a graph to `update` node by node, as the robot made it; an edge enters when both of its ends exist.
+    """Give a graph to `update` node by node, as the robot made it; an edge enters once both of its nodes exist.
 
     Raises:
-        GraphError: the graph is malformed, or a node hangs on later ones only.
+        GraphError: the graph is malformed, or a node is joined to later ones only.
         BackendError: the solver failed.
     """
     for nodes in range(1, graph.n_nodes + 1):
@@ -239,13 +245,13 @@ log = logging.getLogger(__name__)
 
 
 class Ensemble:
-    """Feeds every back-end the same graph, in the same order; one that fails is reported and keeps its last poses.
+    """Gives every back-end the same graph. One that fails is reported and keeps its last poses.
 
     Attributes:
         names: of the back-ends, in order.
         primary: name of the first.
         solutions: latest of each, by name.
-        failures: why one failed the last time, by name.
+        failures: latest error of each back-end that failed, by name.
     """
 
     def __init__(self, config: BackendsConfig, clock: StageClock, backends: Sequence[str | Backend] | None = None) -> None:
@@ -254,10 +260,10 @@ class Ensemble:
         Args:
             config: their settings, and their names.
             clock: gets a stage `backend/<name>` for each.
-            backends: names, or back-ends in a fresh state, in place of those that `config` names.
+            backends: names, or back-ends in a fresh state, instead of those that `config` names.
 
         Raises:
-            BackendError: an unknown name, none at all, or one that is there twice.
+            BackendError: an unknown name, no name, or a name that is given twice.
         """
         made = [create(backend, config) for backend in (config.names if backends is None else backends)]
         self.solutions: dict[str, Solution] = {}
@@ -270,7 +276,7 @@ class Ensemble:
         self.primary = self.names[0]
 
     def poses(self, graph: PoseGraph, name: str | None = None) -> Array:
-        """(N, 3) latest poses of a back-end (default: the primary), carried on to newer nodes by their consecutive edges."""
+        """(N, 3) latest poses of a back-end (default: the primary); newer nodes are placed by their consecutive edges."""
         solution = self.solutions.get(name or self.primary)
         return extend(graph, solution.poses if solution is not None else graph.initial[:1])
 
@@ -280,7 +286,7 @@ class Ensemble:
             self._run(name, backend, graph, final=False)
 
     def finish(self, graph: PoseGraph) -> None:
-        """Let every back-end come to its final solution."""
+        """Let every back-end compute its final solution."""
         for name, backend in self._backends.items():
             self._run(name, backend, graph, final=True)
 

@@ -1,4 +1,4 @@
-"""A back-end to build a graph with: for those who bring their own front-end."""
+"""Build a graph step by step with a back-end: for users with their own front-end."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _EMPTY = PoseGraph(
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A state to return to; arrays in it are never written to.
+    """A state to return to; its arrays are never changed.
 
     Attributes:
         rows: node -> its row in `graph`, in the order in which they were added.
-        graph: `initial` (N, 3) holds the latest poses, m and rad; NaN where a node has none yet.
-        fixed: the node that stays where it is.
+        graph: `initial` (N, 3) holds the latest poses, m and rad; NaN for a node without a pose.
+        fixed: the node that is held fixed.
         next_edge: least number that a new edge may have.
         solution: the latest one.
     """
@@ -50,14 +50,14 @@ class Snapshot:
 
 
 class GraphSession:
-    """Nodes and edges that come and go, and a back-end that follows them.
+    """A graph that is edited, and a back-end that follows it.
 
-    Node and edge numbers are the caller's own: nodes any whole numbers, edges increasing ones. Whatever raises leaves the
-    session as it was, bit for bit.
+    The caller numbers nodes and edges: nodes by any integers, edges by increasing ones. An exception leaves the session
+    exactly as it was.
     """
 
     def __init__(self, backend: str | Backend = LEAST_SQUARES, config: BackendsConfig | None = None) -> None:
-        """An empty session with a back-end by name, or one in a fresh state, of which copies are used.
+        """An empty session with a back-end, given by name or in a fresh state; of the latter, copies are used.
 
         Raises:
             BackendError: no such back-end.
@@ -67,15 +67,15 @@ class GraphSession:
         self._state = Snapshot()
 
     def add_node(self, node: int, pose: ArrayLike | None = None) -> None:
-        """Add a node; the first one stays at its `pose` (3,), m and rad (default: the origin), others are placed by edges.
+        """Add a node. The first one stays at its `pose` (3,), m and rad (default: the origin); edges place the others.
 
         Raises:
-            BackendError: the node is there already.
+            BackendError: the node exists already.
             GraphError: the pose is not three finite numbers.
         """
         state = self._state
         if node in state.rows:
-            raise BackendError(f"node {node} is there already")
+            raise BackendError(f"node {node} exists already")
         given = _numbers(IDENTITY if pose is None else pose, (3,), f"pose of node {node}")
         if not np.isfinite(given).all():
             raise GraphError(f"pose of node {node}: found NaN or Inf, expected finite numbers")
@@ -96,7 +96,7 @@ class GraphSession:
 
         Raises:
             BackendError: the number is not above all earlier ones.
-            GraphError: an unknown node, or a measurement that no solver could take.
+            GraphError: an unknown node, or an invalid measurement.
         """
         state = self._state
         if edge < state.next_edge:
@@ -110,11 +110,11 @@ class GraphSession:
         self._state = replace(state, graph=_joined(state.graph, rows), next_edge=edge + 1)
 
     def remove_edge(self, edge: int) -> None:
-        """Take an edge out again.
+        """Remove an edge.
 
         Raises:
             BackendError: there is no such edge.
-            GraphError: a node would hang on nothing.
+            GraphError: a node would be left without a path to the fixed one.
         """
         graph = self._state.graph
         kept = graph.edge_ids != edge
@@ -124,11 +124,11 @@ class GraphSession:
         self._state = replace(self._state, graph=graph.with_edges(kept))
 
     def remove_node(self, node: int, mode: Literal["drop", "bridge"] = "drop") -> None:
-        """Take a node and its edges out; `bridge` joins its neighbours in the chain by the composition of their edges.
+        """Remove a node and its edges; with `bridge` its neighbours in the chain are joined by the composition of their edges.
 
         Raises:
-            BackendError: there is no such node, it is the fixed one, or it is not between two others of the chain.
-            GraphError: another node would hang on nothing.
+            BackendError: there is no such node, it is the fixed one, or it is at an end of the chain.
+            GraphError: another node would be left without a path to the fixed one.
         """
         state = self._state
         if node not in state.rows or node == state.fixed:
@@ -149,18 +149,18 @@ class GraphSession:
         self._backend = self._fresh()
 
     def fix(self, node: int) -> None:
-        """Make another node the one that stays where it is.
+        """Hold another node fixed.
 
         Raises:
             BackendError: there is no such node, or it has no pose yet.
         """
         state = self._state
         if node not in state.rows or not np.isfinite(state.graph.initial[state.rows[node]]).all():
-            raise BackendError(f"node {node}: has no pose to be fixed at")
+            raise BackendError(f"node {node}: has no pose yet, so it cannot be fixed")
         self._state = replace(self._state, fixed=node)
 
     def step(self, budget: int = 1) -> Solution:
-        """Follow what has changed: at most so many updates of the back-end, fewer where it has converged.
+        """Follow the changes: run up to this many updates of the back-end, fewer if it converges.
 
         Raises:
             GraphError, BackendError: as `Backend.update`.
@@ -175,7 +175,7 @@ class GraphSession:
         return self._adopt(solution)
 
     def solve(self) -> Solution:
-        """Solve the whole graph anew.
+        """Solve the whole graph from the start.
 
         Raises:
             GraphError, BackendError: as `Backend.solve`.
@@ -183,7 +183,7 @@ class GraphSession:
         return self._adopt(self._backend.solve(_graph(self._state)))
 
     def poses(self) -> Array:
-        """(N, 3) latest poses in the order of the nodes; nodes newer than the last solution are placed by their edges."""
+        """(N, 3) latest poses in the order of the nodes; edges place the nodes newer than the last solution."""
         return _graph(self._state).initial.copy()
 
     def edge_weights(self) -> dict[int, float]:
@@ -205,20 +205,20 @@ class GraphSession:
         return np.asarray(covariances.relative(np.array([fixed]), np.array([rows[node]]))[0])
 
     def snapshot(self) -> Snapshot:
-        """The state as it is."""
+        """The present state."""
         return self._state
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Return to a state: nodes, edges and poses are exactly what they were; the back-end starts from them."""
+        """Return to a state: nodes, edges and poses are exactly those of the snapshot, and the back-end starts from them."""
         self._state = snapshot
         self._backend = self._fresh()
 
     def _fresh(self) -> Backend:
-        """The back-end as if it had seen nothing."""
+        """The back-end in its initial state."""
         return create(self._given, self._config) if isinstance(self._given, str) else deepcopy(self._given)
 
     def _adopt(self, solution: Solution) -> Solution:
-        """Bring the fixed node back to where it is, and keep the poses."""
+        """Move the fixed node back to its pose, and keep the poses."""
         state = self._state
         row, poses = state.rows[_fixed(state)], solution.poses.copy()
         where = state.graph.initial[row]
@@ -237,7 +237,7 @@ def _fixed(state: Snapshot) -> int:
 
 
 def _graph(state: Snapshot) -> PoseGraph:
-    """The state's graph; nodes from the first one without a pose on are placed by their edges."""
+    """The state's graph; from the first node without a pose on, edges place the nodes."""
     _fixed(state)
     unplaced = np.isnan(state.graph.initial).any(axis=1)
     if not unplaced.any():
@@ -246,7 +246,7 @@ def _graph(state: Snapshot) -> PoseGraph:
 
 
 def _one_edge(edge: int, source: int, target: int, delta: ArrayLike, information: ArrayLike, kind: EdgeKind) -> PoseGraph:
-    """A graph of one edge without its nodes."""
+    """A graph of one edge, without its nodes."""
     return PoseGraph(
         initial=np.zeros((0, 3)),
         sources=np.array([source]),
@@ -280,7 +280,7 @@ def _bridge(state: Snapshot, node: int) -> PoseGraph:
     """One edge between the neighbours of a node in the chain, by rows."""
     row = state.rows[node]
     if not 0 < row < len(state.rows) - 1:
-        raise BackendError(f"node {node}: is at an end of the chain, there is nothing to bridge")
+        raise BackendError(f"node {node}: is at an end of the chain; expected a node between two others")
     whole = compose_relative(_relative(state, row - 1, row), _relative(state, row, row + 1))
     information = np.linalg.inv(whole.covariance)
     information = 0.5 * (information + information.T)
@@ -288,14 +288,16 @@ def _bridge(state: Snapshot, node: int) -> PoseGraph:
 
 
 def _relative(state: Snapshot, source: int, target: int) -> RelativePose:
-    """The first chain edge between two nodes, given by their rows, from the one to the other."""
+    """The first chain edge between two nodes (rows), directed from the first to the second."""
     graph = state.graph
     forward = (graph.sources == source) & (graph.targets == target)
     backward = (graph.sources == target) & (graph.targets == source)
     found = np.flatnonzero((forward | backward) & (graph.kinds < EdgeKind.LOOP))
     if len(found) == 0:
         names = list(state.rows)
-        raise BackendError(f"nodes {names[source]} and {names[target]}: no chain edge joins them, there is nothing to bridge")
+        raise BackendError(
+            f"nodes {names[source]} and {names[target]}: no chain edge joins them; expected consecutive nodes of the chain"
+        )
     edge = int(found[0])
     covariance = np.asarray(np.linalg.inv(graph.information[edge]), dtype=np.float64)
     relative = RelativePose(graph.deltas[edge], covariance)

@@ -1,4 +1,4 @@
-"""The one referee of every comparison, and the robust weights and costs of edges: squared Mahalanobis residuals on SE(2)."""
+"""The objective by which all back-ends are compared, squared Mahalanobis residuals on SE(2), and robust costs of edges."""
 
 from __future__ import annotations
 
@@ -59,46 +59,43 @@ def squared_norms(graph: PoseGraph, poses: Array) -> Array:
 
 
 def chi2(graph: PoseGraph, poses: Array) -> float:
-    """Sum of the squared Mahalanobis residuals of all edges; infinite where a pose is not finite."""
+    """Sum of the squared Mahalanobis residuals of all edges; infinite if a pose is not finite."""
     with np.errstate(invalid="ignore", over="ignore"):
         return total(squared_norms(graph, poses))
 
 
 def total(squared: Array) -> float:
-    """Sum of squared residuals (E,); infinite where one is not finite."""
+    """Sum of squared residuals (E,); infinite if one is not finite."""
     summed = float(squared.sum())
     return summed if np.isfinite(summed) else float("inf")
 
 
 def unit_variance(graph: PoseGraph, squared: Array, rejected: tuple[int, ...] = ()) -> float:
-    """Sum of squared residuals (E,) of the edges that were not rejected, per degree of freedom; 1 without redundancy."""
+    """Sum of squared residuals (E,) of the inlier edges per degree of freedom; 1 without redundancy."""
     inliers = squared[~np.isin(graph.edge_ids, rejected)] if rejected else squared
     freedom = 3 * (len(inliers) - graph.n_nodes + 1)
     return float(inliers.sum()) / freedom if freedom > 0 else 1.0
 
 
 def truncated_cost(graph: PoseGraph, poses: Array, bound: float, config: RobustConfig | None = None) -> float:
-    """Chi2 with the squared residual of each loop cut off at a bound: what judges poses where loops may be false.
-
-    Edges of motion count with the cost of the configured kernel; without a configuration as in chi2.
-    """
+    """Chi2 with the squared residual of each loop truncated at a bound, to compare poses when some loops may be false."""
     every = squared_norms(graph, poses)
     motion = every if config is None else np.where(graph.is_motion, _COSTS[config.odometry](every, ODOMETRY_SCALE), every)
     return float(np.where(graph.is_loop, np.minimum(every, bound), motion).sum())
 
 
 def gate_of(config: BackendsConfig) -> float:
-    """Squared residual from which a loop is held for false: the configured quantile of chi2 with 3 degrees of freedom."""
+    """Squared residual beyond which a loop is an outlier: the configured quantile of chi2 with 3 degrees of freedom."""
     return chi2_quantile(config.gnc.quantile)
 
 
 def motion_weights(graph: PoseGraph, squared: Array, config: RobustConfig) -> Array:
-    """Weight (E,) of each edge at its squared residual (E,): of the configured kernel for edges of motion, else one."""
+    """Weight (E,) of each edge at its squared residual (E,), by the configured kernel; one for edges that are no motion."""
     return np.where(graph.is_motion, _WEIGHTS[config.odometry](squared, ODOMETRY_SCALE), 1.0)
 
 
 def weak_edges(graph: PoseGraph, squared: Array, config: RobustConfig) -> dict[int, float]:
-    """`edge_ids` -> weight of the edges of motion that hold next to nothing."""
+    """`edge_ids` -> weight of the odometry and registration edges with a weight below `WEAK`."""
     if config.odometry == "none":
         return {}
     weights = motion_weights(graph, squared, config)
@@ -106,13 +103,13 @@ def weak_edges(graph: PoseGraph, squared: Array, config: RobustConfig) -> dict[i
 
 
 def softened(graph: PoseGraph, poses: Array, config: RobustConfig) -> PoseGraph:
-    """The graph with the information of each edge of motion multiplied by its weight at some poses (N, 3)."""
+    """The graph with the information of odometry and registration edges multiplied by their weights at poses (N, 3)."""
     weights = motion_weights(graph, squared_norms(graph, poses), config)
     return replace(graph, information=graph.information * weights[:, None, None])
 
 
 def hanging_nodes(graph: PoseGraph, without: tuple[int, ...]) -> int:
-    """Number of nodes that no path joins to node 0 if some edges (`edge_ids`) are left out."""
+    """Number of nodes without a path to node 0 if the edges `without` (`edge_ids`) are left out."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 

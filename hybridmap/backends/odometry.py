@@ -1,4 +1,4 @@
-"""The null back-end: dead reckoning, whatever else the graph knows."""
+"""The back-end `odometry`: dead reckoning, which ignores all other edges."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from hybridmap.graph.pose_graph import PoseGraph
 
 
 def create(name: str, config: BackendsConfig) -> Driver:
-    """The back-end that believes odometry: what every other one is compared with."""
+    """The dead reckoning back-end, the baseline of every comparison."""
     return Driver(name, config, _solve, works=Works.NEVER, place=dead_reckoning)
 
 
 def dead_reckoning(graph: PoseGraph, placed: Array) -> Array:
     """Place the nodes beyond `placed` (M, 3) by odometry edges alone; (N, 3).
 
-    Where a node has none (a registration that contradicts it drops an odometry edge), the step between the graph's
-    initial poses stands in: in a map these are the odometry chain.
+    A node may have no odometry edge, because a registration that contradicts it drops the edge. Then the relative pose of the
+    graph's initial poses is used: in a map these are the odometry chain.
     """
     poses = np.concatenate([placed, np.zeros((graph.n_nodes - len(placed), 3))])
     forward = (graph.kinds == EdgeKind.ODOMETRY) & (graph.sources < graph.targets) & (graph.targets >= len(placed))

@@ -1,4 +1,4 @@
-"""The back-ends by name: the one table that knows them all, and to which others may add."""
+"""The table of back-ends by name, which others can extend."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _NOT_SEQUENTIAL = {ODOMETRY, "gtsam-isam2", "gtsam-gnc", "gtsam-calibrated"}
 
 
 def _ours(name: str, path: str, **given: Any) -> tuple[str, Factory]:
-    """A row of the table, whose module is imported when the back-end is made."""
+    """An entry of the table; its module is imported when the back-end is made."""
 
     def make(config: BackendsConfig) -> Backend:
         backend: Backend = loaded(f"hybridmap.backends.{path}")(name, config, **given)
@@ -59,31 +59,31 @@ def names() -> tuple[str, ...]:
 
 
 def register(name: str, factory: Factory) -> None:
-    """Add a back-end, which every command then takes by its name; packages have entry points `hybridmap.backends`.
+    """Add a back-end, so that every command takes it by its name. Installed packages use the entry points `hybridmap.backends`.
 
     Raises:
-        BackendError: there is one of this name already.
+        BackendError: the name is taken.
     """
     _TABLE.register(name, factory)
 
 
 def create(backend: str | Backend, config: BackendsConfig | None = None) -> Backend:
-    """Make a back-end by its name, in a fresh state, with the pre-filter before it where that is configured.
+    """Make a back-end by its name, in a fresh state, with the pre-filter before it if configured.
 
-    One that is made already is given back as it is: it has its settings.
+    An instance is returned unchanged, with its own settings.
 
     Raises:
-        BackendError: no such name; the message lists those there are.
+        BackendError: no such name; the message lists the known names.
     """
     if not isinstance(backend, str):
         return backend
     config = config or BackendsConfig()
     made = _TABLE[backend](config)
     if made.name != backend:
-        raise BackendError(f"back-end {backend!r}: calls itself {made.name!r}; expected the name that it is registered by")
+        raise BackendError(f"back-end {backend!r}: has the name {made.name!r}; expected the name under which it is registered")
     return ConsistentBackend(made, config) if config.consistency.enabled and backend != ODOMETRY else made
 
 
 def is_sequential(name: str) -> bool:
-    """Whether a back-end's work on a whole graph is one row of iterations, or sweeps, on one objective."""
+    """Whether the back-end solves a whole graph by one sequence of iterations or sweeps on one objective."""
     return name in _OURS and name not in _NOT_SEQUENTIAL

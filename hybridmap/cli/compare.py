@@ -35,13 +35,11 @@ _Incremental = Annotated[
 ]
 _Reference = Annotated[
     Path | None,
-    typer.Option(
-        metavar="GT.tum", help="Sessions only: ground truth of base_link (TUM format). Default: the session's own, if any."
-    ),
+    typer.Option(metavar="GT.tum", help="Session: ground truth of base_link (TUM format). Default: its own, if any."),
 ]
 _Relations = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="Sessions only: verified relative poses, lines `t1 t2 dx dy dyaw` (s, m, rad)."),
+    typer.Option(metavar="FILE", help="Session: verified relative poses, lines `t1 t2 dx dy dyaw` (s, m, rad)."),
 ]
 
 
@@ -54,9 +52,7 @@ def compare(
     incremental: _Incremental = False,
     reference: _Reference = None,
     relations: _Relations = None,
-    config: Annotated[
-        str | None, typer.Option(help="Configuration with the settings of the back-ends: a name or a file.")
-    ] = None,
+    config: Annotated[str | None, typer.Option(help="Configuration of the back-ends: a name or a file.")] = None,
     setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:

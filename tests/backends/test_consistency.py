@@ -121,7 +121,7 @@ def test_a_lone_true_loop_is_taken_in_from_the_solution(drive):
     sparse = graph.with_edges(np.sort(np.concatenate([np.flatnonzero(~graph.is_loop), alone])))
     report = backends.create("gtsam-lm", FILTERED).solve(sparse).report
     assert report.inconsistent_edge_ids == ()
-    assert "1 tried again and taken in" in report.message
+    assert "1 added again" in report.message
 
 
 @pytest.mark.parametrize("name", ["gtsam-isam2", "gtsam-gnc"])
@@ -161,7 +161,7 @@ def test_a_back_end_that_weighs_loops_gets_all_where_those_left_out_agree(drive,
     backend = prefilter.ConsistentBackend(Judge(graph.n_edges, truth, bent, weighs=weighs), FILTERED)
     solution = backend.solve(graph)
     assert np.array_equal(solution.poses, truth) == weighs
-    assert solution.report.message.startswith("pre-filter set aside, as all loops together fit better") == weighs
+    assert solution.report.message.startswith("pre-filter not used, because all loops together fit better") == weighs
     assert bool(solution.report.inconsistent_edge_ids) != weighs
 
 
@@ -170,6 +170,5 @@ def test_a_broken_chain_is_solved_with_all_loops_and_says_so(drive):
     gone = (graph.sources == 99) & (graph.targets == 100)
     broken = graph.with_edges(~gone)
     report = backends.create("gtsam-lm", FILTERED).solve(broken).report
-    assert "not judged" in report.message
     assert "nodes 99 and 100" in report.message
     assert report.rejected_edge_ids == ()

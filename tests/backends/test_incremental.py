@@ -40,7 +40,7 @@ def test_closures_wait_only_while_no_pose_would_move_by_more_than_the_patience(p
     monkeypatch.setattr(incremental, "PATIENCE", 0.0)
     eager = grown(backends.create("gtsam-isam2"), graph)
     for nodes, mine, best in zip(range(1, 91), lazy, eager, strict=True):
-        if "closures wait" not in mine.report.message:
+        if "loop closures wait" not in mine.report.message:
             continue
         waited += 1
         covariances = Covariances(prefix(graph, nodes), best.poses)

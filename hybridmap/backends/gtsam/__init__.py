@@ -1,1 +1,1 @@
-"""Back-ends on GTSAM: batch, incremental, robust, calibrating. Absolute imports only: `gtsam` is the library."""
+"""Back-ends on GTSAM: batch, incremental, robust, calibrating. Imports here are absolute: `gtsam` is the library."""

@@ -1,4 +1,4 @@
-"""Batch optimisers of GTSAM behind one door: Levenberg-Marquardt, Gauss-Newton, Dogleg."""
+"""Batch optimisers of GTSAM: Levenberg-Marquardt, Gauss-Newton, Dogleg."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _STUCK = 1e4  # Levenberg-Marquardt's lambda where it gave up rather than arrive
 
 
 def create(name: str, config: BackendsConfig, method: str) -> Driver:
-    """A back-end of least squares: `lm` (with a start of its own and Dogleg to fall back on), `gn` or `dogleg`."""
+    """A least-squares back-end: `lm` (which computes its own start, and falls back on Dogleg), `gn` or `dogleg`."""
 
     def solve(graph: PoseGraph, initial: Array) -> Outcome:
         start = best_start(graph, initial)
@@ -49,18 +49,18 @@ def run(
     tolerance: float = 1e-5,
     rescue: bool = True,
 ) -> Outcome:
-    """One optimiser run; exceptions become the status `singular` or `failed`, standing still on a slope `stalled`.
+    """Run an optimiser once. Exceptions become the status `singular` or `failed`; no progress far from an optimum, `stalled`.
 
-    Levenberg-Marquardt that fails or stalls (the normal equations square the condition of the graph) is followed by
-    Dogleg on orthogonal factors, which do not.
+    Levenberg-Marquardt solves normal equations, which square the condition number. If it fails or stalls, Dogleg follows
+    with an orthogonal factorisation, which does not.
 
     Args:
         method: `lm`, `gn` or `dogleg`.
         graph: a `gtsam.NonlinearFactorGraph` over keys 0..N-1.
         start: (N, 3) poses.
         max_iterations: the limit.
-        initial: the same poses as `gtsam.Values`, where they are there already.
-        tolerance: relative decrease of the cost at which an optimiser is done.
+        initial: the same poses as `gtsam.Values`, if they exist already.
+        tolerance: relative decrease of the cost at which an optimiser has converged.
         rescue: whether Dogleg may follow.
     """
     initial = values(start) if initial is None else initial
@@ -102,7 +102,7 @@ def _attempt(method: str, graph: Any, start: Array, initial: Any, max_iterations
 
 
 class WarmStart:
-    """A solver that keeps factors and poses from one update to the next, so that only what is new is converted."""
+    """A solver that keeps factors and poses between updates, so that only new ones are converted."""
 
     def __init__(self, method: str, models: NoiseModels, max_iterations: int) -> None:
         self._method, self._models, self._max_iterations = method, models, max_iterations
@@ -111,7 +111,7 @@ class WarmStart:
         self._values: Any = None
 
     def __call__(self, graph: PoseGraph, start: Array) -> Outcome:
-        """One optimiser run; where the graph was seen before, `start` (N, 3) must carry on from the last outcome."""
+        """Run the optimiser once; for a graph seen before, `start` (N, 3) must continue the last outcome."""
         added = difference(self._graph, graph).added
         known = self._graph.n_nodes if self._graph is not None else 0
         new = graph.with_edges(added)

@@ -1,9 +1,9 @@
-"""Gain, turn gain and heading bias of the odometry are variables of the graph.
+"""A back-end with the systematic errors of odometry (gain, turn gain, heading bias) as variables of the graph.
 
-Wheels that bend every metre by the same amount are no outlier: no kernel takes that out, and true loops that contradict
-the bent chain are thrown out instead. As a variable of the graph the bias straightens the whole chain. A wrong winding of the
-chain is a local minimum, so the solution is sought from several biases; the lowest truncated cost wins, in which
-odometry counts in full and a rejected loop as much as the gate.
+A heading bias bends every metre by the same amount. No robust kernel removes that: true loops that contradict the bent
+chain are rejected instead. Estimating the bias straightens the whole chain. A wrong winding of the chain is a local
+minimum, so the solution starts from several biases. The lowest truncated cost wins, with odometry in full and a
+rejected loop counted at the gate.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _STEP = 1e-6  # of the difference that takes a derivative by the calibration
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """A start's result: `graph` is the one with calibrated odometry, `gains` (3,) gain, turn gain, heading bias."""
+    """Result of one start: `graph` has calibrated odometry, `gains` (3,) are gain, turn gain, heading bias."""
 
     graph: PoseGraph
     outcome: Outcome
@@ -48,7 +48,7 @@ class _Found:
 
 
 def with_calibrated_odometry(graph: PoseGraph, gains: Gains) -> PoseGraph:
-    """The graph with calibrated odometry; its noise grows with the gains, or a smaller map would always fit better."""
+    """The graph with calibrated odometry. Its noise grows with the gains; otherwise a smaller map would always fit better."""
     own = own_odometry(graph)
     deltas, information = graph.deltas.copy(), graph.information.copy()
     deltas[own] = apply(deltas[own], gains)
@@ -58,12 +58,12 @@ def with_calibrated_odometry(graph: PoseGraph, gains: Gains) -> PoseGraph:
 
 
 def create(name: str, config: BackendsConfig) -> Driver:
-    """While driving as graduated non-convexity; on a whole graph with the calibration as one more variable."""
+    """A back-end that runs graduated non-convexity while driving, and adds the calibration when it solves a whole graph."""
     return gnc.create(name, config, best)
 
 
 def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outcome:
-    """The solution of the lowest truncated cost from several heading biases, until two agree and leave no loops in doubt."""
+    """The solution with the lowest truncated cost over several heading biases, until two agree without rejected clusters."""
     found: list[_Found] = []
     for bias in BIAS_STARTS_RAD_M:
         one = _from(graph, config, np.array([1.0, 1.0, bias]), driven if bias == 0.0 else None)
@@ -78,7 +78,7 @@ def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outc
 
 
 def _from(graph: PoseGraph, config: BackendsConfig, gains: Array, driven: Array | None) -> _Found:
-    """Choose loops and calibrate in turn until neither changes."""
+    """Alternate between choosing loops and calibrating until neither changes."""
     straight = with_calibrated_odometry(graph, Gains.from_array(gains))
     outcome = gnc.best(straight, config, driven)
     for _ in range(3):
@@ -93,7 +93,7 @@ def _from(graph: PoseGraph, config: BackendsConfig, gains: Array, driven: Array 
 
 
 def _calibrate(graph: PoseGraph, gains: Array, outcome: Outcome, config: BackendsConfig) -> tuple[Array, Array]:
-    """Gauss-Newton on the three numbers, each time with the poses that are best for them; both."""
+    """Gauss-Newton on the three gains, with the optimal poses at each step; returns both."""
     kept, models = ~np.isin(graph.edge_ids, outcome.rejected), noise_models(config.robust)
     poses = outcome.poses
     for _ in range(_ROUNDS):
@@ -132,7 +132,7 @@ def _gain_step(raw: PoseGraph, straight: PoseGraph, poses: Array, gains: Array) 
 
 
 def _slope(raw: Array, straight: Array, gains: Array, number: int) -> Array:
-    """Derivative (O, 3) of the residuals of odometry edges by one of the three numbers."""
+    """Derivative (O, 3) of the residuals of odometry edges by one of the three gains."""
     moved = gains.copy()
     moved[number] += _STEP
     return np.asarray(-log(between(straight, apply(raw, Gains.from_array(moved)))) / _STEP)

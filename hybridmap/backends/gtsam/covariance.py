@@ -1,4 +1,4 @@
-"""How sure a solution is: covariances from the Gauss-Newton Hessian of the whole graph, node 0 fixed."""
+"""Covariances of a solution, from the Gauss-Newton Hessian of the whole graph with node 0 fixed."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _EXPECTED = 0.999  # quantile of the innovation up to which a loop is expected
 
 
 def expected_loops(graph: PoseGraph, poses: Array, loops: NDArray[np.int64], variance: float) -> NDArray[np.bool_]:
-    """Which loops a map that was made without them expects: their innovation is what loop and map are uncertain by.
+    """Test loops against a map made without them: the innovation must fit the covariance of loop and map.
 
     Args:
         graph: edges of the map, and these loops.
         poses: (N, 3) of the map, m and rad.
         loops: (L,) indices of edges.
-        variance: unit variance of the map, by which its covariances and the loops' are scaled down where it is below 1.
+        variance: unit variance of the map; if below 1, the covariances of map and loops are scaled by it.
 
     Raises:
-        BackendError: the map is singular without them.
+        BackendError: the map is singular without the loops.
     """
     backbone = graph.with_edges(np.setdiff1d(np.arange(graph.n_edges), loops))
     covariance = Covariances(backbone, poses).relative(graph.sources[loops], graph.targets[loops])
@@ -40,17 +40,17 @@ def expected_loops(graph: PoseGraph, poses: Array, loops: NDArray[np.int64], var
 
 
 class Covariances:
-    """The inverse Hessian of a graph at a solution, factorised once.
+    """The factorised Hessian of a graph at a solution.
 
-    Covariances are of right perturbations, m and rad, under the information that the edges state; multiply them by
-    `SolveReport.unit_variance` where that is far from 1.
+    Covariances are of right perturbations, m and rad, for the information stated by the edges. Multiply them by
+    `SolveReport.unit_variance` if that is far from 1.
     """
 
     def __init__(self, graph: PoseGraph, poses: Array) -> None:
         """Factorise.
 
         Raises:
-            BackendError: the Hessian is singular: a node hangs on nothing.
+            BackendError: the Hessian is singular: a node has no path to node 0.
         """
         self._poses = poses
         try:
@@ -99,7 +99,7 @@ class Covariances:
 
 
 def _hessian(graph: PoseGraph, poses: Array) -> csc_array:
-    """(3N - 3, 3N - 3), the residuals' own Jacobians taken for the identity: exact where residuals are small."""
+    """(3N - 3, 3N - 3), with the inner Jacobian of the residual approximated by the identity: exact for small residuals."""
     at_source = -adjoint(between(poses[graph.targets], poses[graph.sources]))
     across = at_source.transpose(0, 2, 1) @ graph.information
     blocks = np.stack([across @ at_source, across, across.transpose(0, 2, 1), graph.information])

@@ -1,4 +1,4 @@
-"""Graphs, robust kernels and poses in GTSAM's terms, and back."""
+"""Conversion of graphs, robust kernels and poses to GTSAM and back."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ _MOTION: dict[str, Any] = {
 
 
 class NoiseModels:
-    """Noise models shared between edges of equal information, with robust kernels on loops and on edges of motion."""
+    """Noise models, shared between edges of equal information, with robust kernels on loops, odometry and registration."""
 
     def __init__(self, loop: Any = None, motion: Any = None) -> None:
-        """With a kernel for loops and one for edges of motion (`PoseGraph.is_motion`); None: quadratic."""
+        """Set a kernel for loops and one for odometry and registration edges (`PoseGraph.is_motion`); None: quadratic."""
         self._plain: dict[bytes, Any] = {}
         self._robust: dict[tuple[bytes, bool], Any] = {}
         self._loop, self._motion = loop, motion
@@ -70,12 +70,12 @@ class NoiseModels:
 
 
 def loop_kernel(name: str, config: RobustConfig) -> Any:
-    """A kernel for loops by its name."""
+    """The kernel for loops with a given name."""
     return _LOOP[name](config)
 
 
 def noise_models(config: RobustConfig, loop: Any = None) -> NoiseModels:
-    """Noise models with a kernel on loops (None: quadratic) and the configured one on edges of motion."""
+    """Noise models with a kernel on loops (None: quadratic) and the configured one on odometry and registration edges."""
     motion = None if config.odometry == "none" else _MOTION[config.odometry].Create(ODOMETRY_SCALE)
     return NoiseModels(loop, motion)
 
@@ -107,7 +107,7 @@ def collected(parts: Iterable[Any]) -> Any:
 
 
 def values(poses: Array, first: int = 0) -> Any:
-    """Poses `(N, 3)` as `gtsam.Values` with keys from `first` on."""
+    """Poses `(N, 3)` as `gtsam.Values`, with keys from `first` on."""
     out = gtsam.Values()
     for key, pose in enumerate(poses.tolist(), start=first):
         out.insert(key, gtsam.Pose2(*pose))

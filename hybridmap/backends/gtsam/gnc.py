@@ -1,7 +1,7 @@
-"""Graduated non-convexity on the loop edges: truncated least squares, odometry and registration edges known inliers.
+"""Graduated non-convexity: truncated least squares on the loops; odometry and registration edges are known inliers.
 
-Yang et al., "Graduated Non-Convexity for Robust Spatial Perception" (2020), with one optimiser step a round, weights
-quantised so that noise models are shared, and loops of weight zero left out of the graph.
+Yang et al., "Graduated Non-Convexity for Robust Spatial Perception" (2020), with one optimiser step per round, quantised
+weights (so that noise models are shared), and without the loops of weight zero.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ Whole = Callable[[PoseGraph, BackendsConfig, Array | None], Outcome]
 
 @dataclass(frozen=True, slots=True)
 class Truncated:
-    """What an annealing came to.
+    """Result of an annealing run.
 
     Attributes:
         poses: (N, 3).
         kept: (L,) which loops are inliers.
         rounds: steps and iterations taken.
-        bound: squared residual from which a loop counted as an outlier at the end.
+        bound: final squared residual beyond which a loop was an outlier.
     """
 
     poses: Array
@@ -62,7 +62,7 @@ class Truncated:
 
 
 class _Problem:
-    """One graph's factors, made once; a round puts them together with the loops' current weights."""
+    """The factors of one graph, made once; each round combines them with the current weights of the loops."""
 
     def __init__(self, graph: PoseGraph, config: BackendsConfig) -> None:
         self.graph = graph
@@ -76,7 +76,7 @@ class _Problem:
         return squared_norms(self.graph, poses)[self.loops]
 
     def weighted(self, weights: Array, negligible: float = 0.0) -> Any:
-        """Factor graph in which each loop's information is multiplied by its weight; loops below `negligible` are out."""
+        """Factor graph with each loop's information multiplied by its weight; loops below `negligible` are left out."""
         out = gtsam.NonlinearFactorGraph(self._known)
         with np.errstate(divide="ignore"):
             quantised = np.where(weights < negligible, 0.0, 2.0 ** (np.round(np.log2(weights) / _STEP) * _STEP))
@@ -99,14 +99,14 @@ def truncated_weights(squared: Array, mu: float, bound: float) -> Array:
 
 
 def graduate(graph: PoseGraph, start: Array, config: BackendsConfig, negligible: float) -> Truncated:
-    """Anneal from nearly convex to truncated, one optimiser step a round; then settle on the set of inliers.
+    """Anneal from a nearly convex to the truncated cost, one optimiser step per round; then solve until the inliers are stable.
 
     Args:
         graph: connected by its known inliers.
         start: (N, 3) poses.
         config: schedule, gate, most iterations of each full solve at the end.
-        negligible: loops of less weight sit a round out. A small value lets far loops pull from the first round, a
-            larger one lets those that nearly agree go first: neither is better on every graph.
+        negligible: loops of smaller weight are left out of a round. A small limit uses far loops from the first round; a
+            larger one begins with loops that nearly agree. Neither is better on every graph.
     """
     problem = _Problem(graph, config)
     bound, poses = gate_of(config), start
@@ -130,7 +130,7 @@ def graduate(graph: PoseGraph, start: Array, config: BackendsConfig, negligible:
 
 
 def trusting(graph: PoseGraph, config: BackendsConfig) -> Truncated | None:
-    """Least squares with all loops, then the loops within the gate; None where too many are beyond it."""
+    """Least squares with all loops, then with the loops within the gate; None if too many loops are outside."""
     bound = gate_of(config)
     poses, rounds = best_start(graph, graph.initial), 0
     if _share(squared_norms(graph, poses)[graph.is_loop] <= _ROUGHLY * bound) < _MOSTLY:
@@ -161,10 +161,10 @@ def _rejected(graph: PoseGraph, result: Truncated) -> tuple[int, ...]:
 
 
 def on_probation(graph: PoseGraph, result: Truncated, config: BackendsConfig) -> Truncated:
-    """Take out the loops that no accepted neighbour backs, and re-admit those that the map without them expects.
+    """Remove loops without support by an accepted neighbour; then re-admit those consistent with the map without them.
 
-    A graph that overstates its noise leaves room for false loops which happen to be consistent. Each loop taken out is
-    judged by its innovation under the covariance of loop and map, scaled by the unit variance of the map without it.
+    If a graph overstates its noise, false loops may happen to be consistent. Each removed loop is tested by its innovation
+    under the covariance of loop and map, scaled by the unit variance of the map without the loop.
     """
     loops = np.flatnonzero(graph.is_loop)
     accepted = loops[result.kept]
@@ -187,7 +187,7 @@ def on_probation(graph: PoseGraph, result: Truncated, config: BackendsConfig) ->
 
 
 def _from_kernels(graph: PoseGraph, config: BackendsConfig) -> Truncated:
-    """Settle from the map that Cauchy's kernel on loops and the configured one on odometry lead to."""
+    """Start from the map of Cauchy's kernel on loops and the configured one on odometry; solve until the inliers are stable."""
     bound = gate_of(config)
     outcome = with_kernel("cauchy", graph, trusted_start(graph, graph.initial, bound), config)
     settled = _settle(_Problem(graph, config), outcome.poses, bound, config.max_iterations)
@@ -195,7 +195,7 @@ def _from_kernels(graph: PoseGraph, config: BackendsConfig) -> Truncated:
 
 
 def _softened_last(graph: PoseGraph, config: BackendsConfig) -> Truncated:
-    """Let the loops compete on odometry without a kernel, which no false loop can tear; then settle with the kernel."""
+    """Choose the loops on odometry without a kernel, which false loops cannot tear; then solve with the kernel."""
     stiff = config.model_copy(update={"robust": config.robust.model_copy(update={"odometry": "none"})})
     result = grow(graph, stiff, _PATIENT)
     settled = _settle(_Problem(graph, config), result.poses, result.bound, config.max_iterations)
@@ -203,7 +203,7 @@ def _softened_last(graph: PoseGraph, config: BackendsConfig) -> Truncated:
 
 
 def _settle(problem: _Problem, poses: Array, bound: float, max_iterations: int) -> Truncated:
-    """A few full solves with the set of inliers, until it no longer changes."""
+    """Solve with the inliers a few times, until the set of inliers is stable."""
     keep: NDArray[np.bool_] = problem.squared(poses) <= bound
     rounds = 0
     for _ in range(8):
@@ -217,7 +217,7 @@ def _settle(problem: _Problem, poses: Array, bound: float, max_iterations: int) 
 
 
 def _step(factor_graph: Any, poses: Array, current: Any) -> tuple[Array, Any]:
-    """One damped step from given poses, which are there as GTSAM's values too; both after it."""
+    """One damped step from given poses, in both forms; returns both forms of the new poses."""
     optimizer = gtsam.LevenbergMarquardtOptimizer(factor_graph, current, gtsam.LevenbergMarquardtParams())
     optimizer.iterate()
     moved = poses_of(optimizer.values())
@@ -225,7 +225,7 @@ def _step(factor_graph: Any, poses: Array, current: Any) -> tuple[Array, Any]:
 
 
 def grow(graph: PoseGraph, config: BackendsConfig, negligible: float) -> Truncated:
-    """Solve the graph chunk by chunk, extending by odometry; loops rejected before compete again in every chunk."""
+    """Solve the graph chunk by chunk, extended by odometry; rejected loops are considered again in every chunk."""
     poses, rounds = graph.initial[:1], 0
     for end in range(CHUNK_NODES, graph.n_nodes, CHUNK_NODES):
         part = prefix(graph, end)
@@ -236,7 +236,7 @@ def grow(graph: PoseGraph, config: BackendsConfig, negligible: float) -> Truncat
 
 
 def create(name: str, config: BackendsConfig, whole: Whole | None = None) -> Driver:
-    """Cauchy on the loops while driving, graduated non-convexity (or what `whole` does) on the whole graph at the end."""
+    """A back-end with Cauchy's kernel on loops while driving, and graduated non-convexity (or `whole`) on a whole graph."""
     solve = whole or best
 
     def anew(graph: PoseGraph, initial: Array) -> Outcome:
@@ -250,11 +250,11 @@ def create(name: str, config: BackendsConfig, whole: Whole | None = None) -> Dri
 
 
 def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outcome:
-    """Run the configured starts until one convinces; if none does, the lowest truncated cost wins.
+    """Run the configured starts until a result convinces; if none does, take the one with the lowest truncated cost.
 
-    A result convinces where no rejected loops agree with each other, or where two different ways came to the same; with a
-    kernel on odometry, which false loops may tear, only where every loop fits without strain. The map of the drive (N, 3) may
-    be bent by loops that were false: what begins there and rejects some is held against the next result that convinces.
+    A result convinces if no rejected loops agree with each other, or if two different starts lead to it. With a kernel on
+    odometry, which false loops may tear, every loop must fit as well. The map of the drive (N, 3) may be bent by false loops:
+    if a run from it rejects loops, it only competes with the next convincing result.
     """
     results: dict[str, Truncated] = {}
     unconfirmed: dict[str, Truncated] = {}
@@ -279,7 +279,7 @@ def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outc
 
 
 def attempts(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> dict[str, Callable[[], Truncated | None]]:
-    """The configured ways to a result, by name, in the order in which they are tried."""
+    """The configured starts by name, in the order in which they are tried."""
 
     def whole(negligible: float) -> Truncated:
         return graduate(graph, trusted_start(graph, graph.initial, gate_of(config)), config, negligible)
@@ -303,9 +303,9 @@ def attempts(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> 
 
 
 def _cheapest(graph: PoseGraph, results: dict[str, Truncated], config: BackendsConfig) -> Outcome:
-    """The result of the lowest truncated cost, at the tightest bound that any of them ended with.
+    """The result with the lowest truncated cost, at the tightest final bound of all results.
 
-    Files that overstate their noise would otherwise prefer a false loop that happens to be consistent.
+    With a wider bound, graphs that overstate their noise would prefer a false loop that happens to be consistent.
     """
     bound = min(result.bound for result in results.values())
     costs = {name: truncated_cost(graph, result.poses, bound, config.robust) for name, result in results.items()}

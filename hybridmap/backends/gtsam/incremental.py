@@ -1,4 +1,4 @@
-"""Incremental smoothing by ISAM2; edges may go again, and after a failure the state before it is restored."""
+"""Incremental smoothing by ISAM2. Edges may be removed again; a failure restores the state before."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _SETTLED = 1e-5  # relative decrease of the cost that no longer counts: the batc
 
 
 def create(name: str, config: BackendsConfig) -> Driver:
-    """A back-end that follows a growing graph; `solve` grows a frozen one from loop to loop."""
+    """A back-end that follows a growing graph; `solve` replays a frozen one from loop to loop."""
     isam2 = Isam2(config)
     most_rise = np.inf if isam2.is_robust else _RISE
 
@@ -58,12 +58,11 @@ def create(name: str, config: BackendsConfig) -> Driver:
 
 
 class Isam2:
-    """A solver that is told what is new, and one that ends the drive.
+    """The two solvers of the back-end: `follow` for updates and `conclude` for the end of the drive.
 
-    Closures that agree with the map wait. Measurements with residuals r, added to a least-squares map, move to first order no
-    pose by more than sqrt(sum of r' information r) of its standard deviations (Cauchy-Schwarz on the Kalman gain), and
-    without them chi2 is above its minimum by that sum at the most. ISAM2 works once the root is beyond
-    `PATIENCE`.
+    Loop closures that agree with the map are delayed. To first order, adding measurements with residuals r to a least-squares
+    map moves no pose by more than sqrt(sum of r' information r) of its standard deviations (Cauchy-Schwarz on the Kalman
+    gain), and without them chi2 is at most that sum above its minimum. ISAM2 runs once the root exceeds `PATIENCE`.
     """
 
     def __init__(self, config: BackendsConfig) -> None:
@@ -79,22 +78,22 @@ class Isam2:
         return self._kernel is not None or self._config.robust.odometry != "none"
 
     def follow(self, graph: PoseGraph, start: Array) -> Outcome:
-        """An update, which may let closures wait."""
+        """Run an update, which may delay loop closures."""
         if self._smoother is not None:
             shift = _largest_shift(graph, self._smoother.lacks(graph), start)
             if shift <= PATIENCE:
-                message = f"isam2: closures wait; they could move no pose by more than {shift:.2g} of its standard deviations"
+                message = f"isam2: loop closures wait; they would move no pose by more than {shift:.2g} standard deviations"
                 return Outcome(start, SolveStatus.CONVERGED, message, 0, self._weights, self._rejected)
         return self._kept(*self._brought_up(graph, start), graph)
 
     def conclude(self, graph: PoseGraph, start: Array) -> Outcome:
-        """The last update: nothing waits, and every node is linearised anew."""
+        """Run the last update: nothing is delayed, and every node is linearised anew."""
         return self._kept(*self._polished(*self._brought_up(graph, start), graph), graph)
 
     def _brought_up(self, graph: PoseGraph, start: Array) -> tuple[Smoother, int]:
-        """The smoother with what is new in the graph, and the updates done.
+        """The smoother with the new part of the graph, and the number of updates.
 
-        It is not kept while it works: a failure leaves it half changed, and then another is made from the start.
+        Meanwhile the smoother is not stored, because a failure leaves it half changed; the next call then makes a new one.
         """
         smoother, self._smoother = self._smoother, None
         if smoother is None:
@@ -105,9 +104,9 @@ class Isam2:
             return self._anew(graph, start)
 
     def _told(self, smoother: Smoother, graph: PoseGraph, start: Array) -> tuple[Smoother, int]:
-        """A smoother that knows the graph, settled if it is new or if edges went, and the updates done.
+        """A smoother that knows the graph, converged if it is new or if edges were removed, and the number of updates.
 
-        The map that false edges have bent may be in another valley when they are gone: then it is left for a fresh start.
+        A map bent by false edges may stay in a wrong local minimum when they are removed: then a fresh smoother is made.
         """
         new, lacks = smoother.is_empty, smoother.lacks(graph)
         smoother.follow(graph, start, lacks)
@@ -123,7 +122,7 @@ class Isam2:
         return self._polished(smoother, updates, graph)
 
     def _polished(self, smoother: Smoother, updates: int, graph: PoseGraph) -> tuple[Smoother, int]:
-        """The smoother with every node linearised anew as long as that lowers the cost, and the updates done so far."""
+        """The smoother, relinearised at every node as long as that lowers the cost, and the number of updates so far."""
         cost = self._cost(graph, smoother.poses())
         for _ in range(self._config.max_iterations):
             onward, more = self._anew(graph, smoother.poses())
@@ -136,7 +135,7 @@ class Isam2:
         return smoother, updates
 
     def _anew(self, graph: PoseGraph, start: Array) -> tuple[Smoother, int]:
-        """A smoother that is told a whole graph from poses (N, 3), and the updates done."""
+        """A new smoother with a whole graph from poses (N, 3), and the number of updates."""
         try:
             return self._told(self._empty(), graph, start)
         except RuntimeError:  # Cholesky factors square the condition of the graph, orthogonal ones do not
@@ -146,12 +145,12 @@ class Isam2:
         return Smoother(noise_models(self._config.robust, self._kernel), orthogonal=orthogonal)
 
     def _cost(self, graph: PoseGraph, poses: Array) -> float:
-        """What it is out to lower, as the referee sees it."""
+        """The cost that the smoother minimises, by the common objective."""
         bound = np.inf if self._kernel is None else gate_of(self._config)
         return truncated_cost(graph, poses, bound, self._config.robust)
 
     def _kept(self, smoother: Smoother, updates: int, graph: PoseGraph) -> Outcome:
-        """The outcome; the smoother goes on from it if it is finite."""
+        """The outcome; if finite, the smoother is kept for the next update."""
         outcome = Outcome(smoother.poses(), SolveStatus.CONVERGED, f"isam2: {updates} updates", updates)
         if self._kernel is not None:
             outcome = judged(outcome, self._kernel, graph, gate_of(self._config))
@@ -161,31 +160,31 @@ class Isam2:
 
 
 def _largest_shift(graph: PoseGraph, lacks: Change, start: Array) -> float:
-    """By how many of its standard deviations what a smoother lacks could move a pose; infinite if it is to forget."""
+    """Bound of the shift of any pose by the missing edges, in standard deviations; infinite if edges are to be removed."""
     if len(lacks.removed):
         return np.inf
     return float(np.sqrt(total(squared_norms(graph.with_edges(lacks.added), start))))
 
 
 def _closing_nodes(graph: PoseGraph) -> list[int]:
-    """Sizes of the graph at which its newest node closes a loop, and the whole."""
+    """Sizes of the graph at which its newest node closes a loop, and the full size."""
     newest = np.maximum(graph.sources, graph.targets)
     return sorted({*(newest[graph.is_loop] + 1).tolist(), graph.n_nodes})
 
 
 class Smoother:
-    """An ISAM2 that follows a graph. What raises may leave it half changed: throw it away then.
+    """An ISAM2 that follows a graph. After an exception it may be half changed and must be discarded.
 
     Attributes:
-        isam: the one of GTSAM.
+        isam: the GTSAM object.
     """
 
     def __init__(self, models: NoiseModels, *, orthogonal: bool) -> None:
-        """An empty one.
+        """An empty smoother.
 
         Args:
             models: makes the noise models of its factors.
-            orthogonal: QR factors, slower than Cholesky's, which square the condition of the graph.
+            orthogonal: QR factorisation: slower than Cholesky, which squares the condition number.
         """
         thresholds = gtsam.ISAM2ThresholdMap()
         limits = np.array([RELINEARIZE_M, RELINEARIZE_M, RELINEARIZE_RAD])
@@ -204,20 +203,20 @@ class Smoother:
 
     @property
     def is_empty(self) -> bool:
-        """Whether it knows nothing yet."""
+        """Whether the smoother has no factors yet."""
         return self._graph is None
 
     def lacks(self, graph: PoseGraph) -> Change:
-        """What it has not been told of a graph yet."""
+        """The difference between a graph and what the smoother knows."""
         return difference(self._graph, graph)
 
     def follow(self, graph: PoseGraph, start: Array, change: Change) -> None:
-        """Bring ISAM2 up to the graph by one update.
+        """Bring ISAM2 up to date with the graph by one update.
 
         Args:
             graph: the graph.
-            start: (N, 3), of which the poses of the nodes that it does not know count.
-            change: what it lacks of the graph.
+            start: (N, 3); the poses of new nodes are used.
+            change: the difference between the graph and what the smoother knows.
         """
         known = len(self._point)
         new = graph.with_edges(change.added)
@@ -230,7 +229,7 @@ class Smoother:
         self._graph = graph
 
     def settle(self) -> int:
-        """Empty updates until nothing is linearised anew, at most `SETTLE_UPDATES`; returns how many."""
+        """Run empty updates until nothing is relinearised, at most `SETTLE_UPDATES`; returns how many."""
         for done in range(1, SETTLE_UPDATES + 1):
             if self._update().getVariablesRelinearized() == 0:
                 return done
@@ -249,7 +248,7 @@ class Smoother:
         return compose(self._point, exp(self.isam.getDelta().vector(range(n)).reshape(-1, 3)))
 
     def _update(self, *given: Any) -> Any:
-        """One update; the nodes that it may have linearised anew are marked."""
+        """Run one update and mark the nodes that may have been relinearised."""
         result = self.isam.update(*given)
         self._marked.update(result.getMarkedKeys())
         return result

@@ -1,4 +1,4 @@
-"""A start for the optimisers: headings by linear rotation averaging, then positions by linear least squares."""
+"""Initial poses for optimisers: headings by linear rotation averaging, then positions by linear least squares."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _NEAR = 100.0  # mean squared Mahalanobis residual from which another start is l
 
 
 def best_start(graph: PoseGraph, given: Array) -> Array:
-    """The angular start or the one given (N, 3), whichever has the lower chi2; (N, 3).
+    """The rotation averaging start or the given one (N, 3), whichever has the lower chi2; (N, 3).
 
-    Where the one given fits the edges within some standard deviations already, it is taken without a look at the other: a
-    chain of the wrong winding does not.
+    If the given start fits the edges within some standard deviations, it is taken directly: a chain with a wrong winding
+    would not fit.
     """
     own = chi2(graph, given)
     if own <= _NEAR * graph.n_edges:
@@ -31,19 +31,19 @@ def best_start(graph: PoseGraph, given: Array) -> Array:
 
 
 def trusted_start(graph: PoseGraph, given: Array, bound: float) -> Array:
-    """The start given (N, 3) or the chain of the best consecutive edges, by chi2 with loops cut off at `bound`; (N, 3).
+    """The given start (N, 3) or the chain of the most certain consecutive edges, by chi2 with loops truncated at `bound`.
 
-    For back-ends that must not trust loops. In a map `initial` is odometry alone, and registrations know better.
+    For back-ends that must not trust loops. In a map `initial` is odometry alone, and registrations are more accurate.
     """
     chained = extend(graph, graph.initial[:1])
     return min((given, chained), key=lambda poses: truncated_cost(graph, poses, bound))
 
 
 def angular_start(graph: PoseGraph) -> Array | None:
-    """Poses (N, 3) by two sparse linear solves; None where they are singular.
+    """Poses (N, 3) by two sparse linear solves; None if they are singular.
 
     Headings: unit complex numbers z minimise sum of w |z_target - z_source exp(i dyaw)|^2 with z_0 fixed, then |z| = 1
-    (the chordal relaxation of rotation averaging; takes any winding). Positions: with these headings, the sum of
+    (the chordal relaxation of rotation averaging; valid for any winding). Positions: with these headings, the sum of
     squared translation residuals weighted by the edge's isotropised information.
     """
     if graph.n_nodes < 2:

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt with a robust kernel on the loop edges; other edges stay quadratic unless configured otherwise."""
+"""Levenberg-Marquardt with a robust kernel on the loop edges; other edges are quadratic unless configured otherwise."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hybridmap.graph.pose_graph import PoseGraph
 
 
 def create(name: str, config: BackendsConfig, kernel: str) -> Driver:
-    """A back-end with a kernel: `cauchy`, `huber`, `dcs` or `geman-mcclure`."""
+    """A back-end with the kernel `cauchy`, `huber`, `dcs` or `geman-mcclure`."""
 
     def solve(graph: PoseGraph, initial: Array) -> Outcome:
         start = trusted_start(graph, initial, gate_of(config))
@@ -30,7 +30,7 @@ def create(name: str, config: BackendsConfig, kernel: str) -> Driver:
 
 
 def judged(outcome: Outcome, kernel: Any, graph: PoseGraph, gate: float) -> Outcome:
-    """The outcome with each loop's weight, and with the loops whose squared residual is beyond the gate rejected."""
+    """The outcome with the weight of each loop; loops with a squared residual beyond the gate are rejected."""
     loops = graph.is_loop
     ids, squared = graph.edge_ids[loops], squared_norms(graph, outcome.poses)[loops]
     weights = {int(edge): float(kernel.weight(distance)) for edge, distance in zip(ids, np.sqrt(squared), strict=True)}
@@ -45,12 +45,12 @@ def with_kernel(name: str, graph: PoseGraph, start: Array, config: BackendsConfi
 
 
 class WarmKernel:
-    """The same, carrying on from update to update."""
+    """Levenberg-Marquardt with a kernel on loops, warm-started from update to update."""
 
     def __init__(self, name: str, config: BackendsConfig) -> None:
         self._kernel, self._gate = loop_kernel(name, config.robust), gate_of(config)
         self._warm = WarmStart("lm", noise_models(config.robust, self._kernel), config.max_iterations)
 
     def __call__(self, graph: PoseGraph, start: Array) -> Outcome:
-        """See `WarmStart`; with weights and verdicts."""
+        """See `WarmStart`; the outcome also has weights and rejected loops."""
         return judged(self._warm(graph, start), self._kernel, graph, self._gate)

@@ -1,1 +1,1 @@
-"""What speaks for and against a solution: certificates, consistency of loops, edges of little weight."""
+"""Assessment of solutions: certificates, consistency of loops, down-weighted edges."""

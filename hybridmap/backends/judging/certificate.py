@@ -1,8 +1,8 @@
-"""Whether a solution is at an optimum, and whether that is the global one of the isotropised objective.
+"""Proof that a solution is at an optimum, and that the optimum is global for the objective with isotropic noise.
 
-Three things are checked, over the edges that the back-end kept: Levenberg-Marquardt on the true objective chi2 finds next
-to nothing to gain from the solution; the critical point of the isotropised objective F beside it is proved to be the global
-optimum of F (`judging.dual`); and F at the solution is near that. No lower bound of chi2 itself is proved, but for zero.
+Three conditions are checked over the inlier edges. Levenberg-Marquardt on the true objective chi2 gains next to nothing
+from the solution. The nearby critical point of the isotropised objective F is proved to be the global optimum of F
+(`judging.dual`). F at the solution is close to F at that point. A lower bound of chi2 itself is not proved.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ _ITERATIONS, _TOLERANCE = 100, 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What could be proved about a solution.
+    """What was proved about a solution.
 
     Attributes:
-        gap: upper bound of (F - F_best) / F at the optimum of F beside the solution; infinite where none could be proved
-            and where the solution itself is not at an optimum.
+        gap: upper bound of (F - F_best) / F at the optimum of F near the solution; infinite if no bound was proved or the
+            solution is not at an optimum.
         message: one line for people.
-        objective: F at its optimum beside the solution; NaN where none was reached or looked for.
-        objective_given: F at the solution; NaN where it was not looked at.
+        objective: F at its optimum near the solution; NaN if that was not reached or not searched for.
+        objective_given: F at the solution; NaN if not computed.
     """
 
     gap: float
@@ -47,7 +47,7 @@ class Certificate:
 
     @property
     def certified(self) -> bool:
-        """Whether the solution is at a local optimum of chi2 that lies beside the global optimum of F."""
+        """Whether the solution is at a local optimum of chi2 near the global optimum of F."""
         return self.gap <= CERTIFIED_GAP
 
     @property
@@ -57,12 +57,12 @@ class Certificate:
 
 
 def certify(graph: PoseGraph, poses: Array, rejected: tuple[int, ...] = ()) -> Certificate:
-    """Check a solution against the optimum of chi2 beside it, and that against the global optimum of F.
+    """Check a solution against the nearby optimum of chi2, and that optimum against the global optimum of F.
 
     Args:
         graph: connected.
         poses: (N, 3) the solution, m and rad.
-        rejected: `edge_ids` that do not count, such as the loops that a robust back-end holds for false.
+        rejected: `edge_ids` to leave out, such as the outlier loops of a robust back-end.
     """
     kept = graph.with_edges(~np.isin(graph.edge_ids, rejected)) if rejected else graph
     cost = chi2(kept, poses)
@@ -79,7 +79,7 @@ def _refused(why: str) -> Certificate:
 
 
 def _not_at_optimum(graph: PoseGraph, poses: Array, cost: float, counted: str) -> str:
-    """What speaks against poses being at an optimum of chi2, of which they have `cost`; empty if nothing does."""
+    """Why poses with chi2 `cost` are not at an optimum of chi2; empty if they are."""
     local = run("lm", factor_graph(graph, NoiseModels()), poses, _ITERATIONS, tolerance=_TOLERANCE)
     best = chi2(graph, local.poses)
     if cost > _AT_OPTIMUM * best:
@@ -87,7 +87,9 @@ def _not_at_optimum(graph: PoseGraph, poses: Array, cost: float, counted: str) -
         less = f"{100.0 * (1.0 - best / cost):.2g} % less" if few else f"{cost / best:.0f} times less"
         where = "the one near it" if local.status is SolveStatus.CONVERGED else "one nearer to it"
         return f"this solution is not at an optimum; {where} has chi2 {best:.4g}{counted}, {less}"
-    return "" if local.status is SolveStatus.CONVERGED else f"whether it is at an optimum is not known ({local.message})"
+    return (
+        "" if local.status is SolveStatus.CONVERGED else f"whether the solution is at an optimum is not known ({local.message})"
+    )
 
 
 def _proved(graph: PoseGraph, poses: Array) -> Certificate:

@@ -1,4 +1,4 @@
-"""Rejected loops that agree with each other: what a false one seldom does, and a true one that was dropped always does."""
+"""Clusters of rejected loops that agree with each other. True loops always form them, false ones seldom."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _LEAST = 3  # loops of a cluster
 
 
 def rejected_clusters(graph: PoseGraph, poses: Array, rejected: tuple[int, ...], gate: float) -> tuple[tuple[int, ...], ...]:
-    """Groups of rejected loops of which neighbours agree, the largest first; `edge_ids`.
+    """Groups of rejected loops in which neighbours agree, the largest first; `edge_ids`.
 
     Args:
         graph: the graph.
         poses: (N, 3) the solution, along which the chain is taken.
-        rejected: `edge_ids` of the loops that it holds for false.
+        rejected: `edge_ids` of the loops that the solution rejects.
         gate: squared Mahalanobis distance up to which two loops agree.
     """
     edges = np.flatnonzero(np.isin(graph.edge_ids, rejected))

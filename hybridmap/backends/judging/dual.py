@@ -33,12 +33,12 @@ _STATIONARY = 1e-12  # relative decrease of F, promised by a Newton step, that n
 
 @dataclass(frozen=True, slots=True)
 class Proof:
-    """What could be proved about the critical point of the isotropised objective F beside some poses.
+    """What was proved about the critical point of the isotropised objective F near given poses.
 
     Attributes:
-        objective: F at the critical point; at the poses given where none was reached.
-        objective_given: F at the poses given.
-        gap: upper bound of (F - F_best) / F at the critical point; infinite where nothing could be proved.
+        objective: F at the critical point; F at the given poses if it was not reached.
+        objective_given: F at the given poses.
+        gap: upper bound of (F - F_best) / F at the critical point; infinite if nothing was proved.
         reached: whether Newton steps led to a critical point.
     """
 
@@ -49,7 +49,7 @@ class Proof:
 
 
 def prove(graph: PoseGraph, poses: Array) -> Proof:
-    """Go to the critical point of F beside some poses and bound how far above the global optimum of F it is.
+    """Find the critical point of F near given poses and bound how far it is above the global optimum of F.
 
     Args:
         graph: connected, of two nodes or more.
@@ -90,7 +90,7 @@ def _multipliers(form: csr_array, x: _Complex) -> Array:
 
 
 def _polished(form: csr_array, x: _Complex) -> _Complex | None:
-    """Damped Newton on positions and heading angles until F cannot fall further; None if that takes too many steps."""
+    """Damped Newton on positions and heading angles until F stops falling; None if that takes too many steps."""
     cost, damping = _objective(form, x), 0.0
     for _ in range(_ITERATIONS):
         step, promised = _newton_step(form, x, damping)
@@ -112,7 +112,7 @@ def _moved(x: _Complex, step: Array) -> _Complex:
 
 
 def _newton_step(form: csr_array, x: _Complex, damping: float) -> tuple[Array, float]:
-    """Newton step (3N,) with the diagonal of the Hessian raised by a factor, and the decrease of F that it promises."""
+    """Newton step (3N,) with the diagonal of the Hessian raised by a factor, and the predicted decrease of F."""
     n = len(x) // 2
     slope = np.asarray(form @ x)
     gradient = np.concatenate([slope[:n].real, slope[:n].imag, (np.conj(1j * x[n:]) * slope[n:]).real])
@@ -139,7 +139,7 @@ def _newton_step(form: csr_array, x: _Complex, damping: float) -> tuple[Array, f
 
 
 def _proved_gap(form: csr_array, x: _Complex, cost: float) -> float:
-    """(F - bound) / F for the best bound that the pivots prove; infinite where they prove none."""
+    """(F - bound) / F for the best bound that the pivots prove; infinite if they prove none."""
     n = len(x) // 2
     multipliers = _multipliers(form, x)
     dual: Any = form - diags_array(multipliers)
@@ -156,7 +156,7 @@ def _proved_gap(form: csr_array, x: _Complex, cost: float) -> float:
 
 
 def _factor(matrix: Any) -> Any:
-    """LU without row exchanges, as a Cholesky factorisation; None where it breaks down."""
+    """LU without row exchanges, as a Cholesky factorisation; None if it breaks down."""
     try:
         return splu(csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     except RuntimeError:

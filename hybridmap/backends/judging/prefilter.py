@@ -1,4 +1,4 @@
-"""Any back-end, given only loops that are consistent with each other; the others are tried again from its solution."""
+"""Pre-filter: a back-end gets only loops that are consistent with each other; the others are tested against its solution."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _TRIES = 2  # of the loops left out
 
 @dataclass(frozen=True, slots=True)
 class _Tried:
-    """A solution of some of the loops.
+    """A solution with some of the loops.
 
     Attributes:
         solution: the back-end's own.
-        out: (L,) indices of the edges that it was not given.
-        taken_in: loops that were left out at first and tried again.
+        out: (L,) indices of the loops that it did not get.
+        taken_in: number of loops that were left out at first and added later.
         iterations: of all its solutions.
     """
 
@@ -42,11 +42,11 @@ class _Tried:
 
 
 class ConsistentBackend:
-    """A back-end with the pre-filter before each whole graph; while driving it sees all loops.
+    """A back-end with the pre-filter before each whole graph; while driving it gets all loops.
 
-    Loops left out count as rejected; those that the solution expects, given how sure it is, are taken in and it is solved
-    again from there. Where some of the others agree with each other, a back-end that weighs loops itself gets all of them as
-    well, and the better map is kept.
+    Loops that are left out count as rejected. Those consistent with the solution, given its covariance, are added and the
+    graph is solved again from there. If some of the remaining ones agree with each other, a robust back-end is also run with
+    all loops, and the better map is kept.
     """
 
     def __init__(self, inner: Backend, config: BackendsConfig) -> None:
@@ -77,12 +77,12 @@ class ConsistentBackend:
             consistent = consistent_loops(graph)
         except GraphError as broken:
             solution = solve(graph)
-            message = f"consistency of loops not judged, as {broken}; {solution.report.message}"
+            message = f"pre-filter not used, because {broken}; {solution.report.message}"
             return replace(solution, report=replace(solution.report, message=message))
         tried = self._tried(graph, consistent, solve)
         whole = solve(graph) if self._doubtful(graph, tried) else None
         if whole is not None and self._cost(graph, whole) < self._cost(graph, tried.solution):
-            message = f"pre-filter set aside, as all loops together fit better; {whole.report.message}"
+            message = f"pre-filter not used, because all loops together fit better; {whole.report.message}"
             return replace(whole, report=replace(whole.report, message=message, cpu_s=time.process_time() - started))
         return self._on_whole(graph, tried, time.process_time() - started)
 
@@ -100,7 +100,7 @@ class ConsistentBackend:
         return _Tried(solution, out, first - len(out), iterations)
 
     def _doubtful(self, graph: PoseGraph, tried: _Tried) -> bool:
-        """Loops that were left out agree with each other, and the back-end could have judged them itself."""
+        """Whether left-out loops agree with each other and the back-end is robust itself."""
         report = tried.solution.report
         left_out = tuple(graph.edge_ids[tried.out].tolist())
         judges = report.status.has_map and bool(report.weights)
@@ -110,7 +110,7 @@ class ConsistentBackend:
         return truncated_cost(graph, solution.poses, gate_of(self._config), self._config.robust)
 
     def _expected(self, graph: PoseGraph, solution: Solution, out: NDArray[np.int64], most: float) -> NDArray[np.int64]:
-        """Those of the loops left out that the solution expects; a map more strained than `most` has no wider gate for it."""
+        """The left-out loops that are consistent with the solution; a unit variance above `most` does not widen the gate."""
         rejected = np.flatnonzero(np.isin(graph.edge_ids, solution.report.rejected_edge_ids))
         judged = softened(_without(graph, rejected), solution.poses, self._config.robust)
         loops = np.flatnonzero(np.isin(judged.edge_ids, graph.edge_ids[out]))
@@ -124,7 +124,7 @@ class ConsistentBackend:
         rejected = tuple(sorted({*report.rejected_edge_ids, *inconsistent}))
         loops = graph.edge_ids[graph.is_loop].tolist()
         weights = {edge: 0.0 if edge in set(inconsistent) else report.weights.get(edge, 1.0) for edge in loops}
-        note = f"{len(inconsistent)} of {len(loops)} loops left out as inconsistent, {tried.taken_in} tried again and taken in"
+        note = f"{len(inconsistent)} of {len(loops)} loops left out as inconsistent, {tried.taken_in} added again"
         whole = replace(
             report,
             message=f"{note}; {report.message}",
@@ -146,11 +146,11 @@ def _without(graph: PoseGraph, edges: NDArray[np.int64]) -> PoseGraph:
 
 @dataclass(frozen=True, slots=True)
 class Consistent:
-    """What the test of pairs found.
+    """Result of the pairwise test.
 
     Attributes:
-        loops: (L,) indices of the edges that agree in pairs with all others of them, and with some beside them.
-        variance: in units of what the edges state, that of neighbouring loops that agree; 1 where there are none.
+        loops: (L,) indices of loops that agree in pairs with each other, each with at least some neighbours.
+        variance: unit variance of neighbouring loops that agree, relative to the stated covariances; 1 if there are none.
     """
 
     loops: NDArray[np.int64]
@@ -160,18 +160,18 @@ class Consistent:
 def consistent_loops(graph: PoseGraph) -> Consistent:
     """Find the loops that are consistent with each other.
 
-    Files mostly overstate their noise. How much is seen from neighbouring loops that agree: where the ring of two closes
-    much better than its covariance says, the bound for all pairs is tightened accordingly.
+    Most graph files overstate their noise. Neighbouring loops that agree show by how much: if their rings close much better
+    than their covariances say, the bound for all pairs is tightened accordingly.
 
     Args:
-        graph: with a chain of edges of motion.
+        graph: with a chain of odometry or registration edges.
 
     Raises:
-        GraphError: no edge of motion joins two consecutive nodes; it names them.
+        GraphError: no odometry or registration edge joins two consecutive nodes; the message names them.
     """
     chain = chain_of(graph)
     if len(chain.breaks):
-        raise GraphError(f"graph: no edge of motion joins nodes {chain.breaks[0] - 1} and {chain.breaks[0]}")
+        raise GraphError(f"graph: no odometry or registration edge joins nodes {chain.breaks[0] - 1} and {chain.breaks[0]}")
     edges = np.flatnonzero(graph.is_loop)
     loops, near = loops_of(graph, edges), neighbouring_pairs(graph, edges)
     apart = ring(loops[near[:, 0]], loops[near[:, 1]], chain.ways).distance

@@ -1,1 +1,1 @@
-"""The relaxation rules: the paper's, its stable relative, and RatSLAM's."""
+"""Relaxation rules: the paper's, its stable variant, and RatSLAM's."""

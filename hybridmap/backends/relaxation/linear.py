@@ -1,8 +1,8 @@
-"""The paper's correction rule (its equation 16) as printed, and with the rate divided by each node's degree.
+"""The paper's correction rule (its equation 16) as printed, and a variant with the rate divided by each node's degree.
 
-Both keep the transitions in the world frame of the initial chain, so headings stay as odometry had them, and correct all
-nodes at once: a Jacobi step d += theta (b - L d), L the graph's Laplacian, stable only for theta < 2 / lambda_max(L).
-Divided by the degree it is stable for every theta <= 1, as no eigenvalue of D^-1 L is above 2.
+Both keep the transitions in the world frame of the initial chain, so headings stay those of odometry. All nodes are
+corrected at once: a Jacobi step d += theta (b - L d), L the graph's Laplacian, stable only for theta < 2 / lambda_max(L).
+The variant is stable for every theta <= 1, as no eigenvalue of D^-1 L is above 2.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class LinearRule:
         return np.asarray(self.pull - self.laplacian @ positions)
 
     def objective(self, positions: Array) -> float:
-        """Half the sum of squared link errors, m^2: what the rule descends on."""
+        """Half the sum of squared link errors, m^2, which the rule minimises."""
         error = positions[self.targets] - positions[self.sources] - self.transitions
         return 0.5 * float(np.sum(error * error))
 
@@ -82,7 +82,7 @@ def lambda_max(laplacian: csr_array) -> float:
 
 
 def relax(rule: LinearRule, positions: Array, rate: float | Array, sweeps: int, tolerance_m: float) -> tuple[Array | None, int]:
-    """Some sweeps of d += rate * correction; the positions (None: they grew without bound) and the sweeps done."""
+    """Up to `sweeps` sweeps of d += rate * correction; returns positions (None: grown without bound) and the sweeps done."""
     before = rule.objective(positions)
     with np.errstate(over="ignore", invalid="ignore"):
         for done in range(1, sweeps + 1):
@@ -97,7 +97,7 @@ def relax(rule: LinearRule, positions: Array, rate: float | Array, sweeps: int, 
 
 
 def paper(name: str, config: BackendsConfig) -> Driver:
-    """Equation 16 as printed; what happens beyond theta_max is configured."""
+    """Equation 16 as printed; `on_unstable` configures what happens beyond theta_max."""
 
     def rate(rule: LinearRule, config: RelaxationConfig) -> Rate:
         largest = lambda_max(rule.laplacian)
@@ -111,7 +111,7 @@ def paper(name: str, config: BackendsConfig) -> Driver:
 
 
 def normalised(name: str, config: BackendsConfig) -> Driver:
-    """Theta divided by the node's degree; never raises its objective."""
+    """Equation 16 with theta divided by the node's degree; never raises its objective."""
 
     def rate(rule: LinearRule, config: RelaxationConfig) -> Rate:
         return _by_degree(rule, config), f"theta {config.theta} / degree"
@@ -126,14 +126,14 @@ def _relaxed(
     start: Array,
     sweeps: int,
 ) -> Outcome:
-    """Sweeps over positions alone, each node at its rate."""
+    """Sweeps over positions alone, with a rate per node."""
     rule = LinearRule.of(graph)
     rate, note = rate_of(rule, config)
     if rate is None:
         return Outcome(start, SolveStatus.DIVERGED, f"{note}; not run", 0)
     positions, done = relax(rule, start[:, :2], rate, sweeps, TOLERANCE_M)
     if positions is None:
-        return Outcome(start, SolveStatus.DIVERGED, f"{note}; diverged within {done} sweeps, kept the start", done)
+        return Outcome(start, SolveStatus.DIVERGED, f"{note}; diverged within {done} sweeps; the initial poses are kept", done)
     poses = np.column_stack([positions, graph.initial[:, 2]])
     status = SolveStatus.CONVERGED if done < sweeps else SolveStatus.MAX_ITERATIONS
     return Outcome(poses, status, f"{note}; {done} sweeps", done)

@@ -1,7 +1,7 @@
-"""Relaxation link by link, in place, headings too: the rule of RatSLAM's experience map, plain, robust, and as a start.
+"""Relaxation link by link, in place, with headings: RatSLAM's rule, plain, robust, and as a start for least squares.
 
-Relaxation needs no good start and thousands of sweeps for the last per cent; least squares needs a good start and a few
-iterations. Together they are `relaxation-gtsam-lm`: while driving the map is relaxed, at the end least squares goes on from it.
+Relaxation needs no good start, but thousands of sweeps to converge fully. Least squares needs a good start and a few
+iterations. `relaxation-gtsam-lm` combines them: relaxation while driving, least squares from its map at the end.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _PER_RAD = 1.0 / _TURN
 
 @dataclass(frozen=True, slots=True)
 class Relaxed:
-    """Where a run of sweeps ended.
+    """Result of a run of sweeps.
 
     Attributes:
-        poses: (N, 3), yaw wrapped; not finite where the run grew without bound.
-        sweeps: how many were done.
-        settled: whether the last one moved nothing by more than the tolerance.
+        poses: (N, 3), yaw wrapped; not finite if the run grew without bound.
+        sweeps: number of sweeps.
+        settled: whether the last sweep moved nothing by more than the tolerance.
     """
 
     poses: Array
@@ -52,18 +52,18 @@ class Relaxed:
 
 
 def relax_links(graph: PoseGraph, start: Array, sweeps: int, config: RelaxationConfig, *, robust: bool = False) -> Relaxed:
-    """At most so many sweeps over the links, by source node and of one node by age, as OpenRatSLAM has them.
+    """Sweep over the links, in the order of source node and then of age, as OpenRatSLAM does.
 
     Each link moves both of its ends by theta times its error: x and y in the world frame, and yaw wrapped to +-pi.
 
     Args:
         graph: its edges are the links; their information is not used.
-        start: (N, 3) poses before, m and rad.
-        sweeps: most sweeps; they end after one that moves no coordinate by more than `TOLERANCE_M`, or one beyond all bounds.
+        start: (N, 3) initial poses, m and rad.
+        sweeps: most sweeps. The run ends earlier if a sweep moves no coordinate by more than `TOLERANCE_M`, or diverges.
         config: theta and its decay from sweep to sweep.
-        robust: multiply theta by the Geman-McClure weight 1 / (1 + r^2)^2 of a loop's error at its visit, r^2 being the sum of
-            the squares in units of the scales. These shrink geometrically from `ROBUST_START` times themselves to themselves,
-            which they are in the second half of the sweeps; before that the tolerance ends nothing.
+        robust: multiply theta by the Geman-McClure weight 1 / (1 + r^2)^2 of a loop's error, r^2 being the sum of its squared
+            components in units of the scales. The scales shrink geometrically from `ROBUST_START` times their value to
+            their value during the first half of the sweeps; in that half the tolerance does not end the run.
     """
     order = np.argsort(graph.sources, kind="stable")
     poses = np.array(start, dtype=np.float64, order="C")
@@ -102,7 +102,7 @@ def _sweep(
     scale_rad: float,
     start: float,
 ) -> tuple[int, bool]:
-    """Sweep over `poses` in place, with room for a copy of them; the sweeps done, and whether they settled.
+    """Sweep over `poses` in place, with a buffer for a copy; returns the number of sweeps and whether they converged.
 
     Element by element, since an operation on a whole array takes seconds to compile.
     """
@@ -148,16 +148,16 @@ _TOLERANCE = 1e-9  # relative decrease of the cost at which least squares is don
 
 
 def plain(name: str, config: BackendsConfig) -> Driver:
-    """Every link moves both of its ends by theta times its error."""
+    """RatSLAM's rule: every link moves both of its ends by theta times its error."""
     return relaxing(name, config, partial(_relaxed, config.relaxation))
 
 
 def robust(name: str, config: BackendsConfig) -> Driver:
-    """A loop's correction is multiplied by a Geman-McClure weight of its error.
+    """RatSLAM's rule with each loop's correction multiplied by a Geman-McClure weight of its error.
 
-    The scale of the weight shrinks geometrically to 1 in the course of a call. When a whole graph is solved, that takes a
-    quarter of the sweeps; the rest are of the plain rule on the loops that are left, with a look at all of them in between.
-    The end of a drive is solved as a whole from the map that the drive led to, and the better of the two is kept.
+    The scale of the weight shrinks geometrically to 1 during a call. For a whole graph that takes a quarter of the sweeps; the
+    others use the plain rule on the inlier loops, which are chosen once more in between.
+    The end of a drive is solved as a whole from the map of the drive, and the better of the two is kept.
     """
     rules = config.relaxation
     solve = swept(partial(_in_rounds, rules), rules.solve_sweeps)
@@ -176,7 +176,7 @@ def robust(name: str, config: BackendsConfig) -> Driver:
 
 
 def then_least_squares(name: str, config: BackendsConfig) -> Driver:
-    """The plain rule, then Levenberg-Marquardt over all edges."""
+    """RatSLAM's plain rule, then Levenberg-Marquardt over all edges."""
     rule, rules = partial(_relaxed, config.relaxation), config.relaxation
     relax = swept(rule, rules.solve_sweeps)
 
@@ -194,7 +194,7 @@ def then_least_squares(name: str, config: BackendsConfig) -> Driver:
 
 
 def weights(graph: PoseGraph, poses: Array) -> Array:
-    """The Geman-McClure weight (E,) that each edge of the graph would have as a loop, at the robust scales themselves."""
+    """The Geman-McClure weight (E,) that each edge would have as a loop, at the final scales."""
     predicted = compose(poses[graph.sources], graph.deltas)
     errors = between(predicted, poses[graph.targets])
     squared = np.sum(errors[:, :2] ** 2, axis=1) / ROBUST_SCALE_M**2 + errors[:, 2] ** 2 / ROBUST_SCALE_RAD**2
@@ -217,7 +217,7 @@ def _in_rounds(config: RelaxationConfig, graph: PoseGraph, start: Array, sweeps:
 
 
 def _judged(graph: PoseGraph, relaxed: Relaxed) -> Outcome:
-    """The outcome with every loop's weight, those of less than `_REJECTED` as rejected."""
+    """The outcome with every loop's weight; loops with less than `_REJECTED` are rejected."""
     loops = graph.only(EdgeKind.LOOP)
     by_id = dict(zip(loops.edge_ids.tolist(), weights(loops, relaxed.poses).tolist(), strict=True))
     rejected = tuple(edge for edge, weight in by_id.items() if weight < _REJECTED)

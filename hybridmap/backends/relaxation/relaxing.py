@@ -1,4 +1,4 @@
-"""What all relaxation rules share: some sweeps whenever the graph has grown, and the state is the map."""
+"""The common part of relaxation back-ends: sweeps after each growth of the graph, with the map as the only state."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Rule = Callable[[PoseGraph, Array, int], Outcome]
 
 
 def swept(rule: Rule, sweeps: int) -> Solver:
-    """A solver by at most so many sweeps of a rule; poses that grow without bound are no map."""
+    """A solver that runs up to this many sweeps of a rule; it refuses poses that grow without bound."""
 
     def solve(graph: PoseGraph, start: Array) -> Outcome:
         if graph.n_edges == 0:
@@ -35,7 +35,7 @@ def swept(rule: Rule, sweeps: int) -> Solver:
 
 
 def relaxing(name: str, config: BackendsConfig, rule: Rule) -> Driver:
-    """A back-end that sweeps whenever the graph has grown; the end of the drive goes on from the map by one more update."""
+    """A back-end that sweeps after each growth of the graph; the end of the drive is one more update."""
     follow = swept(rule, config.relaxation.sweeps_per_node)
     solve = swept(rule, config.relaxation.solve_sweeps)
     return Driver(name, config, solve, follow=follow, last=follow, works=Works.ON_GROWTH)
