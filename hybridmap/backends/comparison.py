@@ -112,7 +112,9 @@ def compare(
     rows = []
     for number, (backend, way) in enumerate(plan):
         step = partial(_count, progress, sum(steps[:number]), sum(steps))
-        row = Row(backend.name, None, way=way, title=_title(backend.name, way, ways))
+        row = Row(
+            backend.name, None, way=way, title=backend.name if len(ways) == 1 or way is Way.BATCH else f"{backend.name}/{way}"
+        )
         try:
             row = _driven(row, backend, graph, step) if way is Way.INCREMENTAL else replace(row, solution=backend.solve(graph))
         except BackendError as error:
@@ -154,10 +156,6 @@ def _limited(config: BackendsConfig, most: int) -> BackendsConfig:
     relaxation = config.relaxation.model_copy(update={"solve_sweeps": min(most, config.relaxation.solve_sweeps)})
     limited = {"max_iterations": min(most, config.max_iterations), "relaxation": relaxation}
     return config.model_copy(update={**limited, "consistency": ConsistencyConfig()})
-
-
-def _title(name: str, way: Way, ways: Sequence[Way]) -> str:
-    return name if len(ways) == 1 or way is Way.BATCH else f"{name}/{way}"
 
 
 def _count(progress: Progress | None, before: int, total: int, done: int) -> None:

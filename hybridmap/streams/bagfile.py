@@ -17,7 +17,7 @@ from hybridmap.errors import StreamError
 from hybridmap.trajectory import NS_PER_S
 
 _TF_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
-_TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+TRANSFORM = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 _ADVICE = {
     "not indexed": "the bag has no index; run `rosbag reindex` on it",
@@ -200,7 +200,7 @@ def _standard_store(is_ros1: bool) -> Any:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-    for name in _TF_TYPES:
+    for name in TRANSFORM:
         if name not in store.fielddefs:
             store.register(get_types_from_msg(_TF_DEFINITION, name))
     return store

@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 from hybridmap.config.inputs import SensorsConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, compose, yaw_from_quaternion
-from hybridmap.streams.bagfile import BagFile, RawMessage, Topic
+from hybridmap.streams.bagfile import TRANSFORM, BagFile, RawMessage, Topic
 from hybridmap.streams.base import Rig, SensorKind
 from hybridmap.streams.mounting import TransformTree, clean_frame, matrix
 from hybridmap.streams.order import sorted_order
 from hybridmap.trajectory import NS_PER_S, Trajectory, format_stamp
 
 ODOMETRY = ("nav_msgs/msg/Odometry",)
-TRANSFORM = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 _TRUTH = re.compile(r"ground_?truth|(^|[/_])(gt|truth|mocap|vicon)([/_]|$)", re.IGNORECASE)
 TRANSPORT = re.compile(r"/(compressed|compressedDepth)$")
@@ -198,11 +197,6 @@ def is_static(topic: str) -> bool:
     return topic.endswith("tf_static")
 
 
-def looks_like_truth(topic: str) -> bool:
-    """Whether a topic's name says that it holds the true pose."""
-    return _TRUTH.search(topic) is not None
-
-
 def select(
     topics: Sequence[Topic],
     config: SensorsConfig,
@@ -291,7 +285,7 @@ def _select_odometry(chooser: TopicChooser, chosen: Selection, frame_of: Callabl
     truths = [
         topic
         for topic in chooser.of(ODOMETRY)
-        if topic.name != wanted and (looks_like_truth(topic.name) or frame_of(topic.name) == "world")
+        if topic.name != wanted and (_TRUTH.search(topic.name) or frame_of(topic.name) == "world")
     ]
     chosen.groundtruth = chooser.named("groundtruth_topic", ODOMETRY) or (truths[0].name if truths else None)
     hidden = {topic.name for topic in truths} | {chosen.groundtruth}

@@ -196,10 +196,7 @@ def _part_or_problem(path: Path, kind: str, read: Callable[[Path], NDArray[np.in
 def _velocity_parts(path: Path, problems: list[str]) -> list[Part]:
     from hybridmap.streams.velocity import read_table
 
-    def stamps(table: Path) -> NDArray[np.int64]:
-        return np.array([sample.stamp_ns for sample in read_table(table)], dtype=np.int64)
-
-    return _part_or_problem(path, "velocities", stamps, problems)
+    return _part_or_problem(path, "velocities", lambda p: np.array([row.stamp_ns for row in read_table(p)]), problems)
 
 
 _PARTS: dict[str, Callable[[Path, list[str]], list[Part]]] = {

@@ -56,7 +56,7 @@ class TransformTree:
         """Take in one transform; a static one wins over a moving one, the newest static one over the older."""
         key = (clean_frame(parent), clean_frame(child))
         edge = self._edges.get(key)
-        if edge is None or (static and not edge.is_static) or (static and edge.is_static):
+        if edge is None or static:
             self._edges[key] = _Edge(T_parent_child, static)
         elif not edge.is_static:
             edge.moves |= bool(np.abs(edge.T_parent_child - T_parent_child).max() > _CONSTANT_TOLERANCE)
@@ -69,12 +69,6 @@ class TransformTree:
     def between(self, base: str, sensor: str) -> Array | None:
         """(4, 4) pose of the sensor's frame in the base, along constant transforms; None where there is no such way."""
         return self._search(clean_frame(base), clean_frame(sensor), allow_moving=False)
-
-    def moves_between(self, base: str, sensor: str) -> bool:
-        """Whether the two frames are joined, but only by transforms that change."""
-        return self.between(base, sensor) is None and (
-            self._search(clean_frame(base), clean_frame(sensor), allow_moving=True) is not None
-        )
 
     def _search(self, base: str, sensor: str, *, allow_moving: bool) -> Array | None:
         reached = {base: np.eye(4)}
@@ -103,7 +97,7 @@ class TransformTree:
         found = self.between(base, sensor)
         if found is not None:
             return found
-        if self.moves_between(base, sensor):
+        if self._search(clean_frame(base), clean_frame(sensor), allow_moving=True) is not None:
             raise StreamError(f"{what}: the transform {base!r} -> {sensor!r} moves on /tf; give {setting} in the configuration")
         known = ", ".join(self.frames) or "none"
         raise StreamError(

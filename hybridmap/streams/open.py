@@ -10,9 +10,8 @@ from typing import Any
 from hybridmap.config.root import Config
 from hybridmap.errors import StreamError
 from hybridmap.plugins import loaded
-from hybridmap.streams.base import Rig, Sample, Stream, StreamReport
+from hybridmap.streams.base import Sample, Stream, StreamReport
 from hybridmap.streams.order import Window
-from hybridmap.trajectory import Trajectory
 
 _SIMULATOR = "hybridmap.simulation"
 """A house of its own above this one, known by name alone."""
@@ -110,26 +109,8 @@ class WindowedStream:
 
     def __init__(self, stream: Stream, window: Window) -> None:
         self._stream, self._window = stream, window
-
-    @property
-    def name(self) -> str:
-        """The whole stream's name."""
-        return self._stream.name
-
-    @property
-    def rig(self) -> Rig:
-        """The whole stream's sensors."""
-        return self._stream.rig
-
-    @property
-    def groundtruth(self) -> Trajectory | None:
-        """The whole stream's truth."""
-        return self._stream.groundtruth
-
-    @property
-    def expected_observations(self) -> int | None:
-        """Not known before it has been read."""
-        return None
+        self.name, self.rig, self.groundtruth = stream.name, stream.rig, stream.groundtruth
+        self.expected_observations: int | None = None  # not known before it has been read
 
     @property
     def report(self) -> StreamReport:

@@ -12,8 +12,8 @@ import numpy as np
 from hybridmap.config.root import Config
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array
-from hybridmap.streams.bagfile import BagFile, RawMessage
-from hybridmap.streams.bagindex import ODOMETRY, TRANSFORM, PoseTrack, build_index, select
+from hybridmap.streams.bagfile import TRANSFORM, BagFile, RawMessage
+from hybridmap.streams.bagindex import ODOMETRY, PoseTrack, build_index, select
 from hybridmap.streams.base import MessageKey, Observation, Sample, SelfMotion, SensorPlan, StreamReport
 from hybridmap.streams.mounting import clean_frame, planar
 from hybridmap.streams.order import Window, check_overlap, merge

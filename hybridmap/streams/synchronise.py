@@ -89,9 +89,7 @@ class Synchroniser:
         return steps + [self._make(sample.stamp_ns, pose, sample) for sample in held]
 
     def _take(self, sample: Sample) -> list[Ready]:
-        if isinstance(sample, SelfMotion | Velocity):
-            return self._push_motion(sample)
-        return self._push_observation(sample)
+        return self._push_observation(sample) if isinstance(sample, Observation) else self._push_motion(sample)
 
     def _push_motion(self, sample: Motion) -> list[Ready]:
         self._check_motion(sample)

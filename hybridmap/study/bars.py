@@ -98,7 +98,9 @@ def _verdict(
         others = (results[cell.key].figure(bar.figure) for cell in groups[cells[0].group, bar.at_most])
         limits, slack = tuple(math.nan if other is None else other for other in others), _ROUND_OFF
     else:
-        limits = (_limit(bar),) * len(cells)
+        limit = bar.at_most if bar.at_least is None else bar.at_least
+        assert limit is not None
+        limits = (limit,) * len(cells)
     found, held = _whole(values), np.array(limits)
     if bar.statistic == "worst":
         at = int(np.argmin(found - held) if bar.side == "at least" else np.argmax(found - held))
@@ -108,12 +110,6 @@ def _verdict(
         value, limit = float(statistic(found)), float(statistic(held))
     passed = value >= limit - slack if bar.side == "at least" else value <= limit + slack
     return Verdict(bar, cells[0], values, limits, value, limit, bool(passed))
-
-
-def _limit(bar: BarConfig) -> float:
-    limit = bar.at_most if bar.at_least is None else bar.at_least
-    assert isinstance(limit, float)
-    return limit
 
 
 def _whole(values: Sequence[float | None]) -> np.ndarray:
