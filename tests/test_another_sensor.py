@@ -17,7 +17,7 @@ from hybridmap.config import Config
 from hybridmap.config.inputs import SensorsConfig
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import ConfigError, StreamError
-from hybridmap.export import export_session
+from hybridmap.export.formats import export_session
 from hybridmap.geometry import Array, RelativePose, transform_points
 from hybridmap.graph.edges import Edge
 from hybridmap.mapper import Mapper

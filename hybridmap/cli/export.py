@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
-_NAMES = "tum, kitti, g2o, grid, ply, pcd, lineset, posegraph"
+from hybridmap.export import FORMATS
 
 
 def export(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Session folder, as `hybridmap map` writes it.")],
-    format_name: Annotated[str, typer.Option("--format", metavar="F", help=f"One of: {_NAMES}.")],
+    format_name: Annotated[str, typer.Option("--format", metavar="F", help=f"One of: {', '.join(FORMATS)}.")],
     out: Annotated[Path, typer.Option(metavar="PATH", help="File to write; `grid` writes PATH.yaml and PATH.pgm.")],
     backend: Annotated[
         str | None, typer.Option(metavar="NAME", help="Back-end whose poses to use. Default: the session's primary one.")
@@ -27,7 +27,7 @@ def export(
 ) -> None:
     """Export trajectory, pose graph, point cloud or occupancy grid, in the map frame of one back-end; m and rad."""
     from hybridmap.cli.show import emit
-    from hybridmap.export import ExportOptions, export_session
+    from hybridmap.export.formats import ExportOptions, export_session
 
     options = ExportOptions(resolution_m=resolution, voxel_m=voxel, max_depth_m=max_depth)
     written = export_session(folder, format_name, out, backend=backend, overwrite=overwrite, options=options)

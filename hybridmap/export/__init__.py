@@ -1,5 +1,37 @@
-"""Sessions for other tools: trajectories, graphs, clouds, grids."""
+"""Sessions for other tools: trajectories, graphs, clouds, grids; here the formats, in `formats` what writes them."""
 
-from hybridmap.export.formats import FORMATS, Exported, ExportOptions, export_session
+from __future__ import annotations
 
-__all__ = ["FORMATS", "ExportOptions", "Exported", "export_session"]
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """An export format.
+
+    Attributes:
+        writer: `module:function` below this package; it writes one file and returns figures about it.
+        suffix: what its file is usually called.
+        description: one line for people.
+        companion: suffix of a second file that lies beside the first, if there is one.
+        by_suffix: Open3D reads the file back only under its suffix.
+    """
+
+    writer: str
+    suffix: str
+    description: str
+    companion: str | None = None
+    by_suffix: bool = False
+
+
+FORMATS: dict[str, Format] = {
+    "tum": Format("poses:write_tum_trajectory", ".tum", "trajectory: stamp, position, quaternion a line"),
+    "kitti": Format("poses:write_kitti_trajectory", ".txt", "trajectory: the 12 numbers of a 3x4 pose a line"),
+    "g2o": Format("poses:write_g2o_graph", ".g2o", "pose graph: VERTEX_SE2, EDGE_SE2"),
+    "lineset": Format("poses:write_lineset", ".ply", "graph as an Open3D LineSet, edges coloured by kind", by_suffix=True),
+    "posegraph": Format("poses:write_posegraph", ".json", "graph as an Open3D PoseGraph", by_suffix=True),
+    "ply": Format("keyframes:write_cloud", ".ply", "merged point cloud, PLY", by_suffix=True),
+    "pcd": Format("keyframes:write_cloud", ".pcd", "merged point cloud, PCD", by_suffix=True),
+    "grid": Format("keyframes:write_grid", ".yaml", "occupancy grid for map_server: yaml and pgm", ".pgm"),
+}
+"""A new format is a row here and its writer. The command line reads it without loading what writes."""

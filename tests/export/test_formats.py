@@ -5,7 +5,8 @@ import pytest
 import yaml
 
 from hybridmap.errors import ExportError, OutputError, StoreError
-from hybridmap.export import FORMATS, ExportOptions, export_session
+from hybridmap.export import FORMATS
+from hybridmap.export.formats import ExportOptions, export_session
 from hybridmap.geometry import between, compose, log
 from hybridmap.graph.io import read_graph
 from hybridmap.streams.base import Rig
