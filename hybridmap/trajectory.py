@@ -14,6 +14,8 @@ from hybridmap.geometry import Array, between, compose, interpolate, quaternion_
 from hybridmap.output import write_text
 
 NS_PER_S = 1_000_000_000
+MAX_GAP_S = 1.0
+"""A reference is interpolated between two of its poses only if they are no further apart than this."""
 
 
 def stamp_ns_from_s(stamp_s: float) -> int:
@@ -63,6 +65,18 @@ class Trajectory:
         """Which of the stamps lie within the trajectory's span, `slack_ns` wider on either side."""
         wanted = np.asarray(stamps_ns, dtype=np.int64)
         return np.asarray((wanted >= self.stamps_ns[0] - slack_ns) & (wanted <= self.stamps_ns[-1] + slack_ns))
+
+
+def known_at(trajectory: Trajectory, stamps_ns: NDArray[np.int64], max_gap_s: float = MAX_GAP_S) -> NDArray[np.bool_]:
+    """At which stamps a trajectory can be interpolated: within its span and not in a gap longer than `max_gap_s`."""
+    if len(trajectory) == 0:
+        return np.zeros(len(stamps_ns), dtype=np.bool_)
+    times = trajectory.stamps_ns
+    right = np.searchsorted(times, stamps_ns, side="left")
+    exact = times[np.minimum(right, len(times) - 1)] == stamps_ns
+    inside = (right > 0) & (right < len(times))
+    after, before = times[np.minimum(right, len(times) - 1)], times[np.maximum(right - 1, 0)]
+    return np.asarray(exact | (inside & (after - before <= max_gap_s * NS_PER_S)))
 
 
 @dataclass(frozen=True, slots=True)

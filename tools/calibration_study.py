@@ -25,14 +25,14 @@ from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.legs import Motion
 from hybridmap.calibration.sessions import Drive, estimate_of, read_drive
 from hybridmap.cli.choose import choose
-from hybridmap.evaluate.association import PosePairs, known_at, travel
+from hybridmap.evaluate.association import PosePairs, travel
 from hybridmap.evaluate.trajectory_errors import motion_errors
 from hybridmap.geometry import Array
 from hybridmap.metrics import Metric, to_json
 from hybridmap.odometry_model import NEUTRAL, Gains
 from hybridmap.streams.base import SelfMotion, Velocity
 from hybridmap.streams.synchronise import Synchroniser
-from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
+from hybridmap.trajectory import NS_PER_S, Trajectory, known_at, read_tum
 
 LENGTHS_M = (16.8, 70.0)
 EVERY_M = 0.5

@@ -24,7 +24,7 @@ from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.odometry_model import GAIN_KEYS, Gains, remove
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.streams.sensors import words
-from hybridmap.trajectory import NS_PER_S, Trajectory
+from hybridmap.trajectory import Trajectory, known_at
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +34,6 @@ GAIN_CHANGES = "gain_changes"
 ESTIMATORS = ("alternating", "joint")
 
 _IN_USE = {"neural": GAIN_KEYS, "sensors": ("odometry_delay_s",)}
-_MAX_GAP_S = 1.0
 _KEY_M, _KEY_RAD = 0.25, 0.35  # travel or turn between two instants at which a reference is used
 _ROUNDS = 5
 
@@ -273,7 +272,7 @@ def _raw(steps: Array, stamps_ns: NDArray[np.int64], gains: Gains, changes: Sequ
 def _seen(drive: Drive, truth: Trajectory) -> Sighting:
     """Where the reference knows the robot, at instants a little apart."""
     motion = drive.motion
-    known = np.flatnonzero(_known(truth, motion.stamps_ns))
+    known = np.flatnonzero(known_at(truth, motion.stamps_ns))
     if len(known) < 2:
         raise EvaluationError(
             f"{drive.name}: {len(known)} stamps in common with the reference, expected many; are they of the same recording "
@@ -283,10 +282,3 @@ def _seen(drive: Drive, truth: Trajectory) -> Sighting:
     keys = known[np.flatnonzero(np.diff(mark, prepend=-1.0) > 0)]
     stamps = motion.stamps_ns[keys]
     return Sighting(motion, stamps, truth.at(stamps))
-
-
-def _known(truth: Trajectory, stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which stamps lie between two poses of the reference that are not far apart in time."""
-    right = np.clip(np.searchsorted(truth.stamps_ns, stamps_ns), 1, max(len(truth) - 1, 1))
-    gap = truth.stamps_ns[np.minimum(right, len(truth) - 1)] - truth.stamps_ns[right - 1]
-    return truth.covers(stamps_ns) & (gap <= _MAX_GAP_S * NS_PER_S)

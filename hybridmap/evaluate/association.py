@@ -10,10 +10,7 @@ from numpy.typing import NDArray
 
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array
-from hybridmap.trajectory import NS_PER_S, Trajectory
-
-MAX_GAP_S = 1.0
-"""A reference is interpolated between two of its poses only if they are no further apart than this."""
+from hybridmap.trajectory import MAX_GAP_S, Trajectory, known_at
 
 _DEAD_BAND_M = 0.05
 
@@ -36,18 +33,6 @@ class PosePairs:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
-
-
-def known_at(trajectory: Trajectory, stamps_ns: NDArray[np.int64], max_gap_s: float = MAX_GAP_S) -> NDArray[np.bool_]:
-    """At which stamps a trajectory can be interpolated: within its span and not in a gap longer than `max_gap_s`."""
-    if len(trajectory) == 0:
-        return np.zeros(len(stamps_ns), dtype=np.bool_)
-    times = trajectory.stamps_ns
-    right = np.searchsorted(times, stamps_ns, side="left")
-    exact = times[np.minimum(right, len(times) - 1)] == stamps_ns
-    inside = (right > 0) & (right < len(times))
-    after, before = times[np.minimum(right, len(times) - 1)], times[np.maximum(right - 1, 0)]
-    return np.asarray(exact | (inside & (after - before <= max_gap_s * NS_PER_S)))
 
 
 def associate(estimate: Trajectory, reference: Trajectory, max_gap_s: float = MAX_GAP_S) -> PosePairs:

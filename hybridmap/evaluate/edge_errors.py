@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.evaluate.association import MAX_GAP_S, known_at
 from hybridmap.geometry import Array, between, log, wrap_angle
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
-from hybridmap.trajectory import NS_PER_S, Trajectory
+from hybridmap.trajectory import NS_PER_S, Trajectory, known_at
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +65,6 @@ def closure_errors(
     truth: Trajectory,
     rejected: Collection[int] = (),
     limits: ClosureLimits = DEFAULT_LIMITS,
-    max_gap_s: float = MAX_GAP_S,
 ) -> ClosureErrors:
     """Judge the accepted loop edges of a map.
 
@@ -75,9 +73,8 @@ def closure_errors(
         truth: true poses of `base_link`, in any frame.
         rejected: numbers of loop edges that a back-end threw out; they do not count as closures.
         limits: when an edge is right and a node a revisit.
-        max_gap_s: longest gap over which the truth is interpolated.
     """
-    stamps, poses, known = _true_nodes(experiences, truth, max_gap_s)
+    stamps, poses, known = _true_nodes(experiences, truth)
     edges = [e for n, e in _judged(experiences, EdgeKind.LOOP, known).items() if n not in rejected]
     translation, rotation = _edge_errors(edges, poses)
     right = (translation <= limits.right_m) & (rotation <= limits.right_deg)
@@ -164,7 +161,7 @@ class EdgeErrors:
 
 
 def edge_errors(
-    experiences: ExperienceMap, truth: Trajectory, weights: Mapping[int, float] | None = None, max_gap_s: float = MAX_GAP_S
+    experiences: ExperienceMap, truth: Trajectory, weights: Mapping[int, float] | None = None
 ) -> dict[EdgeKind, EdgeErrors]:
     """Judge the accepted edges of a map, kind by kind.
 
@@ -172,9 +169,8 @@ def edge_errors(
         experiences: the map.
         truth: true poses of `base_link`, in any frame.
         weights: edge number -> weight that a robust back-end gave it; what is missing counts as 1.
-        max_gap_s: longest gap over which the truth is interpolated.
     """
-    _, poses, known = _true_nodes(experiences, truth, max_gap_s)
+    _, poses, known = _true_nodes(experiences, truth)
     return edge_errors_on(experiences, poses, known, weights)
 
 
@@ -200,12 +196,10 @@ def normalised_errors(edges: list[Edge], poses: Array) -> tuple[Array, Array]:
     return error, np.einsum("ei,ei->e", error, np.linalg.solve(covariance, error[..., None])[..., 0])
 
 
-def _true_nodes(
-    experiences: ExperienceMap, truth: Trajectory, max_gap_s: float
-) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
+def _true_nodes(experiences: ExperienceMap, truth: Trajectory) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:
     """Stamps (N,) of the nodes, their true poses (N, 3), and which of these are known."""
     stamps = np.array([node.stamp_ns for node in experiences.nodes], dtype=np.int64)
-    known = known_at(truth, stamps, max_gap_s)
+    known = known_at(truth, stamps)
     return stamps, truth.at(stamps) if known.any() else np.zeros((len(stamps), 3)), known
 
 

@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 
 from hybridmap.backends.base import ODOMETRY
 from hybridmap.errors import EvaluationError
-from hybridmap.evaluate.association import known_at
 from hybridmap.geometry import Array, between
 from hybridmap.graph.edges import Check, Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.streams.sensors import carried
-from hybridmap.trajectory import NS_PER_S, Trajectory, format_motion, read_tum
+from hybridmap.trajectory import NS_PER_S, Trajectory, format_motion, known_at, read_tum
 from hybridmap.vision.gating import Gate
 
 _AT_NODE_NS = 1_000

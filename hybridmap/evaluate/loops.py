@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from hybridmap.config.gone import without_gone
 from hybridmap.config.vision import MatchingConfig, ProfileConfig
 from hybridmap.errors import EvaluationError
-from hybridmap.evaluate.association import MAX_GAP_S, known_at
 from hybridmap.geometry import Array, wrap_angle
 from hybridmap.metrics import Metric, figure
 from hybridmap.store import MapStore, SessionFolder
-from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
+from hybridmap.trajectory import MAX_GAP_S, NS_PER_S, Trajectory, known_at, read_tum
 from hybridmap.vision.profile import Profile, sees_all_around
 from hybridmap.vision.templates import GBar, Mode, ProfileStore, band_weights, combine, in_sequence
 

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.errors import EvaluationError
-from hybridmap.evaluate.association import MAX_GAP_S, known_at
 from hybridmap.geometry import Array, between
-from hybridmap.trajectory import NS_PER_S, Trajectory
+from hybridmap.trajectory import NS_PER_S, Trajectory, known_at
 
 LOOP_GAP_S = 60.0
 """Relations over more than this time count as loops."""
@@ -109,10 +108,10 @@ def relations_of(path: Path, trajectory: Trajectory) -> Relations:
     return relations
 
 
-def relation_errors(trajectory: Trajectory, relations: Relations, max_gap_s: float = MAX_GAP_S) -> RelationErrors:
+def relation_errors(trajectory: Trajectory, relations: Relations) -> RelationErrors:
     """Compare a trajectory with verified relations at the times that it covers."""
     first, second = relations.stamps_ns[:, 0], relations.stamps_ns[:, 1]
-    known = known_at(trajectory, first, max_gap_s) & known_at(trajectory, second, max_gap_s)
+    known = known_at(trajectory, first) & known_at(trajectory, second)
     loop = relations.is_loop
     error = np.zeros((0, 3))
     if known.any():

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.evaluate.association import MAX_GAP_S, PosePairs, associate, travel
+from hybridmap.evaluate.association import PosePairs, associate, travel
 from hybridmap.geometry import Array, align, between, compose
 from hybridmap.trajectory import NS_PER_S, Trajectory
 
@@ -56,13 +56,13 @@ class RelativeError:
     pairs: int
 
 
-def absolute_error(estimate: Trajectory, reference: Trajectory, max_gap_s: float = MAX_GAP_S) -> AbsoluteError:
+def absolute_error(estimate: Trajectory, reference: Trajectory) -> AbsoluteError:
     """ATE: align the estimate to the reference by one SE(2) transform and measure what is left.
 
     Raises:
         EvaluationError: too few stamps in common.
     """
-    return absolute_error_of(associate(estimate, reference, max_gap_s))
+    return absolute_error_of(associate(estimate, reference))
 
 
 def absolute_error_of(pairs: PosePairs) -> AbsoluteError:
@@ -81,15 +81,13 @@ def absolute_error_of(pairs: PosePairs) -> AbsoluteError:
     )
 
 
-def relative_error(
-    estimate: Trajectory, reference: Trajectory, delta: float, unit: Literal["m", "s"], max_gap_s: float = MAX_GAP_S
-) -> RelativeError:
+def relative_error(estimate: Trajectory, reference: Trajectory, delta: float, unit: Literal["m", "s"]) -> RelativeError:
     """RPE: compare the motion over every piece of `delta` metres of the reference's way, or of `delta` seconds.
 
     Raises:
         EvaluationError: too few stamps in common.
     """
-    return relative_error_of(associate(estimate, reference, max_gap_s), delta, unit)
+    return relative_error_of(associate(estimate, reference), delta, unit)
 
 
 def relative_error_of(pairs: PosePairs, delta: float, unit: Literal["m", "s"]) -> RelativeError:

@@ -15,7 +15,6 @@ from hybridmap.backends.base import ODOMETRY, Solution
 from hybridmap.config import Config
 from hybridmap.edge_book import Update
 from hybridmap.errors import StudyError
-from hybridmap.evaluate.association import known_at
 from hybridmap.evaluate.edge_errors import ClosureLimits, closure_errors, edge_errors, normalised_errors
 from hybridmap.evaluate.relations import Relations, relation_errors, relations_of
 from hybridmap.evaluate.trajectory_errors import absolute_error
@@ -31,7 +30,7 @@ from hybridmap.streams.base import Observation, Sample, Stream
 from hybridmap.study.disturb import KIDNAPPED, disturbed
 from hybridmap.study.frozen import Figures, Frozen, Mapped
 from hybridmap.study.measures import KEPT, WRONG_DEG, WRONG_M
-from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
+from hybridmap.trajectory import NS_PER_S, Trajectory, known_at, read_tum
 
 LIMITS = ClosureLimits(right_m=WRONG_M, right_deg=WRONG_DEG)
 

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from hybridmap.errors import EvaluationError
 from hybridmap.evaluate import absolute_error, relative_error
-from hybridmap.evaluate.association import associate, known_at, travel
+from hybridmap.evaluate.association import associate, travel
 from hybridmap.evaluate.trajectory_errors import drift_percent
 from hybridmap.geometry import compose, quaternion_from_yaw
-from hybridmap.trajectory import NS_PER_S, Trajectory
+from hybridmap.trajectory import NS_PER_S, Trajectory, known_at
 
 STEP_M = 0.1
 
