@@ -208,14 +208,7 @@ def page(rows: list[Row]) -> str:
     for part, names in PARTS.items():
         found = [line for topic in TOPICS if topic.name in names for line in table(topic, rows)]
         if found:
-            lines += [
-                "",
-                f"## {part}",
-                "",
-                "| what | figures | median | worst | bar | |",
-                "|---|---:|---:|---:|---|---|",
-                *found,
-            ]
+            lines += ["", f"## {part}", "", *HEAD, *found]
     return "\n".join([*lines, *commands(rows)]) + "\n"
 
 

@@ -1,4 +1,4 @@
-"""From a source to a frozen graph with a reference. A kind of source is a class in `KINDS`."""
+"""From a source to a frozen graph with a reference. A kind of source is a function in `KINDS`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -52,18 +51,18 @@ class SourceResult:
     code: str
 
 
-class Source(Protocol):
-    """A source of a study, opened: what is read from files is read once."""
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A source of a study, opened: what is read from files is read once.
 
-    def by_chance(self, setting: SettingConfig) -> bool:
-        """Whether another seed gives another graph."""
+    Attributes:
+        task: the task for its graph at a setting and seed. It raises a ConfigError where the configuration of a drive cannot
+            be used.
+        by_chance: whether another seed gives another graph at a setting.
+    """
 
-    def task(self, setting: SettingConfig, seed: int) -> SourceTask:
-        """The task for its graph at a setting and seed.
-
-        Raises:
-            ConfigError: the configuration of a drive cannot be used.
-        """
+    task: Callable[[SettingConfig, int], SourceTask]
+    by_chance: Callable[[SettingConfig], bool]
 
 
 def prepare(task: SourceTask) -> SourceResult:
@@ -75,60 +74,38 @@ def prepare(task: SourceTask) -> SourceResult:
     return SourceResult(frozen.pack(), provenance.solving())
 
 
-class _Synthetic:
-    def __init__(self, source: SourceConfig, maps: bool) -> None:
-        del maps
-        assert source.synthetic is not None
-        self._config, self._first = source.synthetic, source.first_nodes
+def _synthetic(source: SourceConfig, _maps: bool) -> Source:
+    config = source.synthetic
+    assert config is not None
 
-    def by_chance(self, setting: SettingConfig) -> bool:
-        del setting
-        return True
+    def task(_setting: SettingConfig, seed: int) -> SourceTask:
+        identity = {"synthetic": config.model_dump(), "seed": seed, "first": source.first_nodes, "code": provenance.solving()}
+        return SourceTask(provenance.digest(identity), partial(laps, config, seed), source.first_nodes)
 
-    def task(self, setting: SettingConfig, seed: int) -> SourceTask:
-        del setting
-        identity = {"synthetic": self._config.model_dump(), "seed": seed, "first": self._first, "code": provenance.solving()}
-        return SourceTask(provenance.digest(identity), partial(laps, self._config, seed), self._first)
+    return Source(task, lambda _: True)
 
 
-class _Known:
+def _known(source: SourceConfig, _maps: bool) -> Source:
     """A graph file, or the graph of a session: it enters by its content, not by its place."""
-
-    def __init__(self, source: SourceConfig, maps: bool) -> None:
-        del maps
-        clean = (_read_graph(source.graph) if source.graph is not None else _read_session(source.session)).pack()
-        content = {"content": hashlib.sha256(clean).hexdigest(), "first": source.first_nodes, "code": provenance.solving()}
-        self._task = SourceTask(provenance.digest(content), partial(Frozen.unpack, clean), source.first_nodes)
-
-    def by_chance(self, setting: SettingConfig) -> bool:
-        del setting
-        return False
-
-    def task(self, setting: SettingConfig, seed: int) -> SourceTask:
-        del setting, seed
-        return self._task
+    clean = (_read_graph(source.graph) if source.graph is not None else _read_session(source.session)).pack()
+    content = {"content": hashlib.sha256(clean).hexdigest(), "first": source.first_nodes, "code": provenance.solving()}
+    task = SourceTask(provenance.digest(content), partial(Frozen.unpack, clean), source.first_nodes)
+    return Source(lambda *_: task, lambda _: False)
 
 
-class _Drive:
+def _drive(source: SourceConfig, maps: bool) -> Source:
     """A simulated world or a recording."""
+    paths = [path for path in (source.recording, source.reference, source.relations) if path is not None]
+    content = [_content(path) for path in paths]
 
-    def __init__(self, source: SourceConfig, maps: bool) -> None:
-        self._source, self._maps = source, maps
-        paths = [path for path in (source.recording, source.reference, source.relations) if path is not None]
-        self._content = [_content(path) for path in paths]
-
-    def by_chance(self, setting: SettingConfig) -> bool:
-        return self._source.simulated is not None or disturb.by_chance(setting.disturb)
-
-    def task(self, setting: SettingConfig, seed: int) -> SourceTask:
-        source = self._source
+    def task(setting: SettingConfig, seed: int) -> SourceTask:
         overrides = {**source.overrides, **setting.overrides}
         if source.simulated is not None:
             overrides["seed"] = seed
         config = Config.load(
             source.config or source.simulated or "laser", overrides, overridden_by=f"{source.title}: overrides"
         )
-        if not self._maps:  # the other back-ends leave no trace in a graph
+        if not maps:  # the other back-ends leave no trace in a graph
             backends = config.backends.model_copy(update={"names": config.backends.names[:1]})
             config = config.model_copy(update={"backends": backends})
         drive = Drive(
@@ -142,20 +119,22 @@ class _Drive:
             relations=str(source.relations or ""),
         )
         identity = {
-            "drive": [source.simulated, self._content, drive.config, drive.start_s, drive.end_s],
+            "drive": [source.simulated, content, drive.config, drive.start_s, drive.end_s],
             "disturb": [drive.disturb, drive.seed],
             "first": source.first_nodes,
             "code": [provenance.mapping(), provenance.solving()],
         }
         return SourceTask(provenance.digest(identity), drive.make, source.first_nodes)
 
+    return Source(task, lambda setting: source.simulated is not None or disturb.by_chance(setting.disturb))
+
 
 KINDS: Mapping[str, Callable[[SourceConfig, bool], Source]] = {
-    "simulated": _Drive,
-    "recording": _Drive,
-    "session": _Known,
-    "graph": _Known,
-    "synthetic": _Synthetic,
+    "simulated": _drive,
+    "recording": _drive,
+    "session": _known,
+    "graph": _known,
+    "synthetic": _synthetic,
 }
 """Kind of a source -> what opens it, or raises a HybridMapError; the flag: its drive is judged as it was mapped."""
 

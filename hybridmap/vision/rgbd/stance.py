@@ -32,11 +32,10 @@ class LevelPair:
 
     Attributes:
         delta: (3,) moving base in the fixed one, m and rad.
-        T_base_camera_fixed, T_base_camera_moving: (4, 4) the cameras in the levelled bases.
+        T_base_camera_moving: (4, 4) the moving camera in its levelled base.
     """
 
     delta: Array
-    T_base_camera_fixed: Array
     T_base_camera_moving: Array
 
 
@@ -85,7 +84,7 @@ def level_pair(T_fixed_moving: Array, fixed: Stance, moving: Stance) -> LevelPai
     trust = fixed.height_sigma_m**-2 / (fixed.height_sigma_m**-2 + moving.height_sigma_m**-2)
     height = trust * (T_fixed @ T_cameras)[2, 3] + (1.0 - trust) * moving.T_base_camera[2, 3]
     T_moving = camera_on(T_cameras[:3, :3].T @ up, float(height), moving.T_base_camera)
-    return LevelPair(to_floor(T_fixed @ T_cameras @ inverse_rigid(T_moving)).delta, T_fixed, T_moving)
+    return LevelPair(to_floor(T_fixed @ T_cameras @ inverse_rigid(T_moving)).delta, T_moving)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,16 +134,6 @@ def rotation_of(rotvec: Array) -> Array:
     if angle < 1e-9:
         return np.asarray(np.eye(3) + K)
     return np.asarray(np.eye(3) + math.sin(angle) / angle * K + (1.0 - math.cos(angle)) / angle**2 * K @ K)
-
-
-def small_rotvec(R: Array) -> Array:
-    """Rotation vector (3,) of a rotation well below half a turn."""
-    twice_sin = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    sin = 0.5 * float(np.linalg.norm(twice_sin))
-    if sin < 1e-9:
-        return np.asarray(0.5 * twice_sin)
-    angle = np.arctan2(sin, 0.5 * (float(np.trace(R)) - 1.0))
-    return np.asarray(0.5 * twice_sin * angle / sin)
 
 
 def wrenches(arm: Array, direction: Array) -> Array:
