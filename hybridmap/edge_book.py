@@ -1,4 +1,4 @@
-"""The mapper's books: where the robot is, and which edge of the map a proposal of vision became."""
+"""Where the robot is, and which edge of the map a proposal of vision became: the mapper's bookkeeping."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from hybridmap.vision.base import Belief
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """What one instant did to the map, and why.
+    """What the mapper did at one instant, and why.
 
     Attributes:
         stamp_ns: of the sample.
-        pose_odom_robot: (3,) decoded from the path integrator's activity; `odom` begins where the drive begins.
+        pose_odom_robot: (3,) by the path integrator; `odom` begins at the start of the drive.
         pose_map_robot: (3,) by the primary back-end.
-        poses_map_robot: the same by every back-end, by name.
+        poses_map_robot: the same by each back-end.
         at_node, delta_node_robot: the node that the robot is at (-1 before the first) and its pose (3,) seen from it.
-        new_node: the experience made here, None if none was.
-        edges: numbers of the edges that are new or changed their status.
+        new_node: the node made here, if any.
+        edges: numbers of new and changed edges.
         reason: why a node was made, or why not.
     """
 
@@ -46,12 +46,12 @@ class Update:
 
 
 class Position:
-    """Follows the robot from node to node.
+    """Pose of the robot in `odom`, seen from its node, and on the map of every back-end.
 
     Attributes:
         stamp_ns: of the last motion.
-        pose_odom: (3,) in `odom`, as the cells have it.
-        pose_odom_given: (3,) in the odometry as it came in.
+        pose_odom: (3,) in `odom` by the path integrator.
+        pose_odom_given: (3,) in the odometry as received.
         travel_m: path length so far.
         at_node: the node that the robot is at, -1 before the first.
         pose_odom_at_node: (3,) of that node in `odom`.
@@ -59,7 +59,7 @@ class Position:
     """
 
     def __init__(self, config: EdgesConfig, primary: str) -> None:
-        """Start before the first node; `primary` is the back-end that says where the robot is."""
+        """Start before the first node; `primary` is the back-end of `pose_map`."""
         self._config = config
         self._primary = primary
         self._driven = (0.0, 0.0)  # since the last node was made: m and rad
@@ -77,42 +77,42 @@ class Position:
         return between(self.pose_odom_at_node, self.pose_odom)
 
     def drive(self, ready: Ready, pose_odom: Array) -> None:
-        """The robot moved; `pose_odom` (3,) is where the cells have it now."""
+        """Add a motion; `pose_odom` (3,) is the path integrator's pose after it."""
         self.stamp_ns, self.pose_odom_given, self.pose_odom = ready.stamp_ns, ready.pose_odom_robot, pose_odom
         travel_m, turn_rad = float(np.hypot(ready.delta_robot[0], ready.delta_robot[1])), abs(float(ready.delta_robot[2]))
         self.travel_m += travel_m
         self._driven = (self._driven[0] + travel_m, self._driven[1] + turn_rad)
 
     def odometry(self, pose_odom_before: Array) -> RelativePose:
-        """The motion from a pose (3,) in `odom` to here, as unsure as the way since the last node makes it."""
+        """The motion from a pose (3,) in `odom` to here, with the covariance of the way since the last node."""
         return RelativePose(between(pose_odom_before, self.pose_odom), odometry_covariance(self._config, *self._driven))
 
-    def rest(self) -> None:
-        """All that belongs to the new node was done: the way to the next one begins."""
+    def restart(self) -> None:
+        """Start the way to the next node."""
         self._driven = (0.0, 0.0)
 
-    def hang(self, node: int, pose_odom_node: Array) -> None:
-        """From now on the robot is seen from a node, which lies at a pose (3,) in `odom`."""
+    def attach(self, node: int, pose_odom_node: Array) -> None:
+        """See the robot from a node, which lies at a pose (3,) in `odom`."""
         self.at_node, self.pose_odom_at_node = node, pose_odom_node
 
     def correct(self, poses_of: Mapping[str, Array]) -> None:
-        """The back-ends have the nodes at poses (N, 3), by name."""
+        """Take over the poses (N, 3) of the nodes by each back-end."""
         self.pose_map_at_node = {name: poses[self.at_node] for name, poses in poses_of.items()}
 
     def pose_map(self, pose_odom: Array) -> Array:
-        """(3,) a pose in `odom` on the map of the primary back-end."""
+        """A pose (3,) in `odom`, brought to the map of the primary back-end."""
         at_node = self.pose_map_at_node.get(self._primary)
         return pose_odom if at_node is None else compose(at_node, between(self.pose_odom_at_node, pose_odom))
 
     def update(self, reason: str, node: int | None = None, edges: Sequence[int] = ()) -> Update:
-        """What there is to say now."""
+        """The update of this instant."""
         moved, pose_map = self.moved, self.pose_map(self.pose_odom)
         on_map = {name: compose(pose, moved) for name, pose in self.pose_map_at_node.items()}
         return Update(self.stamp_ns, self.pose_odom, pose_map, on_map, self.at_node, moved, reason, node, tuple(edges))
 
 
 class EdgeBook:
-    """Keeps which edge a proposal became.
+    """Writes proposals into the map as edges, and gives vision the state of the map.
 
     Attributes:
         tried_again: numbers of the loops that were measured again because a back-end gave them no weight.
@@ -139,20 +139,20 @@ class EdgeBook:
         return changed
 
     def join(self, source: int, target: int, odometry: RelativePose) -> int:
-        """Hang a new node on the one that the robot was at; returns the edge."""
+        """Join a new node to the one that the robot was at, by odometry; returns the edge."""
         edge = Edge.decided(source, target, EdgeKind.ODOMETRY, odometry, method=Method.ODOMETRY, search=Search.CHAIN)
         return self._map.add_edge(edge)
 
-    def belief(self, poses_of: Callable[[PoseGraph], Array], doubted: Sequence[int] = ()) -> Belief:
-        """What the map believes, for vision.
+    def belief(self, poses_of: Callable[[PoseGraph], Array], outliers: Sequence[int] = ()) -> Belief:
+        """The state of the map, for vision.
 
         Args:
             poses_of: poses (N, 3) of the nodes by the primary back-end, of a graph.
-            doubted: numbers of edges that hold nothing together.
+            outliers: numbers of edges that are left out.
         """
         own, nodes = self._config.gate == "odometry", self._map.nodes
         graph = self._map.pose_graph().only(EdgeKind.ODOMETRY) if own else self._map.pose_graph()
-        graph = graph.with_edges(~np.isin(graph.edge_ids, doubted)) if len(doubted) else graph
+        graph = graph.with_edges(~np.isin(graph.edge_ids, outliers)) if len(outliers) else graph
         return Belief(
             poses_map_node=graph.initial if own else poses_of(graph),
             stamps_s=np.array([node.stamp_ns for node in nodes]) / NS_PER_S,
@@ -166,7 +166,7 @@ class EdgeBook:
         return [self._map.edge(number) for number in report.rejected_edge_ids if number in proposed]
 
     def enter_again(self, proposals: Sequence[Edge]) -> list[int]:
-        """Write what became of loops that were measured again because a back-end gave them no weight."""
+        """As `enter`, for loops that were measured again because a back-end gave them no weight."""
         self.tried_again = tuple(self.enter(proposals))
         return list(self.tried_again)
 

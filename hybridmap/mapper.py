@@ -26,7 +26,7 @@ from hybridmap.streams.sensors import rig_of
 from hybridmap.streams.synchronise import Ready, Synchroniser
 from hybridmap.trajectory import NO_ANCHORS, stamp_ns_from_s
 from hybridmap.vision import create_front_end
-from hybridmap.vision.base import Belief, RetracingFrontEnd, VerifyingFrontEnd, View
+from hybridmap.vision.base import Belief, DenseFrontEnd, VerifyingFrontEnd, View
 
 
 class Mapper:
@@ -109,7 +109,7 @@ class Mapper:
             if view is not None:
                 edges += self._refine_self_motion(node, view)
                 edges += self._close_loops(node)
-            self._position.rest()
+            self._position.restart()
             self._correct()
         return self._position.update(reason + self._calibrate(), node, edges)
 
@@ -121,18 +121,18 @@ class Mapper:
             updates += self._propose_again()
             self._correct(final=True)
             updates += self._verify_again()
-            self._retrace()
+            self._measure_between_nodes()
             updates.append(self._position.update("end of the drive"))
         return updates
 
     @property
     def lost_since(self) -> int | None:
-        """First node from which on the robot may be elsewhere than the map has it: the chain broke there, no loop since."""
+        """First node since a break of the chain, while the robot is not localised."""
         return self.vision.lost_since if self.vision is not None else None
 
     @property
     def pose_map_robot(self) -> Array:
-        """(3,) where the robot is, by the primary back-end."""
+        """(3,) pose of the robot by the primary back-end."""
         return self._position.pose_map(self.cells.pose_odom_robot)
 
     @property
@@ -144,9 +144,9 @@ class Mapper:
         """(N, 3) current poses of all nodes by a back-end (default: the primary)."""
         return self.backends.poses(self.map.pose_graph(), backend)
 
-    def belief(self, doubted: Sequence[int] = ()) -> Belief:
-        """What the map believes, for the gating of loop closures; edges of the numbers `doubted` hold nothing together."""
-        return self.book.belief(self.backends.poses, doubted)
+    def belief(self, outliers: Sequence[int] = ()) -> Belief:
+        """The state of the map for gating and re-proposal; edges of the numbers `outliers` are left out."""
+        return self.book.belief(self.backends.poses, outliers)
 
     def _correct(self, final: bool = False) -> None:
         """Give the graph to every back-end."""
@@ -155,7 +155,7 @@ class Mapper:
         self._position.correct({name: self.backends.poses(graph, name) for name in self.backends.names})
 
     def _propose_again(self) -> list[Update]:
-        """Let vision settle what waits and propose loops on the optimised map, as long as that brings something."""
+        """Let vision decide what is pending and propose loops on the optimised map, until none is accepted."""
         updates: list[Update] = []
         accepted = True
         while accepted and self.vision is not None:
@@ -168,26 +168,26 @@ class Mapper:
         return updates
 
     def _verify_again(self) -> list[Update]:
-        """Have the loops that the primary back-end gave no weight measured again, from where they lie on its map."""
+        """Let vision measure again, on the map of the primary back-end, the loops to which it gave no weight."""
         solution = self.backends.solutions.get(self.backends.primary)
         if solution is None or not isinstance(self.vision, VerifyingFrontEnd) or self.config.edges.gate == "odometry":
             return []
-        doubted = self.book.without_weight(solution.report)
+        outliers = self.book.without_weight(solution.report)
         with self.clock.stage("matching"):
-            proposals = self.vision.verify(doubted, self.belief(solution.report.rejected_edge_ids)) if doubted else []
+            proposals = self.vision.verify(outliers, self.belief(solution.report.rejected_edge_ids)) if outliers else []
         if not (edges := self.book.enter_again(proposals)):
             return []
         self._correct(final=True)
         return [self._position.update("loops without weight measured again", None, edges)]
 
-    def _retrace(self) -> None:
-        """Once the map is final, measure on it where the robot was between nodes."""
-        if isinstance(self.vision, RetracingFrontEnd):
+    def _measure_between_nodes(self) -> None:
+        """Register the frames between nodes to the final map: the dense trajectory."""
+        if isinstance(self.vision, DenseFrontEnd):
             with self.clock.stage("retrace"):
-                self.anchors = self.vision.retrace(replace(self.belief(), poses_map_node=self.poses()))
+                self.anchors = self.vision.dense_trajectory(replace(self.belief(), poses_map_node=self.poses()))
 
     def _calibrate(self) -> str:
-        """Let the gains follow the map, where the map is sure; returns what to add to the reason."""
+        """Correct the gains where the map shows an error; returns what to add to the reason."""
         change = self.calibration.follow(self._position.stamp_ns, self.map.pose_graph, self.poses) if self.calibration else None
         if change is None:
             return ""
@@ -217,7 +217,7 @@ class Mapper:
         self._novelty.remember(code)
         self.cells.remember(node)
         edges = [self.book.join(at.at_node, node, at.odometry(at.pose_odom_at_node))] if node > 0 else []
-        at.hang(node, at.pose_odom)
+        at.attach(node, at.pose_odom)
         return node, edges
 
     def _refine_self_motion(self, node: int, view: View) -> list[int]:
@@ -238,12 +238,12 @@ class Mapper:
         return edges
 
     def _recalibrate(self, matched: Edge) -> None:
-        """Bring the cells back to the matched node (paper eq. 16), and hang the robot on it if so configured (OpenRatSLAM)."""
+        """Re-anchor the cells at the matched node (paper eq. 16), and attach the robot to it if so configured (OpenRatSLAM)."""
         assert matched.relative is not None
         pose_odom_matched = compose(self.map.node(matched.source).pose_odom, matched.relative.delta)
         self.cells.recalibrate(matched.target, between(pose_odom_matched, self.cells.pose_odom_robot))
         if self.config.edges.hanging == "ratslam":
-            self._position.hang(matched.target, pose_odom_matched)
+            self._position.attach(matched.target, pose_odom_matched)
 
 
 def _newest(updates: list[Update]) -> Update | None:

@@ -19,7 +19,7 @@ from hybridmap.edge_book import Update
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.edges import EdgeKind, Status
-from hybridmap.graph.gaps import carries, unobserved
+from hybridmap.graph.gaps import kidnappings, unobserved
 from hybridmap.graph.io import graph_hash
 from hybridmap.mapper import Mapper
 from hybridmap.metrics import Metric, figure
@@ -153,8 +153,8 @@ class _Recorder:
         known = len(self._poses)
         if known and update.edges:
             seen = self._mapper.map.initial
-            carried = compose(self._poses[-1], between(seen[known - 1], seen[known:])) if len(poses) > known else seen[:0]
-            before = np.concatenate([self._poses, carried])
+            extended = compose(self._poses[-1], between(seen[known - 1], seen[known:])) if len(poses) > known else seen[:0]
+            before = np.concatenate([self._poses, extended])
             shift_m = float(np.hypot(*(poses[:, :2] - before[:, :2]).T).max())
             if shift_m > self.largest_correction_m:
                 self.largest_correction_m = shift_m
@@ -195,7 +195,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
             *stream.report.remarks,
             *map(str, _gain_changes(mapper)),
             *([str(free)] if free is not None and free.matters else []),
-            *map(str, carries(mapper.map)),
+            *map(str, kidnappings(mapper.map)),
             *_lost(mapper),
             *_doubts(mapper),
         ],
@@ -217,7 +217,7 @@ def _lost(mapper: Mapper) -> list[str]:
     """That the drive ended without it being known where the robot was, if it did."""
     if mapper.lost_since is None:
         return []
-    rest = "lies where the odometry has it; the robot may have been carried: what it saw there follows on nothing before"
+    rest = "lies where the odometry has it; the robot may have been kidnapped: its views there fit none before"
     return [f"the map from node {mapper.lost_since} of {len(mapper.map)} on {rest}, and no loop since then says where it was"]
 
 
@@ -238,7 +238,7 @@ def _weak(name: str, report: SolveReport) -> list[Metric]:
     ]
 
 
-def _second_look(mapper: Mapper) -> list[Metric]:
+def _measured_again(mapper: Mapper) -> list[Metric]:
     tried, edges = mapper.book.tried_again, mapper.map.edges
     solution = mapper.backends.solutions.get(mapper.backends.primary)
     without = set(solution.report.rejected_edge_ids) if solution is not None else set()
@@ -260,7 +260,7 @@ def _figures(mapper: Mapper, recorder: _Recorder, duration_s: float) -> list[Met
         figure("loops_pending", count[Status.PENDING]),
         figure("loops_rejected", count[Status.REJECTED]),
         figure("loops_retracted", count[Status.RETRACTED]),
-        *_second_look(mapper),
+        *_measured_again(mapper),
         figure("odometry_dropped", len(dropped)),
         figure("largest_correction", recorder.largest_correction_m),
         figure("travel", mapper.map.node(len(mapper.map) - 1).travel_m),

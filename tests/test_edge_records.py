@@ -11,7 +11,7 @@ from hybridmap.cli.choose import choose
 from hybridmap.config import Config
 from hybridmap.graph.edges import EdgeKind, Method, Search, Status
 from hybridmap.graph.experience_map import ExperienceMap
-from hybridmap.graph.gaps import carries
+from hybridmap.graph.gaps import kidnappings
 from hybridmap.simulation import SimulatedStream
 from hybridmap.store import MapStore
 from tests.streams_for_tests import RoomDrive
@@ -74,6 +74,6 @@ def test_each_edge_of_an_office_is_explained_also_where_the_robot_is_kidnapped(t
     settings = {"simulation.world": "office"} | ({"simulation.carried_m": 20.0} if carried else {})
     chosen = Config.load(config, settings)
     experiences = mapped(SimulatedStream(chosen.simulation, 1), chosen, tmp_path / "s")
-    assert len(carries(experiences)) == carried
+    assert len(kidnappings(experiences)) == carried
     if carried:
         assert any(edge.search is Search.WHOLE_MAP and edge.kind is EdgeKind.LOOP for edge in experiences.edges)

@@ -12,10 +12,10 @@ from hybridmap.graph.agreement import BOUND, Ring
 from hybridmap.graph.edges import Edge, EdgeKind, Search, Status
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.vision.base import Belief
-from hybridmap.vision.laser.clusters import Commitment
-from hybridmap.vision.laser.hypotheses import Hypothesis as LaserHypothesis
-from hybridmap.vision.relocalising import Relocaliser, Sighting, Whereabouts
-from hybridmap.vision.rgbd.support import Hypothesis, Support
+from hybridmap.vision.laser.commitment import Commitment
+from hybridmap.vision.laser.hypotheses import Hypothesis
+from hybridmap.vision.relocalising import GlobalMatch, Relocaliser, Whereabouts
+from hybridmap.vision.rgbd.support import MeasuredLoop, Support
 
 NODES, AGAIN = 60, 30
 """A straight drive; in truth nodes 30.. lie where 0.. lie."""
@@ -56,18 +56,18 @@ def pre_filter():
 def laser_commitment():
     commitment = Commitment(BELIEF.travel_m.__getitem__)
     for key, node in enumerate(LOOPS):
-        commitment.add(key, LaserHypothesis(AGAIN + node, node, SEEN, 0.7, 0.3, Search.GATE, (), {}, True, 0.0))
+        commitment.add(key, Hypothesis(AGAIN + node, node, SEEN, 0.7, 0.3, Search.GATE, (), {}, True, 0.0))
     return any(settled.accepted for settled in commitment.settle(BELIEF.travel_m[-1], BELIEF))
 
 
 def lost_robot():
     relocaliser = Relocaliser(Whereabouts(0), count(100).__next__, 0.75)
-    return len(relocaliser.settle([Sighting(edge(node, node)) for node in LOOPS], BELIEF).friends) > 0
+    return len(relocaliser.settle([GlobalMatch(edge(node, node)) for node in LOOPS], BELIEF).accepted) > 0
 
 
 def rgbd_support():
     support = Support()
-    filed = [support.file(Hypothesis(edge(node, node), SEEN), BELIEF) for node in LOOPS]
+    filed = [support.file(MeasuredLoop(edge(node, node), SEEN), BELIEF) for node in LOOPS]
     return filed[-1][0].status is Status.ACCEPTED
 
 

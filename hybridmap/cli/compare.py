@@ -83,7 +83,7 @@ def compare(
         cells = _table(rows, judged.metrics)
         if place is not None:
             facts = (f"Back-ends on {source.name}", opened.start, opened.head, opened.graph)
-            write_comparison(place, Compared(*facts, rows, cells, settings, judged.truth, opened.carried))
+            write_comparison(place, Compared(*facts, rows, cells, settings, judged.truth, opened.kidnapped))
     if as_json:
         _emit(opened, ways, rows, judged.metrics)
     else:

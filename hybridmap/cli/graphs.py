@@ -12,7 +12,7 @@ from hybridmap.config.backends import BackendsConfig
 from hybridmap.config.gone import without_gone
 from hybridmap.config.section import read_mapping
 from hybridmap.errors import GraphError
-from hybridmap.graph.gaps import Carry, carries
+from hybridmap.graph.gaps import Kidnapping, kidnappings
 from hybridmap.graph.io import graph_hash, read_graph
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.store import MapStore, SessionFolder
@@ -28,7 +28,7 @@ class GraphSource:
         is_session: whether `path` is a session folder.
         start: what the graph's initial poses are, in words.
         head: facts about the graph for the JSON output.
-        carried: where the robot was kidnapped; empty for a file.
+        kidnapped: where the robot was kidnapped; empty for a file.
     """
 
     path: Path
@@ -36,7 +36,7 @@ class GraphSource:
     is_session: bool
     start: str
     head: dict[str, Any] = field(default_factory=dict)
-    carried: tuple[Carry, ...] = ()
+    kidnapped: tuple[Kidnapping, ...] = ()
 
 
 def open_graph(path: Path) -> GraphSource:
@@ -56,7 +56,7 @@ def open_graph(path: Path) -> GraphSource:
     if graph.n_edges == 0:
         raise GraphError(f"{path}: the map has no accepted edge; there is nothing to optimise")
     head = _head(path, graph) | {"graph_hash": graph_hash(experiences)}
-    return GraphSource(path, graph, is_session=True, start="dead reckoning", head=head, carried=carries(experiences))
+    return GraphSource(path, graph, is_session=True, start="dead reckoning", head=head, kidnapped=kidnappings(experiences))
 
 
 def settings_of(source: GraphSource, config: str | None, setting: list[str] | None) -> BackendsConfig:

@@ -36,8 +36,8 @@ backends.isam2 backends/gtsam/incremental.py relinearize_m relinearize_rad settl
 backends.isam2 backends/gtsam/incremental.py patience
 vision.templates vision/templates.py threshold stable_frames
 vision.relocalising vision/relocalising.py support mismatch_max mismatch_scale wait_m
-vision.relocalising vision/rgbd/closing.py span_m doubt_nodes unrecognised_nodes known_m known_deg:KNOWN_RAD
-vision.relocalising vision/rgbd/whole_map.py separation doubtful_m
+vision.relocalising vision/rgbd/closing.py span_m doubt_nodes:UNCERTAIN_NODES unrecognised_nodes known_m known_deg:KNOWN_RAD
+vision.relocalising vision/rgbd/global_search.py separation doubtful_m:UNCERTAIN_M
 vision.laser.scan vision/laser/cloud.py range_max_m cell_m
 vision.laser.registration vision/laser/cloud.py reach_m:PARTNER_M field_sigma_m
 vision.laser.registration vision/laser/scan_matching.py cauchy_scale_m iterations inlier_m sigma_m spurious
@@ -47,7 +47,7 @@ vision.laser.tracking vision/laser/checks.py inliers_min inliers_weak translatio
 vision.laser.probes vision/laser/hypotheses.py length_m target_every_m target_half_m points gate_inflation gate_m gate_deg
 vision.laser.probes vision/laser/hypotheses.py window_m targets modes_per_target modes modes_sure floor_m floor_deg
 vision.laser.probes vision/laser/checks.py near_min violation_max loosest_max_m ambiguity_max
-vision.laser.commitment vision/laser/clusters.py wait_m probes span_m span_per_efold_m
+vision.laser.commitment vision/laser/commitment.py wait_m probes span_m span_per_efold_m
 vision.laser.commitment vision/laser/hypotheses.py sure_sigma_m
 vision.laser.commitment vision/laser/checks.py rival
 vision.laser.relocalising vision/relocalising.py support mismatch_max mismatch_scale wait_m
@@ -57,7 +57,8 @@ vision.laser.relocalising vision/laser/checks.py contradiction_sigmas violation:
 vision.laser.relocalising vision/laser/hypotheses.py modes:MODES_ANYWHERE
 vision.laser.revisits vision/laser/revisits.py radius_m every_m apart_m partners probe_half_m target_half_m
 vision.laser.revisits vision/laser/revisits.py search_m search_deg ambiguous_m floor_m floor_deg
-vision.laser.retrace vision/laser/retrace.py block_nodes radius_m map_nodes prior_m prior_deg inliers_min off_max_m off_max_deg
+vision.laser.retrace vision/laser/dense_trajectory.py block_nodes radius_m map_nodes prior_m prior_deg
+vision.laser.retrace vision/laser/dense_trajectory.py inliers_min off_max_m off_max_deg
 vision.rgbd.features vision/rgbd/features.py count fast_threshold ratio
 vision.rgbd.registration vision/rgbd/tracking.py back keypoint_reach_m translation_floor_m:FLOORS rotation_floor_deg:FLOORS
 vision.rgbd.registration vision/rgbd/tracking.py held_translation_floor_m:HELD_FLOORS held_rotation_floor_deg:HELD_FLOORS
@@ -67,7 +68,7 @@ vision.rgbd.registration vision/rgbd/noise_level.py noise_factor
 vision.rgbd.registration vision/rgbd/checks.py min_inliers:DEPTH_INLIERS_MIN contradiction_sigma
 vision.rgbd.pnp vision/rgbd/checks.py min_inliers_alone max_height_m max_tilt_deg agree_m:REVERSE_M agree_deg:REVERSE_DEG
 vision.rgbd.pnp vision/rgbd/checks.py map_inliers map_overlap map_points map_sigma_m
-vision.rgbd.pnp vision/rgbd/pnp_solver.py reprojection_px iterations
+vision.rgbd.pnp vision/rgbd/pnp.py reprojection_px iterations
 vision.rgbd.pnp vision/rgbd/pnp.py translation_floor_m:FLOORS rotation_floor_deg:FLOORS
 vision.rgbd.pnp vision/rgbd/pnp.py held_translation_floor_m:HELD_FLOORS held_rotation_floor_deg:HELD_FLOORS
 vision.rgbd.closing vision/rgbd/closing.py gate_per_m gate_growth_m heading_deg heading_deg_per_m accept separation

@@ -61,7 +61,7 @@ class Decision:
             "method": e.method,
             "search": e.search,
             "figures": {name: _plain(value) for name, value in e.figures.items()},
-            "carried_m": e.carried_m,
+            "carried_m": e.kidnapped_m,
             "broken_by": [_told(check) for check in e.broken_by],
             "contradicts_odometry": e.contradicts_odometry,
             "otherwise": e.otherwise,

@@ -73,7 +73,7 @@ def session_trajectories(session: SessionFolder, store: MapStore) -> dict[str, T
     """Name -> estimate of a session: `odometry`, then each back-end's final and `_online`.
 
     Taken from `trajectory/`; what a killed run could not write there comes from the map file. The poses while the robot was
-    carried, as far as the map knows, are left out.
+    kidnapped, as far as the map knows, are left out.
     """
     written = session.trajectories()
     estimates = {ODOMETRY: written[ODOMETRY] if ODOMETRY in written else store.track().odometry}
@@ -206,7 +206,7 @@ class Judged:
     Attributes:
         metrics: `<measure>/<title>`, as `evaluate` names them; empty where there is nothing to compare with.
         truth: the true way, m and rad, moved onto the solution of the lowest ATE: a piece (P, 3) before, between and after
-            the carries that the map knows of; none where it is not known.
+            the kidnappings that the map knows of; none where it is not known.
     """
 
     metrics: tuple[Metric, ...]

@@ -226,8 +226,8 @@ class Edge:
         method, search: what measured it, and how its nodes came to be compared; None where that is not known.
         shift: columns by which the view of the target is shifted against that of the source.
         figures: further figures for people, by name; nothing is decided by them.
-        carried_m: of the edge that joins the chain again where the robot was kidnapped: how far from where the odometry has it
-            the robot was found; None for every other edge.
+        kidnapped_m: of the edge that rejoins the chain after a kidnapping: how far from its odometry pose the robot was found;
+            None for every other edge.
         broken_by: the checks that say that the robot did not drive from the source to the target; empty where it may have.
         contradicts_odometry: a registration so good that the odometry edge beside it is wrong and is to be dropped.
         since_node: number of the newest node when the edge got its present status (-1: let the map note it), so that a
@@ -246,7 +246,7 @@ class Edge:
     search: Search | None = field(default=None, kw_only=True)
     shift: int = field(default=0, kw_only=True)
     figures: Mapping[str, float] = field(default_factory=dict, kw_only=True)
-    carried_m: float | None = field(default=None, kw_only=True)
+    kidnapped_m: float | None = field(default=None, kw_only=True)
     broken_by: tuple[Check, ...] = field(default=(), kw_only=True)
     contradicts_odometry: bool = field(default=False, kw_only=True)
     since_node: int = field(default=-1, kw_only=True)
@@ -285,8 +285,8 @@ class Edge:
             words.append(self.method.words)
         if self.search is not None and self.search.words:
             words.append(self.search.words)
-        if self.carried_m is not None:
-            words.append(f"kidnapped: {self.carried_m:.1f} m from where the odometry has it")
+        if self.kidnapped_m is not None:
+            words.append(f"kidnapped: {self.kidnapped_m:.1f} m from where the odometry has it")
         if self.contradicts_odometry:
             words.append("contradicts the odometry")
         if self.broken_by:

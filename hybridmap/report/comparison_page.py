@@ -19,7 +19,7 @@ from hybridmap.backends.objective import squared_norms
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.edges import EdgeKind
-from hybridmap.graph.gaps import Carry, parted, through_the_air
+from hybridmap.graph.gaps import Kidnapping, kidnapping_edges, parted
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.output import Held, Kind, write_bytes, write_text
 from hybridmap.report import page_tables as tables
@@ -45,7 +45,7 @@ class Compared:
         cells: the table: a line of column titles, then one line a row of `rows`.
         settings: of the back-ends.
         truth: pieces (P, 3) of the true way in the frame of the maps, m and rad; none where it is not known.
-        carried: where the robot was carried, so that no line is drawn there.
+        kidnapped: where the robot was kidnapped, so that no line is drawn there.
     """
 
     title: str
@@ -56,7 +56,7 @@ class Compared:
     cells: Sequence[Sequence[str]]
     settings: BackendsConfig
     truth: Sequence[Array] = ()
-    carried: Sequence[Carry] = ()
+    kidnapped: Sequence[Kidnapping] = ()
 
 
 def write_comparison(place: Held, compared: Compared) -> Path:
@@ -66,7 +66,7 @@ def write_comparison(place: Held, compared: Compared) -> Path:
         OutputError: it cannot be written to.
     """
     graph, rows = compared.graph, compared.rows
-    picture = panels(graph, rows, compared.start, compared.carried)
+    picture = panels(graph, rows, compared.start, compared.kidnapped)
     page = rendered(
         _TEMPLATE,
         title=compared.title,
@@ -78,9 +78,9 @@ def write_comparison(place: Held, compared: Compared) -> Path:
         rows=[{"cells": line, "bad": not row.has_map} for row, line in zip(rows, compared.cells[1:], strict=True)],
         messages=[(row.title, row.verdict) for row in rows],
         ways={str(row.way) for row in rows},
-        carried=compared.carried,
+        kidnapped=compared.kidnapped,
         of_truth=bool(compared.truth),
-        overlay=overlay(rows, compared.truth, compared.carried),
+        overlay=overlay(rows, compared.truth, compared.kidnapped),
         panels="data:image/png;base64," + base64.b64encode(picture).decode("ascii"),
         convergence=convergence(rows),
         weights=weights(graph, rows),
@@ -122,7 +122,7 @@ def solved(rows: Sequence[Row]) -> dict[str, Array]:
     return {row.title: row.solution.poses for row in rows if row.has_map and row.solution is not None}
 
 
-def overlay(rows: Sequence[Row], truth: Sequence[Array], carried: Sequence[Carry]) -> str:
+def overlay(rows: Sequence[Row], truth: Sequence[Array], kidnapped: Sequence[Kidnapping]) -> str:
     """The chain of nodes of every row in one frame, over the pieces (P, 3) of the truth where it is known; a `data:` URI.
 
     Empty where no row has a map.
@@ -139,7 +139,7 @@ def overlay(rows: Sequence[Row], truth: Sequence[Array], carried: Sequence[Carry
             axes.plot(*piece[:, :2].T, color=style.TRUTH, linewidth=3.2, alpha=0.28, label=label, zorder=3)
         looks = _looks(rows)
         for title, poses in maps.items():
-            axes.plot(*parted(poses, carried)[:, :2].T, label=title, **looks[title])
+            axes.plot(*parted(poses, kidnapped)[:, :2].T, label=title, **looks[title])
         style.metric_axes(axes, "box")
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
@@ -147,20 +147,20 @@ def overlay(rows: Sequence[Row], truth: Sequence[Array], carried: Sequence[Carry
         return style.svg_uri(picture)
 
 
-def panels(graph: PoseGraph, rows: Sequence[Row], start: str, carried: Sequence[Carry]) -> bytes:
+def panels(graph: PoseGraph, rows: Sequence[Row], start: str, kidnapped: Sequence[Kidnapping]) -> bytes:
     """Each map with its loops and its rejected loops, side by side, as PNG; the same figure gives the same bytes.
 
     Args:
         graph: the edges.
         rows: the maps.
         start: what the graph's own poses are.
-        carried: where no line is drawn, as the robot did not drive there.
+        kidnapped: where no line is drawn, as the robot did not drive there.
     """
     maps = solved(rows)
     if not any(np.allclose(poses, graph.initial) for poses in maps.values()):
         maps = {start: graph.initial} | maps
     rejected = {row.title: row.solution.report.rejected_edge_ids for row in rows if row.solution is not None}
-    driven = graph.with_edges(~through_the_air(graph, carried))
+    driven = graph.with_edges(~kidnapping_edges(graph, kidnapped))
     columns = max(1, min(_COLUMNS, len(maps)))
     lines = -(-len(maps) // columns)
     with style.figure(style.PAGE_WIDTH_IN, 0.4 + 3.1 * lines) as picture:

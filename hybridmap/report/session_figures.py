@@ -11,7 +11,7 @@ import numpy as np
 from hybridmap.backends.base import ODOMETRY
 from hybridmap.geometry import Array, wrap_angle
 from hybridmap.graph.edges import Edge, EdgeKind, Status
-from hybridmap.graph.gaps import Carry, carries, parted, pieces
+from hybridmap.graph.gaps import Kidnapping, kidnappings, parted, pieces
 from hybridmap.metrics import ONLINE
 from hybridmap.report import style
 from hybridmap.report.outline import Raster, raster
@@ -55,14 +55,14 @@ def _draw_ways(axes: Any, trajectory: Trajectory, scene: SessionScene, *, label:
 
 
 def graph_figure(scene: SessionScene, building: Raster | None) -> str:
-    """Nodes at the primary back-end's poses, chain, carries, and loops by their fate; a `data:` URI."""
+    """Nodes at the primary back-end's poses, chain, kidnappings, and loops by their fate; a `data:` URI."""
     with style.figure(*_size(scene.nodes[:, :2], building)) as picture:
         axes = picture.add_subplot()
         style.draw_building(axes, building, darkness=0.35)
-        chain, carried = chain_and_carries(scene)
+        chain, kidnapped = chain_and_kidnappings(scene)
         _draw_edges(axes, scene, chain, color=_GREY, linewidth=0.8, zorder=2)
         looks = {"color": _GREY, "linewidth": 0.8, "linestyle": (0, (4, 4)), "zorder": 2}
-        _draw_edges(axes, scene, carried, label=f"carried ({len(carried)})", **looks)
+        _draw_edges(axes, scene, kidnapped, label=f"kidnapped ({len(kidnapped)})", **looks)
         loops = loops_by_fate(scene)
         for fate, looks in _FATES.items():
             many = len(loops[fate]) if fate == "loops rejected" else 0  # thousands of them would hide the building
@@ -98,9 +98,9 @@ def _draw_legend(picture: Any) -> None:
         line.set_linewidth(max(line.get_linewidth(), _LEGEND_PT))
 
 
-def chain_and_carries(scene: SessionScene) -> tuple[list[Edge], list[Edge]]:
+def chain_and_kidnappings(scene: SessionScene) -> tuple[list[Edge], list[Edge]]:
     """The accepted edges that no loops are: those of ways driven, and those that stand for a way through the air."""
-    aloft = {(carry.before, carry.after) for carry in carries(scene.experiences)}
+    aloft = {(kidnapping.before, kidnapping.after) for kidnapping in kidnappings(scene.experiences)}
     motion = [e for e in scene.experiences.edges if e.kind is not EdgeKind.LOOP and e.status is Status.ACCEPTED]
     chain = [edge for edge in motion if (edge.source, edge.target) not in aloft]
     return chain, [edge for edge in motion if (edge.source, edge.target) in aloft]
@@ -235,7 +235,7 @@ def over_intervals(errors: ErrorSeries, count: int) -> ErrorSeries:
 
 
 def gaps(time_s: Array) -> Array:
-    """Middles (G,), s, of the times in which no error is taken, as where the robot was carried or the truth was lost."""
+    """Middles (G,), s, of the times in which no error is taken, as where the robot was kidnapped or the truth was lost."""
     spacing = np.diff(time_s)
     if not len(spacing):
         return spacing
@@ -263,14 +263,14 @@ def _mark_loops(scene: SessionScene, axes: Any) -> None:
         )  # fmt: skip
 
 
-def correction_figure(correction: Correction, points_of: Mapping[int, Array], carried: Sequence[Carry]) -> str:
-    """Two panels on the same axes: nodes and what they saw, before and after; a `data:` URI. The way ends at a carry."""
+def correction_figure(correction: Correction, points_of: Mapping[int, Array], kidnapped: Sequence[Kidnapping]) -> str:
+    """Two panels on the same axes: nodes and what they saw, before and after; a `data:` URI. The way ends at a kidnapping."""
     both = np.concatenate([correction.before, correction.after])[:, :2]
     low, high = both.min(axis=0) - 1.5, both.max(axis=0) + 1.5
     with style.figure(*style.fitted_size(high - low, panels=2)) as picture:
         left, right = picture.subplots(1, 2)
-        _panel(left, "before", correction.before, points_of, carried, style.ODOMETRY)
-        _panel(right, "after", correction.after, points_of, carried, style.PRIMARY)
+        _panel(left, "before", correction.before, points_of, kidnapped, style.ODOMETRY)
+        _panel(right, "after", correction.after, points_of, kidnapped, style.PRIMARY)
         _draw_shifts(right, correction)
         right.set_ylabel("")
         for axes in (left, right):
@@ -279,9 +279,11 @@ def correction_figure(correction: Correction, points_of: Mapping[int, Array], ca
         return style.svg_uri(picture)
 
 
-def _panel(axes: Any, title: str, poses: Array, points_of: Mapping[int, Array], carried: Sequence[Carry], color: str) -> None:
+def _panel(
+    axes: Any, title: str, poses: Array, points_of: Mapping[int, Array], kidnapped: Sequence[Kidnapping], color: str
+) -> None:
     style.draw_building(axes, raster(points_of, poses), darkness=0.6)
-    axes.plot(*parted(poses, carried)[:, :2].T, color=color, linewidth=1.0, marker=".", markersize=3, zorder=4)
+    axes.plot(*parted(poses, kidnapped)[:, :2].T, color=color, linewidth=1.0, marker=".", markersize=3, zorder=4)
     axes.plot(*poses[-1, :2], marker="o", markersize=7, color="white", markeredgecolor="black", zorder=6)
     axes.set_title(title)
     style.metric_axes(axes, adjustable="box")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridmap.backends.base import ODOMETRY
-from hybridmap.graph.gaps import carries
+from hybridmap.graph.gaps import kidnappings
 from hybridmap.metrics import Metric
 from hybridmap.output import write_text
 from hybridmap.report import page_tables as tables
@@ -64,7 +64,7 @@ def _content(scene: SessionScene, store: MapStore) -> dict[str, Any]:
         "trajectories": trajectories_figure(scene, building),
         "graph": graph_figure(scene, building),
         "errors": error_figure(scene),
-        "correction": None if correction is None else correction_figure(correction, points_of, carries(scene.experiences)),
+        "correction": None if correction is None else correction_figure(correction, points_of, kidnappings(scene.experiences)),
         "correction_shift": None if correction is None else " ".join(tables.length(correction.shift_m)),
         "correction_time": None if correction is None else tables.number(round((correction.stamp_ns - start_ns) / NS_PER_S, 1)),
         "examples": examples(scene, store, points_of),

@@ -219,7 +219,7 @@ def record_to_json(edge: Edge) -> str:
         "search": edge.search,
         "figures": {name: float(value) for name, value in edge.figures.items()},
         "shift": edge.shift,
-        "carried_m": edge.carried_m,
+        "carried_m": edge.kidnapped_m,
         "broken_by": [_row(check) for check in edge.broken_by],
         "contradicts_odometry": edge.contradicts_odometry,
     }
@@ -230,8 +230,9 @@ def record_from_json(text: str, version: int = VERSION) -> dict[str, Any]:
     """The fields of an edge that `record_to_json` wrote; a file before version 3 has figures alone."""
     fields: dict[str, Any] = json.loads(text)
     if version < 3:
-        carried_m = fields.pop("carried_m", None)
-        return {"figures": fields, "carried_m": carried_m}
+        kidnapped_m = fields.pop("carried_m", None)
+        return {"figures": fields, "kidnapped_m": kidnapped_m}
+    fields["kidnapped_m"] = fields.pop("carried_m", None)
     for name in ("checks", "broken_by"):
         fields[name] = tuple(Check(figure, value, Need(needs), *limit) for figure, value, needs, *limit in fields.get(name, ()))
     for name, kind in (("lack", Lack), ("method", Method), ("search", Search)):

@@ -1,7 +1,6 @@
-"""What the visual side gives to the mapper, said once: proposals of edges, each measured or refused with a reason.
+"""The interface of front-ends: they propose edges to the mapper, each with the record of its checks.
 
-A front-end keeps its own templates, keyframes and submaps, addressed by node number. It never sees the graph or a
-solver: what they know reaches it as a `Belief`.
+A front-end keeps its own templates, keyframes and submaps, by node number. It gets the state of the map as a `Belief`.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from hybridmap.trajectory import Anchors
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """What the map believes, for gating and re-proposal.
+    """The state of the map, for gating and re-proposal.
 
     Attributes:
         poses_map_node: (N, 3) current estimate of every node by the primary back-end (or the integrator's own poses where
@@ -39,7 +38,7 @@ class Belief:
     covariance_from: Callable[[int], Array]
 
     def ways(self, first: Indices, second: Indices) -> RelativePose:
-        """The way between nodes (P,) and nodes (P,), as `agreement.Ways`. Searches the graph once for each node in `first`."""
+        """Nodes (P,) seen from nodes (P,), as `agreement.Ways`. Costs a search of the graph for each node in `first`."""
         covariance = np.empty((len(first), 3, 3))
         for node in np.unique(first).tolist():
             covariance[first == node] = self.covariance_from(node)[second[first == node]]
@@ -48,13 +47,13 @@ class Belief:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What one frame looks like.
+    """The profile and view template of one frame.
 
     Attributes:
         stamp_ns: of the frame.
-        profile: (bands, width) float32 scanline profile(s), normalised as the configuration says.
+        profile: (bands, width) float32, normalised as configured.
         template: number of the view template it matched or founded.
-        new_template: the frame founded a template (a new view, stable over several frames).
+        new_template: the frame founded the template: its view is new, and stable over several frames.
     """
 
     stamp_ns: int
@@ -64,10 +63,10 @@ class View:
 
 
 class FrontEnd(Protocol):
-    """Scanline loop closure and refined self-motion for one kind of sensor. Calls come in this order:
+    """Loop closure and registration for one kind of sensor. The mapper calls in this order:
 
-    `observe` for each frame; when the mapper makes a node of that frame, `add_node`, then `track`, then `close`;
-    once, at the end, `finish` (and again while it returns something new, as often as the configuration allows).
+    `observe` for each frame; if it makes a node of the frame, `add_node`, `track` and `close`; at the end `finish`, again
+    while it returns accepted edges.
     """
 
     def observe(self, frame: Observation, delta_node_robot: Array) -> View:
@@ -80,14 +79,14 @@ class FrontEnd(Protocol):
         """Register the new node to the ones before it; `odometry` is its pose seen from node - 1 (None for the first node)."""
 
     def close(self, node: int, belief: Belief) -> list[Edge]:
-        """Look for loop closures of the new node; may also settle proposals that were pending."""
+        """Look for loop closures of the new node; may also decide pending proposals."""
 
     def finish(self, belief: Belief) -> list[Edge]:
-        """Re-propose on the optimised map; settle what is pending."""
+        """Re-propose on the optimised map; decide what is pending."""
 
     @property
     def lost_since(self) -> int | None:
-        """First node from which on the robot may be elsewhere than the map has it, as its chain broke there; None: none."""
+        """First node since a kidnapping or a break of the chain, while the robot is not localised; None otherwise."""
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
         """What the map file keeps of a node's frame: `profile`, and `ranges_m`, or `color` and `depth_mm` (compact dtypes)."""
@@ -95,15 +94,15 @@ class FrontEnd(Protocol):
 
 @runtime_checkable
 class VerifyingFrontEnd(FrontEnd, Protocol):
-    """A front-end that can measure loops again."""
+    """A front-end that can measure loops again that a back-end gave no weight."""
 
-    def verify(self, doubted: Sequence[Edge], belief: Belief) -> list[Edge]:
-        """Measure loops again from where their nodes lie on the map; each keeps its key. What is left out stays as it is."""
+    def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
+        """Measure loops again from the map's poses. Each keeps its key; a loop that is not returned stays as it is."""
 
 
 @runtime_checkable
-class RetracingFrontEnd(FrontEnd, Protocol):
-    """A front-end that can also say, once the map is final, where the robot was between nodes."""
+class DenseFrontEnd(FrontEnd, Protocol):
+    """A front-end that can register the frames between nodes to the final map."""
 
-    def retrace(self, belief: Belief) -> Anchors:
-        """Measure every frame on the final map; called once, after the last `finish`."""
+    def dense_trajectory(self, belief: Belief) -> Anchors:
+        """Anchors of the dense trajectory: every frame registered to the final map. Called once, after the last `finish`."""

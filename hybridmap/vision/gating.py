@@ -19,10 +19,10 @@ class Gate:
     """Which older nodes a new one was compared with.
 
     Attributes:
-        radius_m, heading_deg: its widths.
+        radius_m, heading_deg: half-widths.
         older: how many nodes were old enough.
         inside: how many of those lay in it.
-        whole_map: the others were searched as well, because the robot was not sure where it was.
+        whole_map: the nodes outside were searched as well, since the robot was lost.
     """
 
     radius_m: float
@@ -43,13 +43,11 @@ class Gate:
 
 
 def nodes_within(poses: Array, node: int, radius_m: float | Array, turn_rad: float, before: int | None = None) -> Indices:
-    """Nodes before one of them that lie near it and look nearly the same way.
-
-    Every frame asks for it and looks at every node: the one loop over them is compiled.
+    """Earlier nodes near one, of nearly the same heading. Its cost grows with the number of nodes; the loop is compiled.
 
     Args:
         poses: (N, 3) of all nodes, m and rad.
-        node: the one in question.
+        node: the number of the one.
         radius_m: largest distance, m; one for all, or (before,) one for each.
         turn_rad: largest difference of the headings, rad.
         before: only nodes of lower numbers count; default: `node`.
@@ -67,7 +65,7 @@ def nodes_within(poses: Array, node: int, radius_m: float | Array, turn_rad: flo
 
 @cache
 def _scan() -> Callable[[Array, float, float, Array, Indices], int]:
-    """Writes the numbers of the nodes that lie near a point; compiled when it is first asked for, as few commands do."""
+    """The compiled loop; compiled on first use, as few commands need it."""
     from hybridmap.compiled import compiled
 
     return compiled("int64(float64[:, ::1], float64, float64, float64[::1], int64[::1])")(_near)

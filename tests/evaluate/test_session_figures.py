@@ -60,7 +60,7 @@ def test_killed_session_is_evaluated_from_its_map_file(tmp_path):
 def test_the_way_through_the_air_counts_for_nothing(tmp_path):
     experiences = ring_map()
     hung = RelativePose(np.array([3.0, 4.0, 0.0]), np.eye(3))
-    experiences.add_edge(Edge(20, 21, EdgeKind.REGISTRATION, Status.ACCEPTED, hung, carried_m=5.0))
+    experiences.add_edge(Edge(20, 21, EdgeKind.REGISTRATION, Status.ACCEPTED, hung, kidnapped_m=5.0))
     folder = write_session(tmp_path / "s", experiences, keyframes=False).path
     figures = {metric.name: metric.value for metric in evaluate_session(folder)}
     track = len(read_tum(folder / "trajectory" / "odometry.tum"))

@@ -90,5 +90,5 @@ def test_every_lack_says_what_it_is_and_what_was_needed(lack):
 def test_the_reason_says_how_an_edge_was_found_and_measured():
     assert edge(method=Method.SCANS, search=Search.WHOLE_MAP).reason == "scans agree; found on the whole map"
     assert all(method.words for method in Method)
-    assert "kidnapped" in edge(carried_m=5.0).reason
+    assert "kidnapped" in edge(kidnapped_m=5.0).reason
     assert "violation 0.4 > 0.13" in edge(broken_by=(at_most("violation", 0.4, 0.13),)).reason

@@ -9,7 +9,7 @@ from hybridmap.geometry import RelativePose, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
 from hybridmap.vision import relocalising
 from hybridmap.vision.base import Belief
-from hybridmap.vision.relocalising import Chain, Relocaliser, Sighting, Whereabouts
+from hybridmap.vision.relocalising import ChainState, GlobalMatch, Relocaliser, Whereabouts
 
 STEP_M = 0.3
 X = (STEP_M * np.arange(200)).astype(np.float64)
@@ -25,7 +25,7 @@ class Search:
     def __init__(self, span_m=0.75, steps=()):
         self.keys = count()
         self.relocaliser = Relocaliser(Whereabouts(0), self.keys.__next__, span_m)
-        self.relocaliser.tracked(BROKEN_AT, Chain.BROKEN, list(steps))
+        self.relocaliser.tracked(BROKEN_AT, ChainState.BROKEN, list(steps))
         self.proposals = {}
         self.settlements = []
 
@@ -35,7 +35,7 @@ class Search:
         for target, mismatch in sightings:
             relative = RelativePose(np.zeros(3), np.eye(3) * 1e-4)
             edge = Edge(node, target, EdgeKind.LOOP, Status.PENDING, relative, key=next(self.keys))
-            found.append(Sighting(edge, mismatch or 0.0))
+            found.append(GlobalMatch(edge, mismatch or 0.0))
         self.settlements.append(self.relocaliser.settle(found, seen_until(node)))
         self.proposals |= {p.key: p for p in self.settlements[-1].proposals}
         return self
@@ -69,17 +69,17 @@ def test_sightings_wait_until_enough_of_them_agree():
     search.drive([43], THERE)
     assert search.verdicts() == [Status.ACCEPTED] * 4
     assert not search.lost
-    assert search.settlements[-1].carried_to == BROKEN_AT
-    assert len(search.settlements[-1].friends) == 4
+    assert search.settlements[-1].kidnapped_to == BROKEN_AT
+    assert len(search.settlements[-1].accepted) == 4
 
 
 def test_the_chain_is_hung_where_the_sightings_have_it():
     search = Search().drive(range(40, 44), THERE)
-    rehung = next(p for p in search.proposals.values() if p.kind is EdgeKind.REGISTRATION)
-    assert (rehung.source, rehung.target, rehung.status) == (39, 40, Status.ACCEPTED)
-    assert rehung.contradicts_odometry
-    assert compose(BELIEF.poses_map_node[39], rehung.relative.delta) == pytest.approx([X[THERE], 0.0, 0.0])
-    assert rehung.carried_m == pytest.approx(X[BROKEN_AT] - X[THERE])
+    reattached = next(p for p in search.proposals.values() if p.kind is EdgeKind.REGISTRATION)
+    assert (reattached.source, reattached.target, reattached.status) == (39, 40, Status.ACCEPTED)
+    assert reattached.contradicts_odometry
+    assert compose(BELIEF.poses_map_node[39], reattached.relative.delta) == pytest.approx([X[THERE], 0.0, 0.0])
+    assert reattached.kidnapped_m == pytest.approx(X[BROKEN_AT] - X[THERE])
 
 
 def test_registrations_across_the_break_are_taken_back():
@@ -96,13 +96,13 @@ def test_a_robot_found_where_the_chain_has_it_was_not_carried():
         search.see(node, (node, None))
     assert search.verdicts() == [Status.ACCEPTED] * 4
     assert search.verdicts(EdgeKind.REGISTRATION) == []
-    assert search.settlements[-1].carried_to is None
+    assert search.settlements[-1].kidnapped_to is None
     assert not search.lost
 
 
 def test_sightings_that_enter_have_passed_what_they_are_held_against():
-    friends = Search().drive(range(40, 44), THERE).settlements[-1].friends
-    assert {tuple(check.figure for check in edge.checks) for edge in friends} == {("agreeing", "span_m", "rival")}
+    accepted = Search().drive(range(40, 44), THERE).settlements[-1].accepted
+    assert {tuple(check.figure for check in edge.checks) for edge in accepted} == {("agreeing", "span_m", "rival")}
 
 
 def test_rivals_that_count_for_half_as_much_keep_it_waiting():
@@ -144,8 +144,8 @@ def test_of_one_nodes_sightings_the_better_fit_counts_for_more():
     for node in range(40, 44):
         search.see(node, (THERE + node - 40, 0.01), (ELSEWHERE + node - 40, 0.12))
     assert not search.lost
-    assert search.settlements[-1].carried_to == BROKEN_AT
-    assert all(p.target < ELSEWHERE for p in search.settlements[-1].friends)
+    assert search.settlements[-1].kidnapped_to == BROKEN_AT
+    assert all(p.target < ELSEWHERE for p in search.settlements[-1].accepted)
 
 
 @pytest.mark.parametrize(("mismatch", "nodes"), [(0.0, 4), (0.075, 6), (0.12, 14), (0.16, None)])
@@ -179,8 +179,8 @@ def test_sightings_of_a_chain_that_holds_hang_nothing_anew():
     for node in range(40, 44):
         delta = between(BELIEF.poses_map_node[node], BELIEF.poses_map_node[node] + [0.0, 3.0, 0.0])
         relative = RelativePose(delta, np.eye(3) * 1e-4)
-        found.append(Sighting(Edge(node, THERE + node - 40, EdgeKind.LOOP, Status.PENDING, relative, key=node)))
+        found.append(GlobalMatch(Edge(node, THERE + node - 40, EdgeKind.LOOP, Status.PENDING, relative, key=node)))
     settlement = relocaliser.settle(found, seen_until(43))
-    assert len(settlement.friends) == 4
-    assert settlement.carried_to is None
+    assert len(settlement.accepted) == 4
+    assert settlement.kidnapped_to is None
     assert {p.kind for p in settlement.proposals} == {EdgeKind.LOOP}

@@ -1,6 +1,6 @@
 """When a robot counts as lost, and where its chain broke."""
 
-from hybridmap.vision.relocalising import Chain, Whereabouts
+from hybridmap.vision.relocalising import ChainState, Whereabouts
 
 
 def test_places_that_are_known_and_not_recognised_make_it_lost():
@@ -14,7 +14,7 @@ def test_places_that_are_known_and_not_recognised_make_it_lost():
     assert whereabouts.lost
     assert whereabouts.first_break is None
     whereabouts.recognised()
-    whereabouts.tracked(7, Chain.HOLDS)
+    whereabouts.tracked(7, ChainState.HOLDS)
     assert not whereabouts.lost
 
 
@@ -25,8 +25,8 @@ def test_a_robot_that_need_recognise_nothing_is_not_lost():
 
 
 def test_a_break_counts_for_more_than_a_doubt():
-    whereabouts = Whereabouts(0, doubt_nodes=40)
-    for node, chain in ((8, Chain.DOUBTFUL), (9, Chain.BROKEN), (10, Chain.HOLDS), (12, Chain.DOUBTFUL)):
+    whereabouts = Whereabouts(0, uncertain_nodes=40)
+    for node, chain in ((8, ChainState.UNCERTAIN), (9, ChainState.BROKEN), (10, ChainState.HOLDS), (12, ChainState.UNCERTAIN)):
         whereabouts.tracked(node, chain)
     assert whereabouts.lost
     assert whereabouts.first_break == 8
@@ -38,13 +38,13 @@ def test_a_break_counts_for_more_than_a_doubt():
 
 
 def test_a_doubt_is_forgotten_and_a_break_is_not():
-    whereabouts = Whereabouts(0, doubt_nodes=5)
-    whereabouts.tracked(3, Chain.DOUBTFUL)
+    whereabouts = Whereabouts(0, uncertain_nodes=5)
+    whereabouts.tracked(3, ChainState.UNCERTAIN)
     for node in range(4, 9):
-        whereabouts.tracked(node, Chain.HOLDS)
+        whereabouts.tracked(node, ChainState.HOLDS)
         assert whereabouts.lost
-    whereabouts.tracked(9, Chain.HOLDS)
+    whereabouts.tracked(9, ChainState.HOLDS)
     assert not whereabouts.lost
-    whereabouts.tracked(10, Chain.BROKEN)
-    whereabouts.tracked(100, Chain.HOLDS)
+    whereabouts.tracked(10, ChainState.BROKEN)
+    whereabouts.tracked(100, ChainState.HOLDS)
     assert whereabouts.break_before(100) == 10

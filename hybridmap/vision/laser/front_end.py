@@ -17,10 +17,10 @@ from hybridmap.streams.laser import LASER, Laser, LaserScan
 from hybridmap.trajectory import Anchors
 from hybridmap.vision.base import Belief, View
 from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan
-from hybridmap.vision.laser.clusters import Commitment
+from hybridmap.vision.laser.commitment import Commitment
+from hybridmap.vision.laser.dense_trajectory import DenseTrajectory, ObservedScan
 from hybridmap.vision.laser.hypotheses import Prober
-from hybridmap.vision.laser.kidnapping import Continuity, WholeMap
-from hybridmap.vision.laser.retrace import Retracer, SeenScan
+from hybridmap.vision.laser.kidnapping import Continuity, GlobalLocalisation
 from hybridmap.vision.laser.revisits import Reviser
 from hybridmap.vision.laser.submap import Atlas
 from hybridmap.vision.laser.tracking import Step, Tracker
@@ -35,11 +35,11 @@ MOST_BETWEEN = 30
 
 
 class LaserFrontEnd:
-    """Submap registration and commitment by cluster, as a `vision.base.FrontEnd`.
+    """Loop closure by registration of submaps, as a `vision.base.DenseFrontEnd`.
 
     Attributes:
         atlas: the scans of the nodes, of which submaps are made.
-        whole_map: where a robot that may be anywhere is looked for.
+        localisation: whether the robot is lost, and its global localisation.
     """
 
     def __init__(self, config: VisionConfig, laser: Laser) -> None:
@@ -54,11 +54,13 @@ class LaserFrontEnd:
         self._templates = ViewTemplates(config.profile.width // 16, config.matching.mu_r, config.matching.mu_d)
         self._profiles: list[NDArray[np.float32]] = []
         self._continuity = Continuity(config, self.atlas, laser, self._tracker)
-        self.whole_map = WholeMap(config, self.atlas, self._prober, self._continuity, self._profiles, self._next_key)
-        self._retracer = Retracer(self.atlas, laser)
-        self._scans: list[SeenScan] = []
+        self.localisation = GlobalLocalisation(
+            config, self.atlas, self._prober, self._continuity, self._profiles, self._next_key
+        )
+        self._dense_trajectory = DenseTrajectory(self.atlas, laser)
+        self._scans: list[ObservedScan] = []
         self._steps: list[Array] = []
-        self._between: list[SeenScan] = []
+        self._between: list[ObservedScan] = []
         self._node: tuple[int, Cloud, LaserScan] | None = None
         self._last_probe_m = 0.0
         self._keys = 0
@@ -73,7 +75,7 @@ class LaserFrontEnd:
             raise StreamError(f"laser: expected a LaserScan, found {type(frame).__name__}")
         if frame.ranges_m.shape != self._laser.bearings_rad.shape:
             raise StreamError(f"laser: expected {len(self._laser.bearings_rad)} ranges, found {frame.ranges_m.shape}")
-        self._scans.append(SeenScan(frame, len(self._profiles) - 1, np.array(delta_node_robot, dtype=np.float64)))
+        self._scans.append(ObservedScan(frame, len(self._profiles) - 1, np.array(delta_node_robot, dtype=np.float64)))
         profile = laser_profile(frame.ranges_m, self._laser.bearings_rad, self._profile_width)
         if not self._config.scan.templates:
             return View(frame.stamp_ns, profile, -1, False)
@@ -86,7 +88,7 @@ class LaserFrontEnd:
         self._between = [s for s in self._scans[-MOST_BETWEEN:] if s.node == node - 1 and node > 0]
         if node > 0:
             self._steps.append(seen.motion)
-        self._scans.append(SeenScan(seen.scan, node, IDENTITY))
+        self._scans.append(ObservedScan(seen.scan, node, IDENTITY))
         self._profiles.append(view.profile)
         self._node = (node, self._cloud(seen.scan), seen.scan)
 
@@ -104,22 +106,22 @@ class LaserFrontEnd:
         step = self._tracker.step(cloud, odometry, self._clouds_between)
         self.atlas.add(cloud, scan.ranges_m, compose(self.atlas.chain[-1], step.relative.delta), step.scatter)
         broken = self._continuity.broken(node, step, odometry, [(seen.motion, seen.scan) for seen in self._between])
-        return [self.whole_map.tracked(self._registration(node, step), broken)]
+        return [self.localisation.tracked(self._registration(node, step), broken)]
 
     def close(self, node: int, belief: Belief) -> list[Edge]:
-        """Look for a lost robot on the whole map; probe the old submaps every few metres; settle what has waited."""
-        sought = self.whole_map.search(node, belief)
+        """Localise a lost robot on the whole map; probe the old submaps every few metres; decide pending hypotheses."""
+        sought = self.localisation.search(node, belief)
         travel_m = self.atlas.travel_m[node]
-        if sought.friends or travel_m - self._last_probe_m < self._config.probes.every_m:
+        if sought.accepted or travel_m - self._last_probe_m < self._config.probes.every_m:
             return sought.proposals
         out = sought.proposals + self._probe(node, belief)
         settled = [s.proposed() for s in self._commitment.settle(travel_m, belief)]
-        return out + settled + (self.whole_map.closed() if any(p.status is Status.ACCEPTED for p in settled) else [])
+        return out + settled + (self.localisation.closed() if any(p.status is Status.ACCEPTED for p in settled) else [])
 
     def _probe(self, node: int, belief: Belief) -> list[Edge]:
         self._last_probe_m = self.atlas.travel_m[node]
-        hypotheses, out = self._prober.probe(node, belief, self.whole_map.since), []
-        self.whole_map.probed(node, hypotheses, belief)
+        hypotheses, out = self._prober.probe(node, belief, self.localisation.since), []
+        self.localisation.probed(node, hypotheses, belief)
         for hypothesis in hypotheses:
             key = self._next_key()
             out.append(hypothesis.proposed(key, Lack.WAITING))
@@ -128,31 +130,31 @@ class LaserFrontEnd:
         return out
 
     def finish(self, belief: Belief) -> list[Edge]:
-        """Probe from where the robot ended and settle all that waits; then register nodes that lie near each other."""
+        """Probe from the last node and decide all that is pending; then register nodes near each other."""
         last, out = len(self.atlas) - 1, []
         if last >= 0 and self.atlas.travel_m[last] - self._last_probe_m > LAST_PROBE_M:
             out = self._probe(last, belief)
         settled = self._commitment.flush(belief)
-        out += self.whole_map.finish() + [s.proposed() for s in settled]
+        out += self.localisation.finish() + [s.proposed() for s in settled]
         if any(s.accepted for s in settled):
             return out
-        near = self._reviser.round(belief, self.whole_map.since)
+        near = self._reviser.round(belief, self.localisation.since)
         return out + [hypothesis.proposed(self._next_key()) for hypothesis in near]
 
-    def verify(self, doubted: Sequence[Edge], belief: Belief) -> list[Edge]:
-        """Register again, from where they lie on the map, nodes whose loop a back-end holds for false."""
+    def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
+        """Register again, from the map's poses, the nodes of loops that a back-end gave no weight."""
         poses = belief.poses_map_node
-        return [self._reviser.register(d.source, d.target, poses, Search.AGAIN).proposed(d.key) for d in doubted]
+        return [self._reviser.register(edge.source, edge.target, poses, Search.AGAIN).proposed(edge.key) for edge in outliers]
 
-    def retrace(self, belief: Belief) -> Anchors:
+    def dense_trajectory(self, belief: Belief) -> Anchors:
         """Register every scan to the final map."""
         scans = [s for s in self._scans if s.node >= 0] if self._config.dense_trajectory else []
-        return self._retracer.retrace(scans, np.array(self._steps), belief.poses_map_node)
+        return self._dense_trajectory.dense_trajectory(scans, np.array(self._steps), belief.poses_map_node)
 
     @property
     def lost_since(self) -> int | None:
         """As `vision.base.FrontEnd`."""
-        return self.whole_map.lost_since
+        return self.localisation.lost_since
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
         """Profile and ranges of a node's scan."""

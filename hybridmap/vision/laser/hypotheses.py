@@ -27,49 +27,49 @@ from hybridmap.vision.laser.scan_matching import (
 from hybridmap.vision.laser.submap import Atlas, Field, Submap, violation_both_ways
 
 LENGTH_M = 10.0
-"""Travel that a probe covers, m: long enough that a corner or a door is in it."""
+"""Travel that a probe covers, m: long enough to contain a corner or a door."""
 TARGET_EVERY_M, TARGET_HALF_M = 4.0, 6.0
 """Travel between the anchors of old submaps, and that a submap covers to either side, m: a probe fits wholly into one."""
 POINTS = 120
 """Points of a probe that score the starts."""
 GATE_INFLATION = 4.0
-"""Factor on the deviations of the gate: a chain bends more than the covariances of its edges, taken as independent, have it."""
+"""Factor on the deviations of the gate: the errors of the chain's edges are not independent, as their covariances assume."""
 GATE_M, GATE_DEG = 2.5, 4.0
-"""Width of the gate beside that, m and degrees: submaps see as far."""
+"""Constant part of the gate's width, m and degrees."""
 WINDOW_M = 3.5
-"""A target is searched this far about its anchor; the next anchors take over beyond it, m."""
+"""A target is searched this far about its anchor, m; beyond that, other targets are nearer."""
 TARGETS = 16
-"""Old submaps that are searched more closely, the likeliest."""
+"""Most old submaps that are searched more closely, the best first."""
 MODES_PER_TARGET, MODES, MODES_SURE, MODES_ANYWHERE = 2, 6, 3, 8
 """Separated modes that are verified: of a target; of a probe; of one in narrow gates, where one place is in question; of one
-that is held against the whole map."""
+on the whole map."""
 SURE_SIGMA_M = 0.8
 """A gate is narrow below this standard deviation, m: rooms are farther apart."""
 FLOOR_M, FLOOR_DEG = 0.004, 0.04
-"""Standard deviations of the registration of two submaps at least, m and degrees: what their bending hides."""
+"""Least standard deviations of the registration of two submaps, m and degrees: submaps bend."""
 REGISTERED_POINTS = 400
 """Points of a probe that are registered."""
 UNKNOWN = 1e8
 """Stands for an infinite standard deviation, m."""
 SAME_M, SAME_RAD = 0.3, 0.1
-"""Hypotheses of one anchor that lie so near to each other are one."""
+"""Hypotheses of one anchor nearer to each other than this are one, m and rad."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """A place where the robot may have been before, measured.
+    """A measured candidate of a loop closure.
 
     Attributes:
-        probe: node in whose frame the recent submap is given; the newer one.
-        anchor: node in whose frame the old submap is given.
+        probe: newer node, the frame of the recent submap.
+        anchor: older node, the frame of the old submap.
         relative: pose of the anchor in the frame of the probe.
         quality: near x fit.
-        sigma_m: standard deviation of the gate's position there.
+        sigma_m: standard deviation of the position in the gate.
         search: how the two submaps came to be compared.
-        checks: that the registration was held against, in their order; it is no hypothesis if one failed.
+        checks: of the registration, in their order; it is no hypothesis if one failed.
         figures: the further figures of the registration.
-        fits: whether the scans fit, be it at the right place or not.
-        misfit: share of the points that do not fit, and of those that are seen through.
+        fits: whether the scans fit.
+        misfit: share of points that do not fit, plus share in free space.
     """
 
     probe: int
@@ -85,11 +85,11 @@ class Hypothesis:
 
     @property
     def passed(self) -> bool:
-        """Whether it is a hypothesis."""
+        """Whether no check failed."""
         return passed(self.checks)
 
     def proposed(self, key: int, lack: Lack | None = None) -> Edge:
-        """The edge that it stands for, with what it lacks beside checks."""
+        """Its edge, with what it lacks beside checks."""
         return Edge.decided(
             self.probe,
             self.anchor,
@@ -144,7 +144,7 @@ class Prober:
         self._anchors: list[int] = []
 
     def probe(self, node: int, belief: Belief, since: int = 0) -> list[Hypothesis]:
-        """Search the old submaps inside the gate for the last metres before a node; those that fail a check among them.
+        """Register the last metres before a node to the old submaps inside the gate; failed ones are returned too.
 
         Args:
             node: the newest node of the probe.
@@ -162,13 +162,13 @@ class Prober:
         return _distinct([self._verify(mode, probe, Search.GATE) for mode in modes[: MODES_SURE if sure else MODES]])
 
     def probe_anywhere(self, probe: Submap, anchors: Sequence[int]) -> list[Hypothesis]:
-        """Hold a submap against those about some anchors, wherever the map has it and whatever its heading."""
+        """Register a submap to those about some anchors, from any pose."""
         gates = [_Gate(anchor, IDENTITY, UNKNOWN, np.pi, UNKNOWN) for anchor in anchors]
         modes = self._search(gates, probe)[:MODES_ANYWHERE]
         return _distinct([self._verify(mode, probe, Search.WHOLE_MAP) for mode in modes])
 
     def anchors_before(self, node: int) -> list[int]:
-        """Anchors of old submaps that lie wholly before a node."""
+        """Anchors of submaps wholly before a node."""
         self._extend_anchors()
         atlas, half_m = self._atlas, TARGET_HALF_M
         limit = atlas.travel_m[node] - half_m
@@ -192,7 +192,7 @@ class Prober:
             self._anchors.append(after)
 
     def _gates(self, center: int, oldest: int, since: int, belief: Belief) -> list[_Gate]:
-        """Targets that lie wholly before the probe and inside the gate; the gate follows the covariance and has no cap."""
+        """Targets wholly before the probe and inside the gate, which follows the covariance without a cap."""
         anchors = [a for a in self.anchors_before(oldest) if a >= since]
         if not anchors:
             return []
@@ -208,7 +208,7 @@ class Prober:
         ]
 
     def _candidate(self, gate: _Gate, probe: Submap) -> _Candidate:
-        """The best starts on the part of the gate that this target answers for."""
+        """The best starts in the part of the gate about one target."""
         target = self._atlas.around(gate.anchor, TARGET_HALF_M)
         offsets = square(WINDOW_M, 2.0 * STEP_M)
         inside = (np.hypot(offsets[:, 0], offsets[:, 1]) <= WINDOW_M) & (
@@ -253,7 +253,7 @@ class Prober:
 
 
 def _distinct(found: list[Hypothesis]) -> list[Hypothesis]:
-    """Of hypotheses of one anchor that ran to the same pose, the first."""
+    """The first of hypotheses of one anchor at the same pose."""
     out: list[Hypothesis] = []
     for h in found:
         same = [o for o in out if o.anchor == h.anchor]

@@ -1,4 +1,4 @@
-"""Re-proposal: nodes that lie near each other on the optimised map are registered again, finely."""
+"""Re-proposal: nodes near each other on the optimised map are registered again, finely."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from hybridmap.vision.laser.scan_matching import Prior, align, ambiguity_of, sco
 from hybridmap.vision.laser.submap import Atlas, Field, violation_both_ways
 
 RADIUS_M = 2.5
-"""Nodes nearer than this are registered again, m: they see the same room."""
+"""Largest distance of nodes that are registered again, m: they see the same room."""
 EVERY_M = 1.0
 """Travel between two nodes that take part, m."""
 APART_M, PARTNERS = 12.0, 3
 """Travel between two passes, m, and most earlier passes that a node is registered to."""
 PROBE_HALF_M, TARGET_HALF_M = 1.5, 4.0
-"""Travel about the node whose scans are registered, and about the partner to whose scans, m: short, so that neither bends."""
+"""Half-lengths of the submaps about a node and about its partner, m: short, so that neither bends."""
 SEARCH_M, SEARCH_DEG = 0.45, 4.5
-"""Half-widths of the grid of starts, m and degrees: how far an optimised map still is off."""
+"""Half-widths of the grid of starts, m and degrees: the error of an optimised map."""
 GRID_M, GRID_DEG = 0.15, 1.5
 """Steps of that grid, m and degrees."""
 SCORED_POINTS, REGISTERED_POINTS = 100, 300
 """Points that score the starts, and that are registered."""
 PRIOR_M, PRIOR_RAD = 1.0, 0.2
-"""Standard deviations of the map as prior of the registration: it only holds what the walls leave free."""
+"""Standard deviations of the map as prior, m and rad: loose, for directions that the walls leave free."""
 AMBIGUOUS_M = 1.5
 """Standard deviation along a direction in which a registration is ambiguous, m."""
 FLOOR_M, FLOOR_DEG = 0.002, 0.025
@@ -48,11 +48,11 @@ class Reviser:
         self._done: set[tuple[int, int]] = set()
 
     def round(self, belief: Belief, since: int = 0) -> list[Hypothesis]:
-        """Register every pair that is due; empty once the configured rounds are over.
+        """Register every pair that is due; empty after the configured rounds.
 
         Args:
             belief: where the nodes lie.
-            since: how the map lies about this node and later ones with that about earlier ones is not known.
+            since: nodes from this one on are not registered to earlier ones.
         """
         if self._rounds >= self._most_rounds or len(self._atlas) == 0:
             return []
@@ -87,7 +87,7 @@ class Reviser:
         return [o for o in chosen[:PARTNERS] if (node, o) not in self._done]
 
     def register(self, node: int, other: int, poses: Array, search: Search = Search.NEAR) -> Hypothesis:
-        """Register the scans about a node to those about an older one, from where the poses (N, 3) have them; `search`: why."""
+        """Register the scans about a node to those about an older one, from poses (N, 3) on the map."""
         target, probe = self._atlas.around(other, TARGET_HALF_M), self._atlas.around(node, PROBE_HALF_M)
         sharp, fine = self._atlas.scoring_field(target, Field.SHARP), self._atlas.fine_field(target)
         expected = between(poses[other], poses[node])

@@ -19,7 +19,7 @@ SUBMAP_NODES = 25
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class SearchWindow:
     """A grid of starts about the odometry, and how sure the odometry is taken to be.
 
     Attributes:
@@ -33,11 +33,11 @@ class Window:
     prior_deg: float
 
 
-NARROW = Window(half_m=0.2, half_deg=8.0, prior_m=0.1, prior_deg=5.0)
+NARROW = SearchWindow(half_m=0.2, half_deg=8.0, prior_m=0.1, prior_deg=5.0)
 """First search: usual wheels over half a metre."""
-WIDE = Window(half_m=0.45, half_deg=40.0, prior_m=0.1, prior_deg=40.0)
+WIDE = SearchWindow(half_m=0.45, half_deg=40.0, prior_m=0.1, prior_deg=40.0)
 """Second search, when the first is weak or contradicts the odometry: drop-outs of wheels are mostly of heading."""
-LOST = Window(half_m=1.0, half_deg=60.0, prior_m=0.7, prior_deg=60.0)
+LOST = SearchWindow(half_m=1.0, half_deg=60.0, prior_m=0.7, prior_deg=60.0)
 """Last search, when the scans between the nodes did not help either."""
 INLIERS_SURE = 0.75
 """Least share of inliers at which a registration may contradict the odometry without further search."""
@@ -49,7 +49,7 @@ GRID_M, GRID_DEG = 0.1, 2.0
 """Steps of the grid of starts, m and degrees."""
 PULL = 0.05
 """What a start loses of its score at one standard deviation of the odometry's heading, or at two of its translation."""
-DOUBT_M, DOUBT_DEG = 0.05, 1.5
+WEAK_M, WEAK_DEG = 0.05, 1.5
 """Standard deviations that are added to a registration which is not good, m and degrees."""
 SCORED_POINTS = 90
 """Points that score the starts."""
@@ -63,7 +63,7 @@ class Step:
 
     Attributes:
         relative: pose of the new node in the frame of the one before; the odometry's where nothing was measured.
-        checks: that the registration was held against; the motion is the odometry's if one failed.
+        checks: of the registration; the motion is the odometry's if one failed.
         contradicts_odometry: a good registration says that the odometry is wrong.
         inliers, fit: of the registration.
         scatter: covariance (3, 3) of the new node's place in the submap.
@@ -98,10 +98,10 @@ class Tracker:
         """
         field = self._field()
         best = self._search(field, cloud, odometry.delta)
-        if self._doubtful(best, odometry.delta):
+        if self._is_weak(best, odometry.delta):
             stepped = self._step_by_step(field, cloud, odometry.delta, between_nodes())
             best = _better(best, stepped, 0.0)
-        if self._doubtful(best, odometry.delta):
+        if self._is_weak(best, odometry.delta):
             best = _better(best, self._grid(field, cloud, odometry.delta, LOST), LOST_GAIN)
         return self._judge(best, odometry)
 
@@ -109,11 +109,11 @@ class Tracker:
         """The next scan registered to one scan alone, from where the odometry (3,) has it."""
         field = self._field_of(cloud)
         best = self._search(field, following, odometry)
-        if self._doubtful(best, odometry):
+        if self._is_weak(best, odometry):
             best = _better(best, self._grid(field, following, odometry, LOST), LOST_GAIN)
         return best
 
-    def _doubtful(self, alignment: Alignment, expected: Array) -> bool:
+    def _is_weak(self, alignment: Alignment, expected: Array) -> bool:
         """Whether a registration is weak, or contradicts the odometry without being very good."""
         inliers = alignment.inliers[0]
         return bool(
@@ -138,7 +138,7 @@ class Tracker:
             return narrow
         return _better(narrow, self._grid(field, cloud, expected, WIDE), WIDE_GAIN)
 
-    def _grid(self, field: LikelihoodField, cloud: Cloud, expected: Array, window: Window) -> Alignment:
+    def _grid(self, field: LikelihoodField, cloud: Cloud, expected: Array, window: SearchWindow) -> Alignment:
         sigma_m, sigma_rad = window.prior_m, np.deg2rad(window.prior_deg)
         headings, offsets = np.deg2rad(spaced(window.half_deg, GRID_DEG)), square(window.half_m, GRID_M)
         scores = score_starts(field, cloud.thinned(SCORED_POINTS).points, expected[:2], expected[2] + headings, offsets)
@@ -174,8 +174,8 @@ class Tracker:
         if not passed(asked):
             return Step(odometry, asked, False, inliers, fit, odometry.covariance)
         covariance = alignment.covariance(0, FLOOR_M, np.deg2rad(FLOOR_DEG))
-        if self._doubtful(alignment, odometry.delta):
-            covariance = covariance + np.diag([DOUBT_M**2, DOUBT_M**2, np.deg2rad(DOUBT_DEG) ** 2])
+        if self._is_weak(alignment, odometry.delta):
+            covariance = covariance + np.diag([WEAK_M**2, WEAK_M**2, np.deg2rad(WEAK_DEG) ** 2])
         wrong = bool(inliers >= checks.INLIERS_MIN and self._contradicts(pose, odometry.delta))
         edge = self._atlas.joining(len(self._atlas) - 1, pose, covariance)
         return Step(edge, asked, wrong, inliers, fit, covariance)

@@ -1,4 +1,4 @@
-"""Loop closure: gate, candidates by profile, verification, and one supporting edge before anything enters the map."""
+"""Loop closure by camera: gate, candidates by profile, verification, support by a second edge."""
 
 from __future__ import annotations
 
@@ -15,47 +15,44 @@ from hybridmap.metrics import StageClock
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import Gate, nodes_within
 from hybridmap.vision.profile import Profile
-from hybridmap.vision.relocalising import Chain, Relocaliser, Sighting, Whereabouts
+from hybridmap.vision.relocalising import ChainState, GlobalMatch, Relocaliser, Whereabouts
 from hybridmap.vision.rgbd import checks
+from hybridmap.vision.rgbd.global_search import RANKED, GlobalSearch, chain_state
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp import Candidate, Verification, Verifier
-from hybridmap.vision.rgbd.revisits import MAP_SIGMA_DEG, MAP_SIGMA_M, Revisits
-from hybridmap.vision.rgbd.second_look import SecondLook
-from hybridmap.vision.rgbd.support import Hypothesis, Support
-from hybridmap.vision.rgbd.whole_map import RANKED, WholeMap, chain_of
+from hybridmap.vision.rgbd.revisits import MAP_SIGMA_DEG, MAP_SIGMA_M, Reverification, Revisits
+from hybridmap.vision.rgbd.support import MeasuredLoop, Support
 from hybridmap.vision.templates import MODERATE_THRESHOLD, Matcher
 
 Indices = NDArray[np.int64]
 GATE_PER_M, GATE_GROWTH_M = 0.1, 10.0
-"""Growth of the gate per metre travelled since the last closure, and its largest growth, m: wheels drift by less."""
+"""Growth of the gate per metre since the last closure, and its largest growth, m: wheels drift by less."""
 HEADING_DEG, HEADING_DEG_PER_M = 50.0, 0.3
-"""Headings may differ by this much, degrees, and more per metre since the last closure; beyond a camera's field of view
-nothing is seen in common."""
+"""Largest difference of headings, degrees, and its growth per metre since the last closure: within a camera's field of view."""
 ACCEPT, SEPARATION = 2, 2
-"""Edges that may enter for a node, and nodes that its candidates lie apart."""
+"""Most accepted edges of a node, and how many nodes its candidates are apart."""
 PENDING_NODES = 40
-"""A verified edge without support is given up after so many nodes."""
+"""A verified edge without support is rejected after so many nodes."""
 SHIFT_SIGMA_M, SHIFT_SIGMA_DEG = 0.7, 6.0
-"""Standard deviations of unverified edges, m and degrees: views that match were taken about so near to each other."""
+"""Standard deviations of unverified edges, m and degrees: about the distance between views that match."""
 REPROPOSE_M, REPROPOSE_PER_NODE, REPROPOSE_ONLINE = 2.0, 2, 1
-"""Nodes this near on the map are tried again, m; candidates for a node; and nodes that are tried with each new one, once a
-closure has moved them."""
+"""Re-proposal: nodes this near on the map are tried again, m; candidates a node; moved nodes tried with each new node."""
 SPAN_M = 0.75
-"""Travel that sightings of a lost robot must cover, m: three steps between nodes."""
-UNRECOGNISED_NODES, DOUBT_NODES = 16, 40
-"""Nodes in a row at places that the map knows, none of them recognised, after which the robot is lost; and nodes after which
-a doubt is forgotten."""
+"""Travel that agreeing matches of a lost robot must cover, m: three steps between nodes."""
+UNRECOGNISED_NODES, UNCERTAIN_NODES = 16, 40
+"""Nodes in a row at known places, none recognised, after which the robot is lost; nodes after which an uncertain link of the
+chain is taken to hold."""
 KNOWN_M, KNOWN_RAD = 0.7, float(np.deg2rad(20.0))
-"""A node this near to an old one, looking the same way, is at a place that the map knows."""
+"""A node this near to an old one, with a similar heading, is at a known place."""
 SURE = 4.0
-"""While driving, depth alone is trusted only where the map's own uncertainty is below this many times `MAP_SIGMA_M`."""
+"""While driving, depth alone is trusted where the map's standard deviation is below so many times `MAP_SIGMA_M`."""
 
 
 class LoopCloser:
     """Finds loops for one camera. The newer node is the source of an edge.
 
     Attributes:
-        support: the loops that were found, with how many others agree with each.
+        support: the measured loops, and which of them agree.
     """
 
     def __init__(
@@ -79,9 +76,9 @@ class LoopCloser:
         self._matcher = Matcher(
             rgbd.matching, matching.mu_r, matching.mu_d, config.profile.max_shift, matching.g_bar, matching.sequence
         )
-        whereabouts = Whereabouts(UNRECOGNISED_NODES if self._may_be_lost else 0, DOUBT_NODES)
+        whereabouts = Whereabouts(UNRECOGNISED_NODES if self._may_be_lost else 0, UNCERTAIN_NODES)
         self._relocaliser = Relocaliser(whereabouts, new_key, SPAN_M)
-        self._whole_map = WholeMap(keyframes, self._matcher, verifier, new_key)
+        self._global_search = GlobalSearch(keyframes, self._matcher, verifier, new_key)
         self._c_t = matching.c_t if matching.c_t is not None or not self._unverified else MODERATE_THRESHOLD[rgbd.matching]
         self.support = Support()
         self._revisits = Revisits()
@@ -89,7 +86,7 @@ class LoopCloser:
         self._travel_at_closure = 0.0
         self._noted, self._gate_of_newest, self._ranking = -1, Gate(0.0, 0.0, 0, 0), np.zeros((0, 3))
         self._map_covariance = np.diag([MAP_SIGMA_M, MAP_SIGMA_M, np.deg2rad(MAP_SIGMA_DEG)]) ** 2
-        self._second_look = SecondLook(keyframes, verifier, self._map_covariance)
+        self._reverification = Reverification(keyframes, verifier, self._map_covariance)
         self._rounds_left = config.closing.revisit_rounds
 
     def add_node(self, profile: Profile) -> None:
@@ -97,7 +94,7 @@ class LoopCloser:
         self._matcher.add(profile)
 
     def close(self, node: int, belief: Belief) -> list[Edge]:
-        """Look for loops of one node, and settle what was pending."""
+        """Look for loops of one node, and decide what was pending."""
         since_m = self._travel_at_closure
         gated = self._gate(node, belief)
         changed = self._try_candidates(node, self._ranked(node, gated), belief) if len(gated) else []
@@ -114,7 +111,7 @@ class LoopCloser:
         return [*changed, *self.support.give_up(before=node - PENDING_NODES)]
 
     def _catch_up(self, belief: Belief) -> list[Edge]:
-        """Try a few of the nodes again that a closure has moved."""
+        """Try a few nodes again that a closure has moved."""
         out: list[Edge] = []
         for _ in range(REPROPOSE_ONLINE):
             node = self._revisits.next_moved(belief)
@@ -126,8 +123,8 @@ class LoopCloser:
         return out
 
     def tracked(self, node: int, steps: list[Edge]) -> None:
-        """Take notice of how a new node was registered to the ones before it."""
-        self._relocaliser.tracked(node, chain_of(steps) if self._may_be_lost else Chain.HOLDS, steps)
+        """Note how a new node was registered to the ones before it."""
+        self._relocaliser.tracked(node, chain_state(steps) if self._may_be_lost else ChainState.HOLDS, steps)
 
     @property
     def lost_since(self) -> int | None:
@@ -141,7 +138,7 @@ class LoopCloser:
         return {"gate": self._gate_of_newest.to_array(), "ranked": self._ranking}
 
     def _relocalise(self, node: int, gated: Indices, changed: list[Edge], belief: Belief) -> list[Edge]:
-        """Keep account of whether the robot knows where it is; while it does not, look for it on the whole map."""
+        """Note whether the node was recognised; search the whole map while the robot is lost."""
         whereabouts = self._relocaliser.whereabouts
         if any(p.status is Status.ACCEPTED for p in changed):
             whereabouts.recognised()
@@ -152,16 +149,16 @@ class LoopCloser:
             return []
         self._gate_of_newest = replace(self._gate_of_newest, whole_map=True)
         old = np.flatnonzero(belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s)
-        seen = self._whole_map.search(node, np.setdiff1d(old, gated).astype(np.int64))
-        found = self._relocaliser.settle([Sighting(edge) for edge in seen], belief)
-        if found.friends:
-            for sighting in found.friends:
-                self.support.join(sighting.source, sighting.target)
+        seen = self._global_search.search(node, np.setdiff1d(old, gated).astype(np.int64))
+        found = self._relocaliser.settle([GlobalMatch(edge) for edge in seen], belief)
+        if found.accepted:
+            for edge in found.accepted:
+                self.support.join(edge.source, edge.target)
             self._travel_at_closure = float(belief.travel_m[node])
         return found.proposals
 
     def finish(self, belief: Belief) -> list[Edge]:
-        """Try pairs that the optimised map puts side by side and that are not joined yet; then settle everything."""
+        """Re-propose pairs that are near each other on the optimised map; then decide all that is pending."""
         out: list[Edge] = []
         if self._rounds_left > 0 and not self._unverified:
             self._rounds_left -= 1
@@ -174,24 +171,24 @@ class LoopCloser:
         out += self._relocaliser.dismiss()
         return [*out, *self.support.give_up(before=len(self._keyframes))]
 
-    def verify(self, doubted: Sequence[Edge], belief: Belief) -> list[Edge]:
-        """Measure doubted loops again; `belief` is that of the map without them."""
+    def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
+        """Measure outliers again; `belief` is that of the map without them."""
         if self._unverified:
             return []
         out = []
-        for d in doubted:
-            found = self._second_look.measure(d, belief)
-            out.append(found.proposed(d.source, d.target, d.key, Candidate(Search.AGAIN)))
+        for edge in outliers:
+            found = self._reverification.measure(edge, belief)
+            out.append(found.proposed(edge.source, edge.target, edge.key, Candidate(Search.AGAIN)))
             self.support.replace(out[-1])
         return out
 
     def _is_sure(self, node: int, target: int, belief: Belief) -> bool:
-        """The map knows well enough where a node lies to be a guess for depth alone."""
+        """Whether the map knows a relative pose well enough to start a registration of depth alone."""
         sigma = np.sqrt(np.diag(belief.covariance_from(node)[target]))
         return bool(np.all(sigma <= SURE * np.sqrt(np.diag(self._map_covariance))))
 
     def _gate(self, node: int, belief: Belief) -> Indices:
-        """Nodes old enough, within reach of the drift since the last closure, and looking the same way."""
+        """Nodes that are old enough, within the drift since the last closure, and of similar heading."""
         since = float(belief.travel_m[node]) - self._travel_at_closure
         growth = GATE_PER_M * since
         radius = self._closing.gate_m + min(growth, GATE_GROWTH_M)
@@ -211,7 +208,7 @@ class LoopCloser:
         return np.flatnonzero(inside).astype(np.int64)
 
     def _ranked(self, node: int, gated: Indices) -> dict[int, Candidate]:
-        """The best candidates by profile, some nodes apart, with their figures."""
+        """The best candidates by profile, some nodes apart."""
         ranked = RANKED * self._closing.candidates
         with self._clock.stage("search"):
             match = self._matcher.best(self._keyframes[node].profile, ranked, gated, ending_at=node)
@@ -228,7 +225,7 @@ class LoopCloser:
         return chosen
 
     def _try_candidates(self, node: int, ranked: dict[int, Candidate], belief: Belief) -> list[Edge]:
-        """Measure each candidate, the best first, until enough have entered."""
+        """Verify each candidate, the best first, until enough are accepted."""
         if self._unverified:
             return self._accept_unverified(node, ranked, belief)
         out: list[Edge] = []
@@ -244,7 +241,7 @@ class LoopCloser:
         return out
 
     def _try_again(self, node: int, near: dict[int, Candidate], belief: Belief, by_depth: Collection[int]) -> list[Edge]:
-        """Measure pairs that the map puts side by side: by features if that was not tried, else some by depth."""
+        """Verify pairs that are near each other on the map: by features once; else, where allowed, by depth."""
         out: list[Edge] = []
         for target, candidate in near.items():
             found: Verification | None = None
@@ -259,17 +256,17 @@ class LoopCloser:
         return out
 
     def _file(self, node: int, target: int, candidate: Candidate, found: Verification, belief: Belief) -> list[Edge]:
-        """Turn a verification into proposals: its own first, then those that it supports."""
+        """Turn a verification into edges: its own first, then those that it supports."""
         waiting = found.proposed(node, target, self._new_key(), candidate, Lack.WAITING)
         if found.relative is None:
             return [waiting]
-        changed = self.support.file(Hypothesis(waiting, found.relative), belief)
+        changed = self.support.file(MeasuredLoop(waiting, found.relative), belief)
         if changed[0].status is Status.ACCEPTED:
             self._travel_at_closure = max(self._travel_at_closure, float(belief.travel_m[node]))
         return changed
 
     def _nearest(self, node: int, most: int, belief: Belief) -> dict[int, Candidate]:
-        """Earlier nodes that see the same place from nearly the same pose and are not joined to this one yet, nearest first."""
+        """Earlier nodes of nearly the same pose without an edge to this one, nearest first."""
         poses = belief.poses_map_node
         gap = np.hypot(*(poses[:node, :2] - poses[node, :2]).T)
         turned = np.abs(wrap_angle(poses[:node, 2] - poses[node, 2]))
@@ -288,7 +285,7 @@ class LoopCloser:
         return chosen
 
     def _accept_unverified(self, node: int, ranked: dict[int, Candidate], belief: Belief) -> list[Edge]:
-        """The seed's way: the best match is a closure; its shift gives the yaw, and nothing gives the translation."""
+        """As in the paper: the best match is a closure; its shift gives the yaw, the translation is 0."""
         for target, candidate in ranked.items():
             delta = np.array([0.0, 0.0, self._yaw_of_shift(candidate.shift)])
             sigma = np.array([SHIFT_SIGMA_M] * 2 + [np.deg2rad(SHIFT_SIGMA_DEG)])

@@ -44,12 +44,12 @@ class RgbdFrontEnd:
         config: settings of the visual side.
         camera: pinhole and mounting of the frames.
         seed: for RANSAC.
-        clock: is given the stage `search`; what else closing takes is verification.
+        clock: gets the stage `search`.
 
     Attributes:
         keyframes: of the nodes, in their order.
-        verifier: measures how two keyframes lie to each other.
-        closer: finds loops, and keeps those that wait for others.
+        verifier: measures the relative pose of two keyframes.
+        closer: finds loops.
     """
 
     def __init__(self, config: VisionConfig, camera: Camera, seed: int, clock: StageClock | None = None) -> None:
@@ -121,12 +121,12 @@ class RgbdFrontEnd:
         return self.closer.close(node, belief)
 
     def finish(self, belief: Belief) -> list[Edge]:
-        """Re-propose on the optimised map; settle what is pending."""
+        """Re-propose on the optimised map; decide what is pending."""
         return self.closer.finish(belief)
 
-    def verify(self, doubted: Sequence[Edge], belief: Belief) -> list[Edge]:
-        """Measure again, from where their nodes lie on the map, loops that a back-end holds for false."""
-        return self.closer.verify(doubted, belief)
+    def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
+        """Measure again, from the map's poses, loops that a back-end gave no weight."""
+        return self.closer.verify(outliers, belief)
 
     @property
     def lost_since(self) -> int | None:

@@ -13,7 +13,7 @@ from hybridmap.geometry import Array
 from hybridmap.vision.rgbd.depth_grid import DepthGrid
 from hybridmap.vision.rgbd.features import Features, match
 from hybridmap.vision.rgbd.keyframe import Keyframe
-from hybridmap.vision.rgbd.pnp_solver import PnpSolver
+from hybridmap.vision.rgbd.pnp import PnpSolver
 from hybridmap.vision.rgbd.stance import Stance, camera_on, inverse_rigid, rotation_of
 
 ON_FLOOR_M = (0.05, 0.03, 0.03)
@@ -37,8 +37,8 @@ TRUSTED_FLOORS, RELAXED_EVERY = 20, 5
 MIN_FLOOR_CELLS = 40
 MOUNTED = (float(np.deg2rad(0.2)), 0.004)
 ON_FLOOR = (float(np.deg2rad(0.5)), 0.02)
-CARRIED = (float(np.deg2rad(3.0)), 0.06)
-"""Standard deviations of tilt (rad) and height (m): as mounted on a robot, measured on the floor, carried over."""
+PROPAGATED = (float(np.deg2rad(3.0)), 0.06)
+"""Standard deviations of tilt (rad) and height (m): as mounted on a robot, measured on the floor, propagated."""
 NODS_DEG = (0.0, 8.0, -8.0, 16.0, -16.0, 24.0, -24.0, 32.0, -32.0)
 """Where the features do not tell, the head may have nodded by one of these."""
 MIN_FOLLOWED = 15
@@ -70,7 +70,7 @@ class Posture:
         if not self._held:
             return self._as_mounted
         if found is None:
-            return Stance(self._carried(grid, features, last), *CARRIED, True)
+            return Stance(self._propagated(grid, features, last), *PROPAGATED, True)
         return Stance(found, *ON_FLOOR, True)
 
     def _looks(self) -> bool:
@@ -97,7 +97,7 @@ class Posture:
         tilted = np.arccos(np.clip(cosine, -1.0, 1.0)) > AGREE_TILT_RAD
         return bool(tilted or abs(T_base_camera[2, 3] - self._mounting[2, 3]) > AGREE_HEIGHT_M)
 
-    def _carried(self, grid: DepthGrid, features: Features, last: Keyframe | None) -> Array:
+    def _propagated(self, grid: DepthGrid, features: Features, last: Keyframe | None) -> Array:
         """No floor in view: the last posture, turned by what the features say, then set upright by walls and tables."""
         before = self._mounting if last is None else last.surface.stance.T_base_camera
         followed = None if last is None else self._followed(last, features)

@@ -1,18 +1,25 @@
-"""Which earlier nodes are worth another look while driving, because a closure has moved them."""
+"""Loops that are measured once more: where a closure has moved nodes, and where a back-end gives a loop no weight."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
-from hybridmap.geometry import Array, wrap_angle
+from hybridmap.geometry import Array, RelativePose, between, log, wrap_angle
+from hybridmap.graph.edges import Edge, passed
 from hybridmap.vision.base import Belief
+from hybridmap.vision.rgbd import checks
+from hybridmap.vision.rgbd.keyframe import Keyframe
+from hybridmap.vision.rgbd.pnp import Verification, Verifier
 
 MAP_SIGMA_M, MAP_SIGMA_DEG = 0.15, 3.0
 """How far an optimised map may be off between nodes that lie side by side (one standard deviation), m and degrees."""
 
 
 class Revisits:
-    """The nodes between one closure and the next: where that moved them, what was out of reach may lie near them now."""
+    """The nodes between two closures. Those that the later one moved may now lie near old nodes."""
 
     def __init__(self) -> None:
         self._waiting: list[tuple[int, Array]] = []
@@ -23,7 +30,7 @@ class Revisits:
         self._waiting += [(int(n), belief.poses_map_node[n].copy()) for n in behind]
 
     def next_moved(self, belief: Belief) -> int | None:
-        """Take the newest of the nodes that lie elsewhere now; None if there is none left."""
+        """Take the newest node that has moved; None if there is none left."""
         while self._waiting:
             node, before = self._waiting.pop()
             now = belief.poses_map_node[node]
@@ -31,3 +38,43 @@ class Revisits:
             if moved_m > MAP_SIGMA_M or turned > np.deg2rad(MAP_SIGMA_DEG):
                 return node
         return None
+
+
+class Reverification:
+    """Measures loops again that a back-end holds for outliers.
+
+    If the views fit at the map's pose, the loop takes the new measurement. If they fit at another pose only, it stays where
+    the covariance of the map without outliers allows that pose, and is retracted where not, or where the views do not fit.
+    """
+
+    def __init__(self, keyframes: Sequence[Keyframe], verifier: Verifier, map_covariance: Array) -> None:
+        """`map_covariance` (3, 3): how far the map may be off between nodes that lie side by side, m and rad."""
+        self._keyframes = keyframes
+        self._verifier = verifier
+        self._map_covariance = map_covariance
+
+    def measure(self, outlier: Edge, belief: Belief) -> Verification:
+        """Measure one loop again; `belief` is that of the map without outliers."""
+        source, target = self._keyframes[outlier.source], self._keyframes[outlier.target]
+        on_map = between(belief.poses_map_node[outlier.source], belief.poses_map_node[outlier.target])
+        there = self._verifier.verify_near(source, target, RelativePose(on_map, self._map_covariance))
+        if there.relative is not None:
+            return there
+        elsewhere = self._verifier.verify(source, target)
+        if elsewhere.relative is None:
+            figures = {**there.figures, **elsewhere.figures}
+            return replace(elsewhere, checks=there.checks + elsewhere.checks, lack=there.lack, figures=figures)
+        spread = belief.covariance_from(outlier.source)[outlier.target] + self._map_covariance
+        return _weighed(elsewhere, elsewhere.relative, on_map, spread)
+
+
+def _weighed(found: Verification, relative: RelativePose, on_map: Array, spread: Array) -> Verification:
+    """A measurement tested against the covariance `spread` (3, 3) of the map, infinite where that is unknown."""
+    error = log(between(on_map, relative.delta))
+    off_m, off_deg = float(np.hypot(error[0], error[1])), float(np.rad2deg(abs(error[2])))
+    squared = 0.0
+    if np.isfinite(spread).all():
+        squared = float(error @ np.linalg.solve(spread + relative.covariance, error))
+    asked = found.checks + checks.of_map(float(np.sqrt(squared)))
+    figures = {**found.figures, "off_m": off_m, "off_deg": off_deg}
+    return replace(found, relative=relative if passed(asked) else None, checks=asked, figures=figures)

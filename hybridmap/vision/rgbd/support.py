@@ -1,4 +1,4 @@
-"""Measured loops wait until another one agrees with them; nothing enters the map alone."""
+"""Measured loops wait until another one agrees; none enters the map alone."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from hybridmap.vision.base import Belief
 from hybridmap.vision.rgbd import checks
 
 SUPPORT_NODES = 12
-"""Loops support each other from nodes no farther apart than this to nodes no farther apart, by number."""
+"""Loops support each other if their sources, and their targets, are at most so many nodes apart."""
 
 
 @dataclass(slots=True)
-class Hypothesis:
+class MeasuredLoop:
     """A measured edge, waiting for support or accepted.
 
     Attributes:
-        proposal: as it stands.
+        proposal: the edge, with its present status.
         relative: what was measured.
     """
 
@@ -41,27 +41,27 @@ class Hypothesis:
 
 
 class Support:
-    """Keeps hypotheses by their source and lets those enter that agree with each other."""
+    """Keeps measured loops by their source; accepts those that agree with each other."""
 
     def __init__(self) -> None:
-        self._of_source: defaultdict[int, list[Hypothesis]] = defaultdict(list)
-        self._pending: list[Hypothesis] = []
+        self._of_source: defaultdict[int, list[MeasuredLoop]] = defaultdict(list)
+        self._pending: list[MeasuredLoop] = []
         self._filed: set[tuple[int, int]] = set()
 
     def has(self, source: int, target: int) -> bool:
-        """The two nodes are joined, or wait to be."""
+        """Whether the two nodes have an edge, accepted or pending."""
         return (source, target) in self._filed
 
     def join(self, source: int, target: int) -> None:
-        """The two nodes were joined in another way."""
+        """Note that the two nodes have an edge from elsewhere."""
         self._filed.add((source, target))
 
     def accepted(self, source: int) -> int:
-        """How many edges of a node have entered."""
+        """How many edges of a node are accepted."""
         return sum(h.proposal.status is Status.ACCEPTED for h in self._of_source.get(source, ()))
 
-    def file(self, new: Hypothesis, belief: Belief) -> list[Edge]:
-        """Take in a hypothesis; accept it and what it supports if another one agrees. Its own proposal comes first."""
+    def file(self, new: MeasuredLoop, belief: Belief) -> list[Edge]:
+        """Add a loop. If another one agrees, accept it and those that it supports. Its own edge comes first."""
         near = [h for h in self._beside(new) if h.proposal.status in (Status.PENDING, Status.ACCEPTED)]
         loops = Loops.measured([(h.source, h.target, h.relative) for h in (new, *near)])
         agreeing = [near[i] for i in np.flatnonzero(agrees(loops, 0, np.arange(1, len(near) + 1), belief.ways)).tolist()]
@@ -78,15 +78,15 @@ class Support:
         return [h.proposal for h in changed]
 
     def replace(self, proposal: Edge) -> None:
-        """A loop was measured again: from now on it supports others as it is now, or no longer."""
+        """Replace a loop that was measured again."""
         of_source = self._of_source[proposal.source]
         kept = [h for h in of_source if h.proposal.key != proposal.key]
         if proposal.relative is not None and len(kept) < len(of_source):
-            kept.append(Hypothesis(proposal, proposal.relative))
+            kept.append(MeasuredLoop(proposal, proposal.relative))
         self._of_source[proposal.source] = kept
 
     def give_up(self, before: int) -> list[Edge]:
-        """Reject what nodes before one have waited for too long."""
+        """Reject the pending loops of nodes before `before`."""
         self._pending = [h for h in self._pending if h.proposal.status is Status.PENDING]
         late = [h for h in self._pending if h.source < before]
         for h in late:
@@ -94,8 +94,8 @@ class Support:
             h.proposal = h.proposal.settled(lack=Lack.UNSUPPORTED)
         return [h.proposal for h in late]
 
-    def _beside(self, new: Hypothesis) -> list[Hypothesis]:
-        """Edges from other nodes near its source, to nodes near its target."""
+    def _beside(self, new: MeasuredLoop) -> list[MeasuredLoop]:
+        """Loops from other nodes near its source to nodes near its target."""
         reach = SUPPORT_NODES
         sources = (source for source in range(new.source - reach, new.source + reach + 1) if source != new.source)
         return [h for source in sources for h in self._of_source.get(source, ()) if abs(h.target - new.target) <= reach]

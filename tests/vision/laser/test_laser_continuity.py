@@ -129,13 +129,13 @@ def sightings(onward):
 @pytest.mark.parametrize("onward", [10, 40, 66])
 def test_where_nothing_showed_the_carry_the_old_map_tells_when_it_was(onward):
     chain = carried(onward)
-    assert chain.continuity.carried_unnoticed(sightings(onward), chain.belief()) == DOWN
+    assert chain.continuity.kidnapped_unnoticed(sightings(onward), chain.belief()) == DOWN
 
 
 def test_a_chain_that_may_have_drifted_so_far_was_not_carried():
     chain = carried(10)
-    assert chain.continuity.carried_unnoticed(sightings(10), chain.belief(sigma_m=0.5)) is None
+    assert chain.continuity.kidnapped_unnoticed(sightings(10), chain.belief(sigma_m=0.5)) is None
 
 
 def test_a_chain_that_fits_the_map_as_it_is_was_not_carried(driven):
-    assert driven.continuity.carried_unnoticed(sightings(40), driven.belief()) is None
+    assert driven.continuity.kidnapped_unnoticed(sightings(40), driven.belief()) is None

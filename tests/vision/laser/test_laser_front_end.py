@@ -11,7 +11,7 @@ from hybridmap.geometry import IDENTITY, between, compose, log
 from hybridmap.graph.edges import EdgeKind, Search, Status
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
-from hybridmap.vision.base import RetracingFrontEnd, VerifyingFrontEnd
+from hybridmap.vision.base import DenseFrontEnd, VerifyingFrontEnd
 from hybridmap.vision.laser.front_end import LaserFrontEnd
 from tests.vision.laser.laser_worlds import LASER, Run, cast, corridor, drifting, ring, ring_drive, room
 
@@ -91,8 +91,8 @@ def test_a_doubted_loop_is_measured_again_and_one_of_two_places_is_not_found(two
     final = between(two_laps.truth[0], two_laps.truth[two_laps.node_at])
     loop = two_laps.loops(Status.ACCEPTED)[0]
     other_side = int(np.argmax(np.hypot(*(final[: loop.source, :2] - final[loop.source, :2]).T)))
-    doubted = [loop, dataclasses.replace(loop, target=other_side, key=4711)]
-    found, lost = two_laps.front_end.verify(doubted, two_laps.belief(final))
+    outliers = [loop, dataclasses.replace(loop, target=other_side, key=4711)]
+    found, lost = two_laps.front_end.verify(outliers, two_laps.belief(final))
     assert (found.key, found.source, found.target, found.status) == (loop.key, loop.source, loop.target, Status.ACCEPTED)
     assert np.hypot(*two_laps.error(found)[:2]) < 0.05
     assert (lost.key, lost.status) == (4711, Status.REJECTED)
@@ -100,9 +100,9 @@ def test_a_doubted_loop_is_measured_again_and_one_of_two_places_is_not_found(two
 
 def test_scans_between_nodes_are_put_right_on_the_final_map(two_laps):
     final = between(two_laps.truth[0], two_laps.truth[two_laps.node_at])
-    assert isinstance(two_laps.front_end, RetracingFrontEnd)
+    assert isinstance(two_laps.front_end, DenseFrontEnd)
     assert isinstance(two_laps.front_end, VerifyingFrontEnd)
-    retraced = two_laps.front_end.retrace(two_laps.belief(final))
+    retraced = two_laps.front_end.dense_trajectory(two_laps.belief(final))
     assert len(retraced.nodes) > 0.95 * len(two_laps.truth)
     assert (np.diff(retraced.stamps_ns) > 0).all()
     index = (retraced.stamps_ns - 1_000_000_000) // 100_000_000

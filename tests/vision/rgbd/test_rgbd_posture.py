@@ -4,7 +4,7 @@ import pytest
 from hybridmap.streams.rgbd import Camera
 from hybridmap.vision.rgbd.depth_grid import make_grid
 from hybridmap.vision.rgbd.features import detect
-from hybridmap.vision.rgbd.pnp_solver import PnpSolver
+from hybridmap.vision.rgbd.pnp import PnpSolver
 from hybridmap.vision.rgbd.posture import Posture, find_floor, vertical_of_structure
 from tests.vision.rgbd.rgbd_room import camera, render
 

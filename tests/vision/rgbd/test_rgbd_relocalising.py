@@ -14,10 +14,10 @@ from hybridmap.geometry import RelativePose, align, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import Rig
-from hybridmap.vision.relocalising import Chain
+from hybridmap.vision.relocalising import ChainState
 from hybridmap.vision.rgbd import checks, whole_map
+from hybridmap.vision.rgbd.global_search import GlobalSearch, chain_state
 from hybridmap.vision.rgbd.pnp import Verification, Verifier
-from hybridmap.vision.rgbd.whole_map import WholeMap, chain_of
 from hybridmap.vision.templates import Matcher
 from tests.narrowing import known
 from tests.vision.rgbd.rgbd_room import camera, render
@@ -141,7 +141,7 @@ def test_the_likeliest_views_some_nodes_apart_are_verified(monkeypatch):
         matcher.add(profile)
     verifier = FakeVerifier({(30, 12): (0.1, 0.0, 0.0)})
     monkeypatch.setattr(whole_map, "CANDIDATES", 3)
-    found = WholeMap(keyframes, matcher, verifier, iter(range(99)).__next__).search(30, np.arange(25))
+    found = GlobalSearch(keyframes, matcher, verifier, iter(range(99)).__next__).search(30, np.arange(25))
     assert len(found) == 3
     assert (found[0].target, found[0].status) == (12, Status.PENDING)
     assert (found[0].search, found[0].lack) == (Search.WHOLE_MAP, Lack.WAITING)
@@ -157,12 +157,12 @@ def step(status, sigma_m=0.01):
 @pytest.mark.parametrize(
     ("steps", "chain"),
     [
-        ([], Chain.HOLDS),
-        ([step(Status.REJECTED), step(Status.REJECTED)], Chain.BROKEN),
-        ([step(Status.REJECTED), step(Status.ACCEPTED)], Chain.HOLDS),
-        ([step(Status.ACCEPTED, 0.3), step(Status.ACCEPTED, 0.4)], Chain.DOUBTFUL),
-        ([step(Status.ACCEPTED, 0.3), step(Status.ACCEPTED, 0.02)], Chain.HOLDS),
+        ([], ChainState.HOLDS),
+        ([step(Status.REJECTED), step(Status.REJECTED)], ChainState.BROKEN),
+        ([step(Status.REJECTED), step(Status.ACCEPTED)], ChainState.HOLDS),
+        ([step(Status.ACCEPTED, 0.3), step(Status.ACCEPTED, 0.4)], ChainState.UNCERTAIN),
+        ([step(Status.ACCEPTED, 0.3), step(Status.ACCEPTED, 0.02)], ChainState.HOLDS),
     ],
 )
 def test_one_wall_fits_any_other(steps, chain):
-    assert chain_of(steps) is chain
+    assert chain_state(steps) is chain

@@ -1,4 +1,4 @@
-"""At the end every scan is registered to the final map: the way between nodes gets as good as the nodes are."""
+"""The dense trajectory: every scan between nodes is registered to the final map."""
 
 from __future__ import annotations
 
@@ -16,41 +16,41 @@ from hybridmap.vision.laser.scan_matching import Prior, align
 from hybridmap.vision.laser.submap import Atlas
 
 BLOCK_NODES = 8
-"""Consecutive nodes whose scans share one local map: they see much the same."""
+"""Consecutive nodes whose scans share one local map, as their views overlap."""
 RADIUS_M, MAP_NODES = 6.0, 60
-"""Nodes of the local map lie this near its middle, m, and are the nearest so many: enough walls, and little time."""
+"""Nodes of a local map: largest distance to its middle, m, and number of the nearest; enough walls in little time."""
 PRIOR_M, PRIOR_DEG = 0.02, 6.0
-"""Standard deviations of what the wheels give between two nodes, m and degrees: they drift in heading, hardly in distance."""
+"""Standard deviations of odometry between two nodes, m and degrees: it drifts in heading, hardly in distance."""
 INLIERS_MIN = 0.6
-"""Least share of inliers of a scan that is believed: as of a good registration of a node."""
+"""Least share of inliers of an accepted scan: as of a good registration of a node."""
 OFF_MAX_M, OFF_MAX_DEG = 0.3, 17.0
-"""Largest correction that is believed, m and degrees: half a step between nodes."""
+"""Largest accepted correction, m and degrees: half a step between nodes."""
 TURN_AS_TRAVEL_M = 0.3
 """A turn by a radian counts as so much travel, m."""
 NOWHERE_M = 1e6
-"""Where points lie that only fill an array, m."""
+"""Coordinate of points that only fill an array, m."""
 
 
 @dataclass(frozen=True, slots=True)
-class SeenScan:
-    """A scan with the node that the robot had made last and the integrator's motion (3,) since then."""
+class ObservedScan:
+    """A scan, the last node before it, and the integrator's motion (3,) since that node."""
 
     scan: LaserScan
     node: int
     motion: Array
 
 
-class Retracer:
+class DenseTrajectory:
     """Registers scans to the map, block of nodes by block."""
 
     def __init__(self, atlas: Atlas, laser: Laser) -> None:
         self._atlas = atlas
         self._laser = laser
 
-    def retrace(self, scans: Sequence[SeenScan], steps: Array, poses: Array) -> Anchors:
-        """Pose of the robot at every scan that could be registered, seen from the node it had made last.
+    def dense_trajectory(self, scans: Sequence[ObservedScan], steps: Array, poses: Array) -> Anchors:
+        """Pose of the robot at every registered scan, seen from the last node before it.
 
-        Scans about a break of the chain are left out: the wheels do not tell on which side of it they were taken.
+        Scans about a break of the chain are left out: odometry does not show on which side of it they were taken.
 
         Args:
             scans: every scan since the first node, in order; that of a node has no motion.
@@ -72,12 +72,12 @@ class Retracer:
         return anchors_on(poses, stamps[good], nodes[good], between(poses[nodes[good]], found[good]))
 
     def _blocks(self) -> list[tuple[int, int]]:
-        """First and one past the last node of each block; none of them goes beyond a piece of the chain."""
+        """First and one past the last node of each block, within one piece of the chain."""
         size = BLOCK_NODES
         return [(first, min(first + size, p.stop)) for p in self._atlas.pieces for first in range(p.start, p.stop, size)]
 
     def _register(self, clouds: list[Cloud], expected: Array, block: Array, poses: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Poses (K, 3) of a block's scans, and which of them are to be believed."""
+        """Poses (K, 3) of a block's scans, and which of them are accepted."""
         distance = np.hypot(*(poses[:, :2] - block[:, :2].mean(axis=0)).T)
         near = np.argsort(distance, kind="stable")[:MAP_NODES]
         near = np.union1d(near[distance[near] < RADIUS_M], np.argsort(distance, kind="stable")[:1])
@@ -103,7 +103,7 @@ def _stacked(clouds: list[Cloud]) -> tuple[Cloud, NDArray[np.int64]]:
 
 
 def _expected(nodes: NDArray[np.int64], motions: Array, steps: Array, poses: Array) -> Array:
-    """Poses (S, 3) of the scans in the map: as the wheels have it from the node before and to the node after, blended."""
+    """Poses (S, 3) of the scans on the map by odometry, from the node before blended with that to the node after."""
     forward = compose(poses[nodes], motions)
     inside = np.flatnonzero(nodes < len(poses) - 1)
     if len(inside) == 0:

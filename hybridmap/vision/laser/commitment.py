@@ -1,4 +1,4 @@
-"""Late commitment: hypotheses wait until several of them, pairwise consistent through the chain, beat their best rivals."""
+"""Late commitment: hypotheses are pending until a cluster of them, consistent through the chain, beats its best rival."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from hybridmap.vision.laser import checks
 from hybridmap.vision.laser.hypotheses import SURE_SIGMA_M, Hypothesis
 
 HALF = 0.5
-"""What agrees with less than this share of a cluster's members contradicts it."""
+"""A hypothesis that agrees with less than this share of a cluster contradicts it."""
 WAIT_M = 32.0
-"""Travel after which a hypothesis that found no cluster is given up, m: it is tried again at the end."""
+"""Travel after which a hypothesis without a cluster is set aside, m; it is tried again at the end."""
 PROBES, SPAN_M = 3, 3.0
-"""Distinct probes that a cluster needs, and travel that they must cover, m; in a narrow gate one probe less is enough."""
+"""Probes that a cluster needs, one less in a narrow gate, and travel that they must cover, m."""
 SPAN_PER_EFOLD_M = 1.0
-"""Travel that they must cover beside that for each factor e by which the gate is wider: there more places look alike, m."""
+"""Additional travel for each factor e by which the gate is wider, m: more places then look alike."""
 
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """A hypothesis that waits, under its key."""
+    """A pending hypothesis and its key."""
 
     key: int
     hypothesis: Hypothesis
@@ -35,7 +35,7 @@ class Waiting:
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """A hypothesis that waits no longer: the checks of the cluster that committed it, or what it lacks."""
+    """A decided hypothesis: the checks of its cluster, or what it lacks."""
 
     key: int
     hypothesis: Hypothesis
@@ -48,7 +48,7 @@ class Settled:
         return self.lack is None
 
     def proposed(self) -> Edge:
-        """The edge that it stands for."""
+        """Its edge."""
         return self.hypothesis.proposed(self.key).settled(*self.checks, lack=self.lack)
 
 
@@ -72,15 +72,15 @@ class Cluster:
 
 
 @dataclass(frozen=True, slots=True)
-class Ripe:
-    """A cluster that is good enough, and the checks that it passed."""
+class Chosen:
+    """A cluster that is accepted, and the checks that it passed."""
 
     cluster: Cluster
     checks: tuple[Check, ...]
 
 
 class Commitment:
-    """The queue of waiting hypotheses."""
+    """The queue of pending hypotheses."""
 
     def __init__(self, travel_of: Callable[[int], float]) -> None:
         """Start empty; `travel_of` gives the travel until a node, m."""
@@ -90,11 +90,11 @@ class Commitment:
         self._consistent: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
 
     def add(self, key: int, hypothesis: Hypothesis) -> None:
-        """Let a hypothesis wait."""
+        """Add a hypothesis."""
         self._queue.append(Waiting(key, hypothesis))
 
     def settle(self, travel_m: float, belief: Belief) -> list[Settled]:
-        """Give up what waited too long; commit the best cluster if it is good enough, with all that agrees with it."""
+        """Set aside what has been pending too long; accept the best cluster if it is good enough, with all that agrees."""
         out = [Settled(w.key, w.hypothesis, lack=Lack.UNSUPPORTED) for w in self._expire(travel_m)]
         return out + self._commit_all(belief, SPAN_PER_EFOLD_M)
 
@@ -126,8 +126,8 @@ class Commitment:
 
     def _commit_all(self, belief: Belief, span_per_efold_m: float) -> list[Settled]:
         out: list[Settled] = []
-        while (ripe := self._ripe(belief, span_per_efold_m)) is not None:
-            out += self._commit(ripe)
+        while (chosen := self._choose(belief, span_per_efold_m)) is not None:
+            out += self._commit(chosen)
         return out
 
     def _keep(self, positions: list[int]) -> None:
@@ -135,7 +135,7 @@ class Commitment:
         self._consistent = self._consistent[np.ix_(known, known)]
         self._queue = [self._queue[p] for p in positions]
 
-    def _ripe(self, belief: Belief, span_per_efold_m: float) -> Ripe | None:
+    def _choose(self, belief: Belief, span_per_efold_m: float) -> Chosen | None:
         hypotheses = (w.hypothesis for w in self._queue)
         loops = Loops.measured([(h.probe, h.anchor, h.relative) for h in hypotheses])
         self._consistent = agreement(loops, belief.ways, known=self._consistent)
@@ -145,23 +145,23 @@ class Commitment:
         best = clusters[0]
         rival = max((c.score for c in clusters[1:] if self._rivals(best, c)), default=0.0)
         asked = self._asked(best, rival, span_per_efold_m)
-        return Ripe(best, asked) if passed(asked) else None
+        return Chosen(best, asked) if passed(asked) else None
 
     def _asked(self, cluster: Cluster, rival: float, span_per_efold_m: float) -> tuple[Check, ...]:
-        """What a cluster is held against; `rival`: score of the best one that contradicts it."""
+        """Checks of a cluster; `rival`: score of the best one that contradicts it."""
         wider = max(0.0, float(np.log(max(cluster.sigma_m, 1e-9) / SURE_SIGMA_M)))
         probes = PROBES if wider > 0.0 else PROBES - 1
         span_m = SPAN_M + span_per_efold_m * wider
         return checks.of_cluster(cluster.probes, probes, cluster.span_m, span_m, rival / max(cluster.score, 1e-9))
 
-    def _commit(self, ripe: Ripe) -> list[Settled]:
-        """Accept everything that agrees with all members; refuse what contradicts most of them."""
-        members = list(ripe.cluster.members)
+    def _commit(self, chosen: Chosen) -> list[Settled]:
+        """Accept all that agree with every member; reject those that contradict most of them."""
+        members = list(chosen.cluster.members)
         agrees = self._consistent[:, members].mean(axis=1)
         out, left = [], []
         for i, w in enumerate(self._queue):
             if i in members or agrees[i] == 1.0:
-                out.append(Settled(w.key, w.hypothesis, ripe.checks))
+                out.append(Settled(w.key, w.hypothesis, chosen.checks))
             elif agrees[i] < HALF:
                 out.append(Settled(w.key, w.hypothesis, lack=Lack.CONTRADICTED))
             else:
@@ -173,7 +173,7 @@ class Commitment:
         return bool(self._consistent[np.ix_(list(best.members), list(other.members))].mean() < HALF)
 
     def _clusters(self) -> list[Cluster]:
-        """Sets of hypotheses that agree, one a probe, begun with each of them in turn; those of the largest score first."""
+        """Sets of hypotheses that agree, one a probe, grown from each in turn; the largest score first."""
         quality = np.array([w.hypothesis.quality for w in self._queue])
         probes = np.array([w.hypothesis.probe for w in self._queue])
         together = self._consistent & (probes[:, None] != probes) | np.eye(len(probes), dtype=bool)

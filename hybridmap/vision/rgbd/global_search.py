@@ -1,4 +1,4 @@
-"""A lost robot's view is compared with the whole map."""
+"""Global localisation by camera: the view of a lost robot is compared with the whole map."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hybridmap.geometry import loosest_direction
 from hybridmap.graph.edges import Edge, Lack, Search, Status
-from hybridmap.vision.relocalising import Chain
+from hybridmap.vision.relocalising import ChainState
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp import Candidate, Verifier
 from hybridmap.vision.templates import Matcher
@@ -18,14 +18,14 @@ Indices = NDArray[np.int64]
 
 CANDIDATES, SEPARATION = 5, 4
 """Views of the whole map that are verified for a node, the best first, and nodes that they lie apart."""
-DOUBTFUL_M = 0.1
-"""A node whose view fits those before it but may slide by more than this (one standard deviation) may be elsewhere, m."""
+UNCERTAIN_M = 0.1
+"""Standard deviation in the loosest direction of a registration above which the chain is uncertain, m."""
 RANKED = 6
 """Profiles ranked for each candidate that is verified: the best of one place lie next to each other."""
 
 
-class WholeMap:
-    """Sightings outside the gate: the likeliest nodes by their profiles, verified by features."""
+class GlobalSearch:
+    """Candidates outside the gate: the nodes of the most similar profiles, verified by features."""
 
     def __init__(
         self,
@@ -40,7 +40,7 @@ class WholeMap:
         self._new_key = new_key
 
     def search(self, node: int, elsewhere: Indices) -> list[Edge]:
-        """Compare a node, the source, with older nodes (n,), ascending; what is verified waits."""
+        """Compare a node, the source, with older nodes (n,), ascending. Verified edges are pending."""
         return [self._measured(node, target, candidate) for target, candidate in self._candidates(node, elsewhere).items()]
 
     def _candidates(self, node: int, targets: Indices) -> dict[int, Candidate]:
@@ -58,12 +58,12 @@ class WholeMap:
         return found.proposed(node, target, self._new_key(), candidate, Lack.WAITING)
 
 
-def chain_of(steps: Sequence[Edge]) -> Chain:
-    """How a node hangs on those before it, by the registrations that were tried; where none was, it does by the odometry."""
+def chain_state(steps: Sequence[Edge]) -> ChainState:
+    """State of the chain at a node, from its registrations. Without any, the odometry holds the chain."""
     if not steps:
-        return Chain.HOLDS
+        return ChainState.HOLDS
     accepted = [step.relative for step in steps if step.status is Status.ACCEPTED and step.relative is not None]
     if not accepted:
-        return Chain.BROKEN
+        return ChainState.BROKEN
     loosest_m = min(loosest_direction(relative.covariance)[0] for relative in accepted)
-    return Chain.DOUBTFUL if loosest_m > DOUBTFUL_M else Chain.HOLDS
+    return ChainState.UNCERTAIN if loosest_m > UNCERTAIN_M else ChainState.HOLDS

@@ -9,7 +9,7 @@ from hybridmap.config import Config
 from hybridmap.evaluate import evaluate_session
 from hybridmap.geometry import align, between, compose
 from hybridmap.graph.edges import EdgeKind, Status
-from hybridmap.graph.gaps import carries
+from hybridmap.graph.gaps import kidnappings
 from hybridmap.session import run
 from hybridmap.simulation import SimulatedStream
 from hybridmap.store import MapStore
@@ -48,7 +48,7 @@ def test_it_is_relocalised_within_five_metres(named, world, carried_m, seed, tmp
     first = min(back, key=lambda edge: edge.since_node)
     error = between(between(truth[first.source], truth[first.target]), known(first.relative).delta)
     assert np.hypot(error[0], error[1]) < 0.1
-    assert (down - 1, down) in {(gap.before, gap.after) for gap in carries(experiences)}
+    assert (down - 1, down) in {(gap.before, gap.after) for gap in kidnappings(experiences)}
     figures = {metric.name: metric.value for metric in evaluate_session(done.folder.path)}
     assert figures["ate_max/gtsam-gnc"] < 0.2
     ends = compose(align(truth, final.poses), final.poses)

@@ -1,4 +1,4 @@
-"""Pictures of a robot that was carried: no line leads through the air, and no error is drawn there."""
+"""Pictures of a robot that was kidnapped: no line leads through the air, and no error is drawn there."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hybridmap.cli.graphs import open_graph
 from hybridmap.evaluate.session_errors import judge_solutions
 from hybridmap.geometry import RelativePose, between
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
-from hybridmap.graph.gaps import carries
+from hybridmap.graph.gaps import kidnappings
 from hybridmap.report import comparison_page, session_figures, style
 from hybridmap.report.session_scene import Correction, SessionScene, load_scene
 from hybridmap.store import MapStore, SessionFolder
@@ -32,9 +32,9 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> SessionFolder:
     experiences.update_edge(odometry, experiences.edge(odometry).settled(lack=Lack.OVERRULED))
     truth = truth_at(np.array([PICKED_UP, PICKED_UP + 1]) * SECOND)
     hung = RelativePose(between(truth[0], truth[1]), np.eye(3))
-    edge = Edge(PICKED_UP, PICKED_UP + 1, EdgeKind.REGISTRATION, Status.ACCEPTED, hung, carried_m=5.0)
+    edge = Edge(PICKED_UP, PICKED_UP + 1, EdgeKind.REGISTRATION, Status.ACCEPTED, hung, kidnapped_m=5.0)
     experiences.add_edge(edge)
-    return write_session(tmp_path_factory.mktemp("carried") / "session", experiences, keyframes=False)
+    return write_session(tmp_path_factory.mktemp("kidnapped") / "session", experiences, keyframes=False)
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 def is_broken(line: Any) -> bool:
-    """Whether a line of nodes breaks at the carry, and nowhere else."""
+    """Whether a line of nodes breaks at the kidnapping, and nowhere else."""
     return np.flatnonzero(np.isnan(line.get_xdata())).tolist() == [PICKED_UP + 1]
 
 
@@ -64,17 +64,17 @@ def test_the_truth_ends_where_the_robot_was_picked_up(scene: SessionScene, drawn
 
 
 def test_the_chain_is_dashed_where_the_robot_was_carried(scene: SessionScene, drawn: list[Any]) -> None:
-    chain, carried = session_figures.chain_and_carries(scene)
-    assert [(edge.source, edge.target) for edge in carried] == [(PICKED_UP, PICKED_UP + 1)]
+    chain, kidnapped = session_figures.chain_and_kidnappings(scene)
+    assert [(edge.source, edge.target) for edge in kidnapped] == [(PICKED_UP, PICKED_UP + 1)]
     assert len(chain) == len(scene.nodes) - 2
     session_figures.graph_figure(scene, None)
-    (lines,) = [lines for lines in drawn[0].axes[0].collections if lines.get_label() == "carried (1)"]
+    (lines,) = [lines for lines in drawn[0].axes[0].collections if lines.get_label() == "kidnapped (1)"]
     assert lines.get_linestyle()[0][1] is not None
 
 
 def test_the_ways_before_and_after_a_correction_break(scene: SessionScene, drawn: list[Any]) -> None:
     correction = Correction(0, 1.0, scene.nodes[:40], scene.nodes[:40] + 1.0)
-    session_figures.correction_figure(correction, {}, carries(scene.experiences))
+    session_figures.correction_figure(correction, {}, kidnappings(scene.experiences))
     assert [is_broken(axes.get_lines()[0]) for axes in drawn[0].axes] == [True, True]
 
 
@@ -84,14 +84,14 @@ def test_no_map_of_a_comparison_has_a_line_through_the_air(
     source = open_graph(session.path)
     rows = comparison.compare(source.graph, ("odometry", "gtsam-lm"))
     judged = judge_solutions(session.path, comparison_page.solved(rows))
-    comparison_page.overlay(rows, judged.truth, source.carried)
+    comparison_page.overlay(rows, judged.truth, source.kidnapped)
     first, second, *maps = drawn[0].axes[0].get_lines()
     assert first.get_label() == "ground truth"
     assert len(first.get_xdata()) + len(second.get_xdata()) < len(source.graph.initial) * 10 - 9
     assert [is_broken(line) for line in maps] == [True, True]
     graphs = []
     monkeypatch.setattr(comparison_page, "draw_map", lambda axes, graph, *_: graphs.append(graph))
-    comparison_page.panels(source.graph, rows, source.start, source.carried)
+    comparison_page.panels(source.graph, rows, source.start, source.kidnapped)
     assert {graph.n_edges for graph in graphs} == {source.graph.n_edges - 1}
     assert all(PICKED_UP + 1 not in graph.targets[graph.is_motion] for graph in graphs)
 

@@ -156,13 +156,13 @@ def test_a_mapper_mends_one_loop_and_retracts_another(poses, frames, monkeypatch
     )
     held, verify = [mapper.belief().covariance_from(PER_LAP // 2)[0]], as_a(RgbdFrontEnd, mapper.vision).verify
 
-    def looked_at(doubted, belief):
+    def looked_at(outliers, belief):
         held.append(belief.covariance_from(PER_LAP // 2)[0])
-        return verify(doubted, belief)
+        return verify(outliers, belief)
 
     monkeypatch.setattr(mapper.vision, "verify", looked_at)
     mapper.finish()
-    assert np.trace(held[1]) > np.trace(held[0])  # a doubted loop is no witness of its own
+    assert np.trace(held[1]) > np.trace(held[0])  # a outliers loop is no witness of its own
     edges = mapper.map.edges
     assert {spoilt, false} <= set(mapper.book.tried_again)
     assert edges[spoilt].status is Status.ACCEPTED

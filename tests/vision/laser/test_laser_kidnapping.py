@@ -48,9 +48,9 @@ def test_the_break_is_noticed_and_the_chain_is_joined_anew(found):
     rejected = next(p for p in into if p.key == seen.key)
     assert rejected.status is Status.REJECTED
     assert rejected.lack is Lack.KIDNAPPED
-    rehung = next(p for p in into if p.status is Status.ACCEPTED)
-    assert (rehung.source, rehung.target, rehung.contradicts_odometry) == (down - 1, down, True)
-    error = run.error(rehung)
+    reattached = next(p for p in into if p.status is Status.ACCEPTED)
+    assert (reattached.source, reattached.target, reattached.contradicts_odometry) == (down - 1, down, True)
+    error = run.error(reattached)
     assert np.hypot(error[0], error[1]) < 0.2
     assert abs(error[2]) < np.deg2rad(2.0)
 
@@ -100,7 +100,7 @@ def test_submaps_of_either_side_are_not_mixed(found):
 def test_scans_are_traced_on_either_side_of_the_carry(found):
     run, down = found
     final = between(run.truth[0], run.truth[run.node_at])
-    retraced = run.front_end.retrace(run.belief(final))
+    retraced = run.front_end.dense_trajectory(run.belief(final))
     index = (retraced.stamps_ns - 1_000_000_000) // 100_000_000
     assert not np.any((index > run.node_at[down - 1]) & (index < run.node_at[down]))
     assert {*range(EVERY * (down - 8), run.node_at[down - 1] + 1), *range(UP, UP + 40)} <= set(index.tolist())
@@ -110,14 +110,14 @@ def test_scans_are_traced_on_either_side_of_the_carry(found):
 
 def test_of_many_submaps_those_with_the_likeliest_views_are_searched(found, monkeypatch):
     run, down = found
-    searched = run.front_end.whole_map
+    searched = run.front_end.localisation
     anchors = Prober(VisionConfig(), run.front_end.atlas, LASER).anchors_before(down)
-    assert searched.likeliest(down + 2, anchors) == anchors
+    assert searched.most_similar(down + 2, anchors) == anchors
     monkeypatch.setattr(kidnapping, "SUBMAPS", 3)
     places = run.truth[run.node_at]
     near = []
     for node in range(down + 2, down + 8):
-        chosen = searched.likeliest(node, anchors)
+        chosen = searched.most_similar(node, anchors)
         assert chosen == sorted(chosen)
         assert len(chosen) == 3 < len(anchors)
         near.append(np.hypot(*(places[chosen, :2] - places[node, :2]).T).min() < WINDOW_M)
@@ -144,8 +144,8 @@ def test_a_glimpse_of_something_else_is_no_carry():
     truth[658:663] = ring_drive(2.1)[1000:1005]
     run = Run(ring(), truth, drifting(way, np.random.default_rng(2)), EVERY)
     assert [p.target for p in run.proposals if p.broken_by] == [660 // EVERY]
-    assert not [p for p in run.proposals if p.carried_m is not None]
+    assert not [p for p in run.proposals if p.kidnapped_m is not None]
     assert len([p for p in run.loops(Status.ACCEPTED) if p.search is Search.WHOLE_MAP]) >= 4
     assert len(run.front_end.atlas.pieces) == 1
     assert run.front_end.lost_since is None
-    assert run.front_end.whole_map.since == 0
+    assert run.front_end.localisation.since == 0

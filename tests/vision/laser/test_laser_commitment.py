@@ -6,7 +6,7 @@ import pytest
 from hybridmap.geometry import RelativePose, between, compose
 from hybridmap.graph.edges import Lack, Search
 from hybridmap.vision.base import Belief
-from hybridmap.vision.laser.clusters import Commitment
+from hybridmap.vision.laser.commitment import Commitment
 from hybridmap.vision.laser.hypotheses import Hypothesis
 
 N = 400
