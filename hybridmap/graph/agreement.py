@@ -18,7 +18,7 @@ from hybridmap.geometry import Array, RelativePose, between, compose_relative, i
 
 Indices = NDArray[np.int64]
 Ways = Callable[[Indices, Indices], RelativePose]
-"""How the robot came from nodes (P,) to nodes (P,): the latter seen from the former. Not finite where nothing is known."""
+"""Poses of nodes (P,) seen from nodes (P,), by the chain. Not finite where unknown."""
 
 
 def chi2_quantile(probability: float) -> float:
@@ -34,7 +34,7 @@ BOUND = chi2_quantile(QUANTILE)
 
 @dataclass(frozen=True, slots=True)
 class Loops:
-    """Measured loops, all told from the older node.
+    """Measured loops, seen from the older node.
 
     Attributes:
         older, newer: (L,) nodes.
@@ -94,7 +94,7 @@ def ring(first: Loops, second: Loops, ways: Ways) -> Ring:
 
     The four parts count as independent, although the ways between older and between newer ends may overlap.
     """
-    with np.errstate(invalid="ignore"):  # a way of which nothing is known
+    with np.errstate(invalid="ignore"):  # an unknown way
         along_new = compose_relative(first.relative, ways(first.newer, second.newer))
         along_old = compose_relative(ways(first.older, second.older), second.relative)
     error = log(between(along_old.delta, along_new.delta))

@@ -1,7 +1,7 @@
-"""The words for edges, shared by all that propose, keep, solve and judge them: kind, status, check, edge.
+"""Edges: kind, status, check, and the record of the decision.
 
-A decision about an edge is a record: the checks that were asked, in their order, and what else it lacked. The verdict, the
-reason in words and what would have had to be different follow from that record alone.
+The record holds the checks in their order, and what the edge lacked beside them. Status, reason in words and `explain`
+follow from it alone.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class EdgeKind(IntEnum):
 class Status(StrEnum):
     """What became of an edge; only accepted ones are in the graph.
 
-    A rejected edge never was in the graph, a retracted one was and has been taken back.
+    A rejected edge never was in the graph; a retracted one was.
     """
 
     ACCEPTED = "accepted"
@@ -53,7 +53,7 @@ class Method(StrEnum):
 
 
 class Search(StrEnum):
-    """How the two nodes of an edge came to be compared."""
+    """Why the two nodes of an edge were compared."""
 
     CHAIN = "chain"
     GATE = "gate"
@@ -134,7 +134,7 @@ class Need(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """A figure held against a limit.
+    """A figure and its limit.
 
     Attributes:
         figure: its name, which carries its unit.
@@ -198,7 +198,7 @@ def at_most(figure: str, value: float, limit: float, setting: str | None = None)
 
 
 def passed(checks: Sequence[Check]) -> bool:
-    """Whether every one of some checks did."""
+    """Whether all checks passed."""
     return all(check.passed for check in checks)
 
 
@@ -221,15 +221,15 @@ class Edge:
         kind: where it comes from.
         status: what became of it.
         relative: the measurement; None where a candidate was refused before one was made.
-        checks: the figures that decided, each against its limit, in the order in which they were asked.
-        lack: what else it lacked; None where that is nothing.
-        method, search: what measured it, and how its nodes came to be compared; None where that is not known.
+        checks: the figures that decided, with their limits, in order.
+        lack: what it lacked beside checks, if anything.
+        method, search: what measured it, and why its nodes were compared; None if unknown.
         shift: columns by which the view of the target is shifted against that of the source.
         figures: further figures for people, by name; nothing is decided by them.
         kidnapped_m: of the edge that rejoins the chain after a kidnapping: how far from its odometry pose the robot was found;
             None for every other edge.
-        broken_by: the checks that say that the robot did not drive from the source to the target; empty where it may have.
-        contradicts_odometry: a registration so good that the odometry edge beside it is wrong and is to be dropped.
+        broken_by: failed checks of whether the robot drove from the source to the target.
+        contradicts_odometry: a good registration that replaces the odometry edge of the same nodes.
         since_node: number of the newest node when the edge got its present status (-1: let the map note it), so that a
             replay brings an edge that was committed late at the same moment.
         key: number within the front-end that proposed it (-1: none did): a later proposal of the same key replaces this one.
@@ -278,7 +278,7 @@ class Edge:
 
     @property
     def reason(self) -> str:
-        """Why it is as it is, in words: from its record."""
+        """Reason of its status, in words."""
         words = [] if self.lack is None else [self.lack.words]
         words += [check.miss for check in self.failed]
         if self.method is not None and not words:
@@ -295,7 +295,7 @@ class Edge:
 
     @property
     def otherwise(self) -> str:
-        """What would have had to be different for another status; empty where nothing is known."""
+        """What would have changed its status; empty if unknown."""
         if self.lack is not None:
             return self.lack.needed
         asked = self.failed or sorted(self.checks, key=lambda check: check.slack)

@@ -30,7 +30,7 @@ def image_profile(
 ) -> Profile:
     """Profile of an RGB-D frame: column sums of intensity, column means of the valid depth pixels, by row band.
 
-    With `bands=1` it is the seed's profile, with `bands=4` the four-band profile.
+    With `bands=1` it is the paper's profile, with `bands=4` the four-band profile.
 
     Args:
         grey: (H, W) uint8 intensity.

@@ -13,26 +13,26 @@ from hybridmap.geometry import Array
 from hybridmap.streams.laser import Laser
 
 RANGE_MAX_M = 20.0
-"""Returns farther away are left out, m: beyond it the beams of most lasers are too far apart to give a wall its normal."""
+"""Largest range used, m: beyond it the beams of most lasers are too far apart for normals."""
 CELL_M = 0.05
-"""Points of one cell are merged into one, m: a few times the noise of a range."""
+"""Side of the cells whose points are merged, m: a few times the noise of a range."""
 REACH_M, REACH_BEAMS, REACH_MAX_M = 0.1, 8.0, 1.0
-"""A neighbour of a point lies no farther than this, m, beside so many distances between beams there; never beyond the last."""
+"""Largest distance of neighbours, m: the first plus so many distances between beams, at most the last."""
 THIN = 0.1
-"""Neighbours are a line where their spread across it is at most this share of that along it (squares)."""
+"""Largest variance of neighbours across their line, as a share of that along it."""
 AGREEING = 0.3
-"""Length of the sum of the normals in a cell below which they contradict one another, and the cell has none."""
+"""Least length of the sum of the normals in a cell; below it they contradict each other, and the cell has none."""
 NEIGHBOURS = 3
 """Beams to either side of a point that give it its normal."""
 PARTNER_M = 0.3
-"""A point farther than this from every target point has no partner, m: a chair's width, less than a corridor's."""
+"""Largest distance of a point from its partner, m: a chair's width, less than a corridor's."""
 FIELD_SIGMA_M = 0.12
 """Width of the likelihood field on which starts are scored, m: about a step of the grid of starts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """Points of walls, with normals that point to the robot which saw them.
+    """Points of walls, with normals towards the robot.
 
     Attributes:
         points: (P, 2) m.
@@ -73,7 +73,7 @@ def cloud_of_scan(ranges_m: NDArray[np.float32], laser: Laser) -> Cloud:
 
 
 def clouds_of_scans(ranges_m: Sequence[NDArray[np.float32]], laser: Laser) -> list[Cloud]:
-    """The same for many scans, worked out together: a scan is too small to keep an array operation busy."""
+    """The same for many scans at once, which is faster."""
     ranges = np.array(ranges_m, dtype=np.float64).reshape(len(ranges_m), -1)
     valid = (ranges >= laser.range_min_m) & (ranges <= min(laser.range_max_m, RANGE_MAX_M))
     valid &= valid.sum(axis=1, keepdims=True) >= 2 * NEIGHBOURS + 1
@@ -168,7 +168,7 @@ class LikelihoodField:
         low: (2,) corner of cell (0, 0), m.
         cell_m: side of a cell.
         shape: cells in x and y.
-        margin: empty cells at each border, so that a clipped look-up meets nothing.
+        margin: empty cells at each border, to which look-ups are clipped.
         labels: (cells,) int32, 1 + index of the nearest point of the cloud within reach, 0 for none.
         likelihood: (cells,) uint8, 255 exp(-d^2 / 2 sigma^2) of the distance d to that point.
         lines: (3, 1 + P) the line through each point: its normal, and its distance from the origin along that; 0 for none.
@@ -203,7 +203,7 @@ def build_field(
     sigma_m: float = FIELD_SIGMA_M,
     search_m: float = 0.0,
 ) -> LikelihoodField:
-    """Grow every point with a normal into its surroundings, the far cells first so that the nearest point wins.
+    """Write every point with a normal into the cells about it, the far cells first, so that the nearest point wins.
 
     Args:
         cloud: P points with normals.

@@ -22,7 +22,7 @@ def score_poses(field: LikelihoodField, points: Array, poses: Array) -> Array:
 
 
 def ambiguity(field: LikelihoodField, points: Array, direction: Array, apart_m: float = 0.4, reach_m: float = 3.0) -> float:
-    """How well points that lie right would also lie when shifted along a direction: the second mode's share of the likelihood.
+    """Likelihood of a second mode along a direction, as a share of that of the registered pose.
 
     Args:
         field: the target.
@@ -67,11 +67,11 @@ def score_starts(field: LikelihoodField, points: Array, center: Array, headings_
 
 
 STEP_M, STEP_DEG = 0.3, 2.0
-"""Half a step of the wide grid of starts, m and degrees; the search about the best ones goes by it."""
+"""Half a step of the wide grid of starts, m and degrees: the step of the search about the best ones."""
 SURVIVORS = 24
-"""Starts of the wide grid that are looked at more closely."""
+"""Number of starts of the wide grid that are refined."""
 SEPARATE_M, SEPARATE_DEG = 0.8, 12.0
-"""Modes are apart where they differ by more, m or degrees."""
+"""Least difference of separate modes, m or degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,24 +153,24 @@ INLIER_M = 0.1
 SIGMA_M = 0.01
 """Standard deviation of a point's residual at least, m: the noise of a laser."""
 SPURIOUS = 0.04
-"""Share of the inliers whose information along any direction is not believed: normals err by some 10 degrees."""
+"""Share of the inliers whose information along any direction is subtracted: normals err by some 10 degrees."""
 WIDE, WIDE_ITERATIONS = 2.0, 2
 """Factor on that scale in the first iterations, and how many these are."""
 LARGEST_STEP = 0.3
 """No iteration moves the cloud by more, m and rad."""
 FACING = -0.1
-"""Least cosine between the normals of partners: the two sides of a wall are none."""
+"""Least cosine between the normals of partners: the two sides of a wall are not partners."""
 CONVERGED = 5e-4
 """Iterations end when none moves the cloud by more, m and rad."""
 LEAST = 1e-6
-"""Information beside that of the points, so that the equations have a solution where there are none."""
+"""Information added to that of the points, so that there is a solution without them."""
 WEAKEST_INFORMATION = (1.0, 1.0, 4.0)
-"""Information of a registration that no wall holds: a metre, and half a radian."""
+"""Least information of a registration: standard deviations of a metre and half a radian."""
 
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """Where the moving frame is expected: pose (3,), or (K, 3) one a start, and how surely, m and rad."""
+    """Expected pose of the moving frame, (3,) or (K, 3) for K starts, and its standard deviations, m and rad."""
 
     pose: Array
     sigma_m: float
@@ -200,10 +200,9 @@ class Alignment:
     points: int
 
     def covariance(self, k: int, floor_m: float, floor_rad: float) -> Array:
-        """Covariance (3, 3) of registration k in the moving frame: loose along a bare corridor, never below the floors.
+        """Covariance (3, 3) of registration k in the moving frame: variance of the residuals times the inverse Hessian.
 
-        The variance of the residuals times the inverse Hessian, as for least squares with independent points; the floors
-        stand for what residuals do not show: a target that is itself bent.
+        The floors stand for errors that residuals do not show, as of a target that is itself bent.
         """
         variance = max(SIGMA_M, float(self.rms_m[k])) ** 2
         trusted = self._without_spurious(k, SPURIOUS)
@@ -212,7 +211,7 @@ class Alignment:
         return np.asarray(0.5 * (covariance + covariance.T) + floor)
 
     def weakest_direction(self, k: int) -> Array:
-        """Unit vector (2,) in the moving frame along which the walls hold registration k least, whatever the heading."""
+        """Unit vector (2,) in the moving frame along which registration k is least certain."""
         return np.asarray(np.linalg.eigh(self._translation(k))[1][:, 0])
 
     def _translation(self, k: int) -> Array:
@@ -221,7 +220,7 @@ class Alignment:
         return np.asarray(h[:2, :2] - np.outer(h[:2, 2], h[2, :2]) / max(float(h[2, 2]), 1e-9))
 
     def _without_spurious(self, k: int, share: float) -> Array:
-        """The Hessian less what `share` of the points would give: normals err, so a bare wall seems to hold along itself."""
+        """The Hessian less that of a `share` of the points: with noisy normals a bare wall seems to hold along itself."""
         out = self.hessian[k].copy()
         value, vector = np.linalg.eigh(self._translation(k))
         lost = np.minimum(value, share * self.points * float(self.inliers[k]))
@@ -230,7 +229,7 @@ class Alignment:
 
 
 def ambiguity_of(field: LikelihoodField, cloud: Cloud, alignment: Alignment, k: int = 0) -> float:
-    """Share of registration k's likelihood that the cloud keeps when it is shifted along its weakest direction."""
+    """`ambiguity` of registration k along its weakest direction."""
     pose = alignment.poses[k]
     weakest = alignment.weakest_direction(k)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
@@ -264,7 +263,7 @@ def align(field: LikelihoodField, cloud: Cloud, starts: Array, prior: Prior | No
         field: the target.
         cloud: P points in the moving frame.
         starts: (K, 3) poses of the moving frame in the target's.
-        prior: holds the pose where the walls leave it free; it is no part of `hessian`.
+        prior: of the pose; `hessian` leaves it out.
     """
     poses = np.array(starts, dtype=np.float64)
     moving = _Moving(*(np.ascontiguousarray(a[..., i]) for a in (cloud.points, cloud.normals) for i in (0, 1)))
@@ -304,7 +303,7 @@ def _normal_equations(partners: _Partners, scale: float) -> tuple[Array, Array]:
 
 
 def _newton_steps(hessian: Array, gradient: Array, poses: Array, prior: Prior | None) -> Array:
-    """Steps (K, 3) in the body frame, the prior taken in; a system of three unknowns is soonest solved without arrays."""
+    """Steps (K, 3) in the body frame, with the prior; three unknowns are solved fastest without arrays."""
     expected = poses.tolist() if prior is None else np.broadcast_to(prior.pose, poses.shape).tolist()
     weight_m, weight_rad = (0.0, 0.0) if prior is None else (prior.sigma_m**-2, prior.sigma_rad**-2)
     steps = []

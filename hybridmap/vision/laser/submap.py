@@ -1,4 +1,4 @@
-"""Submaps of the clouds along the chain, their likelihood fields, and the free space that their scans see."""
+"""Submaps of the clouds along the chain, their likelihood fields, and their free space."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hybridmap.streams.laser import Laser
 from hybridmap.vision.laser.cloud import Cloud, LikelihoodField, build_field, merged_at
 
 SEARCH_M = 4.5
-"""Starts may lie this far from the anchor of a submap."""
+"""Largest distance of starts from the anchor of a submap, m."""
 
 Span = tuple[int, int, int]
 Key = TypeVar("Key")
@@ -59,7 +59,7 @@ FINE_KEPT, SUBMAPS_KEPT = 40, 1000
 
 
 class _Recent(Generic[Key, Value]):
-    """A bounded dictionary that forgets what was not asked for longest."""
+    """A bounded dictionary that drops what was not used for longest."""
 
     def __init__(self, kept: int) -> None:
         self._kept = kept
@@ -76,9 +76,9 @@ class _Recent(Generic[Key, Value]):
 
 
 class Atlas:
-    """The clouds of all nodes with the chain of refined poses; makes submaps and targets of them.
+    """The clouds of all nodes and the chain of their registered poses; makes submaps.
 
-    Where the chain broke a new piece of it begins; no submap holds nodes of two pieces.
+    A new piece begins where the chain broke; no submap holds nodes of two pieces.
 
     Attributes:
         clouds, ranges: of each node's scan, the points in its frame and the ranges (B,) as they came.
@@ -113,8 +113,7 @@ class Atlas:
     def joining(self, target: int, pose: Array, covariance: Array, probe: int | None = None) -> RelativePose:
         """The edge that a registration gives: the probe's node in the frame of the target's.
 
-        A registration joins two submaps (or a scan and a submap); where the two nodes lie in theirs is as uncertain as
-        their scatter says, and the edge between them is, too.
+        The scatter of the nodes in their submaps adds to the covariance of the edge.
 
         Args:
             target: anchor of the submap that was registered to.
@@ -125,11 +124,11 @@ class Atlas:
         return edge if probe is None else compose_relative(edge, RelativePose(IDENTITY, self.scatter[probe]))
 
     def part(self, node: int) -> None:
-        """Let a new piece of the chain begin at a node."""
+        """Begin a new piece of the chain at a node."""
         insort(self._pieces, node)
 
     def join(self, node: int) -> None:
-        """Make one of two pieces again, of which the later begins at a node."""
+        """Rejoin two pieces, the later of which begins at a node."""
         self._pieces.remove(node)
 
     @property
@@ -138,7 +137,7 @@ class Atlas:
         return [range(a, b) for a, b in pairwise([*self._pieces, len(self)])]
 
     def piece(self, node: int) -> range:
-        """The nodes of the piece of the chain that a node, or the next one to come, belongs to."""
+        """The nodes of the piece of a node, which may be the next one to come."""
         return self.pieces[bisect_right(self._pieces, node) - 1]
 
     def along(self, node: int, before_m: float, after_m: float) -> NDArray[np.int64]:
@@ -156,7 +155,7 @@ class Atlas:
         return Submap(anchor, numbers, poses, cloud)
 
     def around(self, anchor: int, half_m: float) -> Submap:
-        """The submap of the nodes within so many metres of travel of an anchor; kept for the next time."""
+        """The submap of the nodes within so many metres of travel of an anchor; cached."""
         nodes = self.along(anchor, half_m, half_m)
         return self._submaps.get(_span(anchor, nodes), lambda: self.submap(anchor, nodes))
 
@@ -180,9 +179,9 @@ def _span(anchor: int, nodes: NDArray[np.int64]) -> Span:
 Marks = NDArray[np.bool_]
 
 MARGIN_M, MARGIN_PER_M = 0.25, 0.03
-"""A point is in free space where the laser saw farther by so much, m, and by this share of its distance."""
+"""A point is in free space where the range exceeds its distance by so much, m, plus this share of the distance."""
 VIEWPOINTS, POINTS = 6, 250
-"""Scans of one submap that look at points of the other, and these points, at most."""
+"""Most scans of one submap, and most points of the other, that are compared."""
 GRAZING = 0.3
 """Least cosine between a wall's normal and the ray at which the wall is judged."""
 
@@ -190,11 +189,11 @@ GRAZING = 0.3
 def violation(
     walls: Submap, seers: Submap, pose_seers_walls: Array, ranges: Sequence[NDArray[np.float32]], laser: Laser
 ) -> float:
-    """Share of one submap's visible points that most of another's scans which could see them look through.
+    """Share of one submap's visible points that are in the free space of most scans of another that see them.
 
     Args:
-        walls: whose points are asked about.
-        seers: whose scans look at them.
+        walls: the submap of the points.
+        seers: the submap of the scans.
         pose_seers_walls: (3,) frame of `walls` in that of `seers`.
         ranges: (B,) ranges of every node's scan, by node.
         laser: bearings and mounting.
@@ -217,9 +216,9 @@ def violation_both_ways(
 
 
 def _look(cloud: Cloud, poses_laser_cloud: Array, ranges_m: NDArray[np.float32], laser: Laser) -> tuple[Marks, Marks]:
-    """Which points of a cloud each of some scans looks through, and which it sees as walls; (V, P) each.
+    """Which points of a cloud are in the free space of each scan, and which are at its ranges; (V, P) each.
 
-    Walls that the beams graze are left out: there a small error of the heading is a large one of the range.
+    Walls at grazing incidence are left out: there a small error of heading is a large one of range.
 
     Args:
         cloud: P points.

@@ -1,4 +1,4 @@
-"""Refined self-motion: each new node is registered to the submap of the last ones, with the odometry as prior."""
+"""Registration of each new node to the submap of the last ones, with the odometry as prior."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from hybridmap.vision.laser.scan_matching import Alignment, Prior, align, score_
 from hybridmap.vision.laser.submap import Atlas
 
 SUBMAP_NODES = 25
-"""Nodes in the submap: some 12 m of way, in which the chain hardly bends."""
+"""Nodes in the submap: some 12 m of travel, in which the chain hardly bends."""
 
 
 @dataclass(frozen=True, slots=True)
 class SearchWindow:
-    """A grid of starts about the odometry, and how sure the odometry is taken to be.
+    """A grid of starts about the odometry, and the odometry's standard deviations as prior.
 
     Attributes:
         half_m, half_deg: half-widths of the grid.
-        prior_m, prior_deg: standard deviations of the odometry as prior of the registration.
+        prior_m, prior_deg: these standard deviations.
     """
 
     half_m: float
@@ -42,24 +42,24 @@ LOST = SearchWindow(half_m=1.0, half_deg=60.0, prior_m=0.7, prior_deg=60.0)
 INLIERS_SURE = 0.75
 """Least share of inliers at which a registration may contradict the odometry without further search."""
 CONTRADICTION_M, CONTRADICTION_DEG = 0.15, 3.0
-"""A good registration this far from the odometry drops the odometry edge: several times what wheels err over a step."""
+"""A good registration this far from the odometry drops the odometry edge, m and degrees: several times its usual error."""
 FLOOR_M, FLOOR_DEG = 0.001, 0.02
-"""Standard deviations of a node's place in the submap at least, m and degrees: what residuals do not show."""
+"""Least standard deviations of a node's pose in the submap, m and degrees: errors that residuals do not show."""
 GRID_M, GRID_DEG = 0.1, 2.0
 """Steps of the grid of starts, m and degrees."""
 PULL = 0.05
-"""What a start loses of its score at one standard deviation of the odometry's heading, or at two of its translation."""
+"""Loss of a start's score at one standard deviation of the odometry's heading, or at two of its translation."""
 WEAK_M, WEAK_DEG = 0.05, 1.5
 """Standard deviations that are added to a registration which is not good, m and degrees."""
 SCORED_POINTS = 90
 """Points that score the starts."""
 WIDE_GAIN, LOST_GAIN = 0.03, 0.1
-"""By so much the share of inliers must be larger for a wider search to be preferred."""
+"""Gain in the share of inliers from which a wider search is preferred."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """The motion from one node to the next, as the scans have it.
+    """The motion from one node to the next by scan matching.
 
     Attributes:
         relative: pose of the new node in the frame of the one before; the odometry's where nothing was measured.
@@ -89,7 +89,7 @@ class Tracker:
         self._atlas = atlas
 
     def step(self, cloud: Cloud, odometry: RelativePose, between_nodes: Callable[[], Iterable[tuple[Array, Cloud]]]) -> Step:
-        """Say how the robot moved from the last node of the atlas to a new one.
+        """Measure the motion from the last node of the atlas to a new one.
 
         Args:
             cloud: scan of the new node.
@@ -106,7 +106,7 @@ class Tracker:
         return self._judge(best, odometry)
 
     def pair(self, cloud: Cloud, following: Cloud, odometry: Array) -> Alignment:
-        """The next scan registered to one scan alone, from where the odometry (3,) has it."""
+        """Register the next scan to one scan alone, from the odometry (3,)."""
         field = self._field_of(cloud)
         best = self._search(field, following, odometry)
         if self._is_weak(best, odometry):
@@ -132,7 +132,7 @@ class Tracker:
         return build_field(cloud, search_m=LOST.half_m + 2 * CELL_M)
 
     def _search(self, field: LikelihoodField, cloud: Cloud, expected: Array) -> Alignment:
-        """Narrow first; wide when that is weak or disagrees with the odometry, and then whichever has more inliers."""
+        """Search narrowly; if that is weak or contradicts the odometry, widely too, and take the one of more inliers."""
         narrow = self._grid(field, cloud, expected, NARROW)
         if narrow.inliers[0] >= checks.INLIERS_MIN and not self._contradicts(narrow.poses[0], expected):
             return narrow

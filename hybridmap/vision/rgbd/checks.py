@@ -1,4 +1,4 @@
-"""What a camera's edges are decided by: every check of registrations, candidates and loops, each with its limit."""
+"""The checks that decide about edges of a camera, with their limits: registrations, candidates, loops."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ _MIN_INLIERS = "vision.rgbd.pnp.min_inliers"
 DEPTH_INLIERS_MIN = 0.5
 """Least share of the points in common view that fit: half of a view may have changed."""
 CONTRADICTION_SIGMA = 8.0
-"""A good registration that differs from odometry by more than this many sigma contradicts it: slips do, drift does not."""
+"""A good registration contradicts the odometry beyond so many standard deviations: slips do, drift does not."""
 MIN_INLIERS_ALONE = 30
 """Fewest keypoints that agree where there is too little depth in common view to refine on."""
 MAX_HEIGHT_M, MAX_TILT_DEG = 0.1, 3.0
@@ -24,13 +24,13 @@ SURE_INLIERS, SURE_SLACK_M = 0.8, 0.03
 HELD_HEIGHT, HELD_TILT = 3.0, 2.0
 """Factors on the limits of height and tilt where the camera's tilt was measured and not taken from the mounting."""
 REFINED = 3.0
-"""Depth may lead away from the features' pose by so many times what the two directions may differ."""
+"""Largest distance of depth's pose from the features', as a multiple of that between the two directions."""
 PLAUSIBLE_SIGMA = 16.3**0.5
-"""Deviations of the map that one as sure as it says exceeds once in a thousand (3 degrees of freedom)."""
+"""Mahalanobis distance from the map that is exceeded once in a thousand (3 degrees of freedom)."""
 
 
 def of_step(depth_inliers: float, slack_m: float, odometry_sigma: float) -> tuple[Check, ...]:
-    """Of the registration of a new node: its inliers; one that is not sure may not contradict the odometry."""
+    """Registration of a new node: its inliers; only a certain one may contradict the odometry."""
     checks = of_depth(depth_inliers)
     if not (depth_inliers > SURE_INLIERS and slack_m < SURE_SLACK_M):
         checks += (at_most("odometry_sigma", odometry_sigma, CONTRADICTION_SIGMA),)
@@ -38,32 +38,32 @@ def of_step(depth_inliers: float, slack_m: float, odometry_sigma: float) -> tupl
 
 
 def of_depth(depth_inliers: float) -> tuple[Check, ...]:
-    """Of a registration: the share of the depth in common view that fits."""
+    """A registration: share of the depth in common view that fits."""
     return (at_least("depth_inliers", depth_inliers, DEPTH_INLIERS_MIN),)
 
 
 def of_profile(profile_G: float, c_t: float) -> tuple[Check, ...]:
-    """Of a candidate that nothing verifies: how much its scanline differs."""
+    """A candidate without verification: the difference of its profile."""
     return (at_most("profile_G", profile_G, c_t, "vision.matching.c_t"),)
 
 
 def of_matches(matches: int, least: int) -> tuple[Check, ...]:
-    """Of two views: how many features match."""
+    """Two views: number of matching features."""
     return (at_least("matches", matches, least, _MIN_INLIERS),)
 
 
 def of_pose(feature_inliers: int, least: int) -> tuple[Check, ...]:
-    """Of a pose by features: how many of them agree on it."""
+    """A pose by features: number of inliers."""
     return (at_least("feature_inliers", feature_inliers, least, _MIN_INLIERS),)
 
 
 def of_reverse_pose(feature_inliers_reverse: int, least: int) -> tuple[Check, ...]:
-    """The same the other way round."""
+    """The same in the other direction."""
     return (at_least("feature_inliers_reverse", feature_inliers_reverse, least, _MIN_INLIERS),)
 
 
 def of_plane(height_m: float, tilt_deg: float, reverse_m: float, reverse_deg: float, held: bool) -> tuple[Check, ...]:
-    """Of a pose by features: the robot stays on the floor, and both ways round give the same; `held`: the tilt is measured."""
+    """A pose by features: planar, and the same in both directions; `held`: the tilt is measured."""
     height, tilt = (HELD_HEIGHT, HELD_TILT) if held else (1.0, 1.0)
     return (
         at_most("height_m", height_m, MAX_HEIGHT_M * height),
@@ -74,7 +74,7 @@ def of_plane(height_m: float, tilt_deg: float, reverse_m: float, reverse_deg: fl
 
 
 def of_refinement(off_m: float, off_deg: float, depth_inliers: float) -> tuple[Check, ...]:
-    """Of depth registered from the features' pose: how far it leads away from it, and whether it fits."""
+    """Depth registered from the features' pose: distance from that pose, and fit."""
     return (
         at_most("off_features_m", off_m, REFINED * REVERSE_M),
         at_most("off_features_deg", off_deg, REFINED * REVERSE_DEG),
@@ -83,12 +83,12 @@ def of_refinement(off_m: float, off_deg: float, depth_inliers: float) -> tuple[C
 
 
 def of_features_alone(feature_inliers_both: int) -> tuple[Check, ...]:
-    """Of a pose by features that no depth can object to: more of them must agree, both ways round."""
+    """A pose by features without depth in common view: more inliers, in both directions."""
     return (at_least("feature_inliers_both", feature_inliers_both, MIN_INLIERS_ALONE),)
 
 
 def of_depth_alone(depth_inliers: float, overlap: float, points: int, slack_m: float) -> tuple[Check, ...]:
-    """Of depth registered from where the map has the two views, without features."""
+    """Depth registered from the map's pose, without features."""
     return (
         at_least("depth_inliers", depth_inliers, MAP_INLIERS),
         at_least("overlap", overlap, MAP_OVERLAP),
@@ -98,10 +98,10 @@ def of_depth_alone(depth_inliers: float, overlap: float, points: int, slack_m: f
 
 
 def of_map(map_sigma: float) -> tuple[Check, ...]:
-    """Of a loop that fits elsewhere than the map has it: whether the map may be that wrong."""
+    """A loop that contradicts the map: whether the map's covariance allows it."""
     return (at_most("map_sigma", map_sigma, PLAUSIBLE_SIGMA),)
 
 
 def of_support(supporting: int) -> tuple[Check, ...]:
-    """Of a measured loop: another one near it must agree."""
+    """A measured loop: another one near it must agree."""
     return (at_least("supporting", supporting, 1),)

@@ -16,7 +16,7 @@ from hybridmap.vision.rgbd.pairs import PointPairs
 from hybridmap.vision.rgbd.stance import LevelPair, Stance, from_planar, level_pair, rotation_of, to_floor, wrenches
 
 ITERATIONS = 10
-"""Gauss-Newton steps, at most; a good start needs half of them."""
+"""Most Gauss-Newton steps; a good start needs half of them."""
 MAX_DISTANCE_M, MAX_NORMAL_DEG = 0.15, 30.0
 """Points of two surfaces are a pair no farther apart than this (plus the noise of depth), m, and no more inclined, degrees."""
 MIN_POINTS = 60
@@ -28,22 +28,21 @@ ASIDE = 4.0
 TAILS = 0.25
 """Share of a squared residual that is added to the variance of its point: a Cauchy weight of two standard deviations."""
 CORRELATION = 30.0
-"""Where it is asked whether surfaces hold each other or slide, so many neighbouring points count as one: depth errs alike
-over some cells."""
+"""So many neighbouring points count as one where sliding is tested: errors of depth are correlated over some cells."""
 PLANAR = np.array([0, 1, 5])
 OUT_OF_PLANE = np.array([2, 3, 4])
 COARSE_POINTS = 400
 NEARLY_SETTLED, SETTLED = 1e-2, 5e-4
 """While steps (m, rad) exceed the first, about so many points do; it ends with all of them and a step below the second."""
 LEAST_UNIT_VARIANCE = 0.1
-"""Residuals are never held for better than this share of the variance that the sensor's model gives."""
+"""Least variance of residuals, as a share of that of the sensor's model."""
 LOOSE = 1.0 / np.array([0.3, 0.3, np.deg2rad(10.0)]) ** 2
 """Information (m^-2, m^-2, rad^-2) that every edge keeps, so that a corridor's long axis stays loose and not infinite."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Prior:
-    """What is known beforehand, along the axes of the fixed robot.
+    """The prior of a registration, along the axes of the fixed robot.
 
     Attributes:
         delta: (3,) pose by the wheels (anything where there are none).
@@ -186,9 +185,8 @@ def _summarise(
 def _information(pairing: Pairing) -> Array:
     """Information (6, 6) of the matched points, each with the variance that the residuals show.
 
-    Normals are noisy, and squared noise passes for information: a bare wall would seem to hold the slide along itself. The
-    product of either point's own normal has no such bias, since they err independently; what comes out below nothing is
-    nothing.
+    Squared noise of normals looks like information: a bare wall would seem to hold the slide along itself. The product of the
+    two points' own normals has no such bias, as their errors are independent. Negative results count as 0.
     """
     unit = max(pairing.mean(pairing.residual**2 / pairing.variance), LEAST_UNIT_VARIANCE)
     J_fixed, J_moving = wrenches(pairing.arm, pairing.normal), wrenches(pairing.arm, pairing.turned)

@@ -1,4 +1,4 @@
-"""How far registrations really err, learnt while driving from how badly three of them close."""
+"""The noise of registrations, learnt while driving from rings of three of them."""
 
 from __future__ import annotations
 
@@ -9,38 +9,38 @@ import numpy as np
 from hybridmap.geometry import RelativePose, between, compose_relative, log
 
 NOISE_FACTOR = 10.0
-"""What the residuals' covariance is multiplied by, until closures of registrations have shown by how much: as for a Kinect."""
+"""Factor on the residuals' covariance until there are enough rings: that of a Kinect."""
 QUANTILE = 0.7
 CHI2_QUANTILE = 3.665
-"""The quantile of the closures' squared error that is looked at, and what it is for three degrees of freedom: above the
-median, because errors have heavier tails than the law."""
+"""Quantile of the rings' squared error that is compared, and its value for three degrees of freedom: above the median, as
+errors have heavier tails."""
 SHARED = 2.0
-"""Two of the three registrations of a closure share each keyframe, whose noise they misread alike: half of it hides."""
+"""Registrations of one ring share keyframes and their noise: half of it does not show in the ring."""
 REMEMBERED = 200
 ENOUGH = 15
-"""Closures that are remembered, and how many it takes before they are believed."""
+"""Number of rings that are kept, and the least number that counts."""
 
 
 class NoiseLevel:
     """A factor on the covariance that the residuals of a registration give.
 
-    Residuals know the noise of a single point. They do not know what errs alike over a whole surface (calibration, a bias of
-    depth, blur), which makes real edges several times worse than simulated ones. The registrations from k-2 to k-1, from
-    k-1 to k and from k-2 to k must close; how badly they do, in terms of their own covariances, is the factor.
+    Residuals do not show errors that a whole surface shares (calibration, bias of depth, blur), and which make real edges
+    several times worse than simulated ones. The factor is the squared error of the ring k-2 to k-1, k-1 to k and k-2 to k,
+    relative to its covariance.
     """
 
     def __init__(self, initial: float = NOISE_FACTOR) -> None:
-        """Begin with a factor that holds until enough closures have been seen."""
+        """Begin with the factor that holds until there are enough rings."""
         self._factor = initial
         self._squared: deque[float] = deque(maxlen=REMEMBERED)
 
     @property
     def factor(self) -> float:
-        """What covariances are multiplied by; 1 or more."""
+        """Factor on covariances; 1 or more."""
         return self._factor
 
     def observe(self, first: RelativePose, second: RelativePose, across: RelativePose) -> None:
-        """Take in a closure: from k-2 to k-1, from k-1 to k, and from k-2 to k, with covariances as the residuals give them."""
+        """Add a ring: k-2 to k-1, k-1 to k, and k-2 to k, with the residuals' covariances."""
         around = compose_relative(first, second)
         error = log(between(around.delta, across.delta))
         self._squared.append(float(error @ np.linalg.solve(around.covariance + across.covariance, error)))

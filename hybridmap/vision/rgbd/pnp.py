@@ -82,13 +82,13 @@ class PnpSolver:
 FLOORS, HELD_FLOORS = (0.0001, 0.005), (0.01, 0.2)
 """Least standard deviations of a loop edge, m and degrees: of a mounted camera, and of one whose tilt comes from the floor."""
 KEYPOINT_REACH_M = 0.3
-"""Matched keypoints farther apart than this at a guess, beside what that is off by, are no matches, m."""
+"""Largest distance of matched keypoints at a guess, beside the error of the guess, m."""
 ROUGH_M, ROUGH_DEG = 0.1, 3.0
 """Standard deviations of a pose by features as prior of its refinement, m and degrees."""
 ALONE_M, ALONE_DEG = 0.1, 1.5
-"""Standard deviations of an edge by as few features as may measure one alone, m and degrees."""
+"""Standard deviations of an edge by the least number of features alone, m and degrees."""
 GUESSED = 2.0
-"""Standard deviations of a guess over which features are looked for around it."""
+"""Factor on the standard deviation of a guess within which features are matched."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,13 +108,13 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """Outcome: the pose of the target in the source's frame and the record of how it was found.
+    """Outcome: the pose of the target in the source's frame, and the record of the decision.
 
     Attributes:
         relative: the pose; None where a check failed, or something was lacking.
         method: what it was measured by.
         checks: in the order in which they were asked.
-        lack: what there was too little of; None: nothing.
+        lack: what it lacked beside checks, if anything.
         figures: further figures.
     """
 
@@ -125,7 +125,7 @@ class Verification:
     figures: Mapping[str, float] = field(default_factory=dict)
 
     def proposed(self, source: int, target: int, key: int, candidate: Candidate, lack: Lack | None = None) -> Edge:
-        """The loop that it stands for, with what it lacks where it passed."""
+        """Its edge, with what it lacks where all checks passed."""
         return Edge.decided(
             source,
             target,
@@ -158,7 +158,7 @@ class Verifier:
         self._level = level
 
     def verify(self, source: Keyframe, target: Keyframe) -> Verification:
-        """Measure the target's pose in the source's frame, or say why not."""
+        """Measure the target's pose in the source's frame."""
         pairs = match(source.features, target.features)
         asked = checks.of_matches(len(pairs.first), self._min_inliers)
         if not passed(asked):
@@ -181,11 +181,11 @@ class Verifier:
         return self._refined(source, target, flat, pairs.first[both], pairs.second[both], asked)
 
     def verify_on_map(self, source: Keyframe, target: Keyframe, guess: RelativePose) -> Verification:
-        """Measure by depth alone, from where the map has the target (for views that share surfaces but no features).
+        """Measure by depth alone, from the map's pose: for views that share surfaces but no features.
 
         Args:
             source, target: the keyframes.
-            guess: the target in the source's frame as the map has it, and how far that may be off.
+            guess: the target in the source's frame on the map, with its covariance.
         """
         fit = register(source.surface, target.surface, from_planar(guess.delta), guess)
         if fit is None:
@@ -196,11 +196,11 @@ class Verifier:
         return Verification(self._calibrated(fit.relative, source, target), Method.DEPTH, asked)
 
     def verify_near(self, source: Keyframe, target: Keyframe, guess: RelativePose) -> Verification:
-        """Measure from where the map has the target: by depth and the features that the guess brings together, else by depth.
+        """Measure from the map's pose: by depth and the features that match there, else by depth alone.
 
         Args:
             source, target: the keyframes.
-            guess: the target in the source's frame as the map has it, and how far that may be off.
+            guess: the target in the source's frame on the map, with its covariance.
         """
         pairs = point_pairs(
             source,
@@ -254,7 +254,7 @@ class Verifier:
         return Verification(relative, Method.FEATURES_AND_DEPTH, asked, figures=figures)
 
     def _features_alone(self, flat: FloorPose, inliers: int, asked: tuple[Check, ...]) -> Verification:
-        """No depth to refine on or to object: many features must agree, and the edge is looser."""
+        """Without depth in common view: more features must agree, and the edge is looser."""
         asked += checks.of_features_alone(inliers)
         if not passed(asked):
             return Verification(None, Method.FEATURES, asked)
@@ -267,7 +267,7 @@ class Verifier:
 
 
 def _flat(T_source_target: Array, source: Keyframe, target: Keyframe) -> FloorPose:
-    """Planar pose between the levelled bases; height and tilt as the stances had them."""
+    """Planar pose between the levelled bases; height and tilt before levelling."""
     raw = to_floor(T_source_target)
     level = level_pair(T_source_target, source.surface.stance, target.surface.stance)
     return FloorPose(level.delta, raw.height_m, raw.tilt_rad)

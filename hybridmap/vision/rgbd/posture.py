@@ -1,4 +1,4 @@
-"""Where the camera was in a level base at each keyframe: as mounted, or as the floor plane in its depth image says."""
+"""Pose of the camera in a level base at each keyframe: as mounted, or from the floor plane in its depth image."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ AGREE_HEIGHT_M = 0.06
 """A floor seen within this of the mounting does not contradict it."""
 FIRST_TOLERANCE_M = 0.3
 LATER_TOLERANCE_M = 0.12
-"""How far the height may be from the mounting's, and from that of the last floors once some have been seen."""
+"""Largest difference of height from the mounting's, and from that of the last floors once there are some, m."""
 REMEMBERED_FLOORS = 15
 MIN_FLOORS = 3
 TRUSTED_FLOORS, RELAXED_EVERY = 20, 5
@@ -40,13 +40,13 @@ ON_FLOOR = (float(np.deg2rad(0.5)), 0.02)
 PROPAGATED = (float(np.deg2rad(3.0)), 0.06)
 """Standard deviations of tilt (rad) and height (m): as mounted on a robot, measured on the floor, propagated."""
 NODS_DEG = (0.0, 8.0, -8.0, 16.0, -16.0, 24.0, -24.0, 32.0, -32.0)
-"""Where the features do not tell, the head may have nodded by one of these."""
+"""Changes of pitch that are tried where features do not give the turn, degrees."""
 MIN_FOLLOWED = 15
-"""Features that must agree before the camera's turn since the last keyframe is believed."""
+"""Least number of features that agree on the camera's turn since the last keyframe."""
 
 
 class Posture:
-    """Decides how the camera is held, keyframe by keyframe."""
+    """Estimates the stance of the camera at each keyframe."""
 
     def __init__(self, mode: Literal["auto", "level", "floor"], T_base_camera: Array, solver: PnpSolver) -> None:
         self._mounting = T_base_camera
@@ -59,7 +59,7 @@ class Posture:
         self._unwatched = 0
 
     def stance(self, grid: DepthGrid, features: Features, last: Keyframe | None) -> Stance:
-        """How the camera is held at the keyframe after `last`."""
+        """Stance of the camera at the keyframe after `last`."""
         if not self._held and not self._looks():
             return self._as_mounted
         found = self._on_floor(grid)
@@ -74,7 +74,7 @@ class Posture:
         return Stance(found, *ON_FLOOR, True)
 
     def _looks(self) -> bool:
-        """Whether this keyframe's floor is looked for: once many have agreed with the mounting, only now and then."""
+        """Whether to look for the floor: at every keyframe, later at one in some, once many agreed with the mounting."""
         self._unwatched += 1
         if not self._watching or (self._agreed >= TRUSTED_FLOORS and self._unwatched < RELAXED_EVERY):
             return False
@@ -98,7 +98,7 @@ class Posture:
         return bool(tilted or abs(T_base_camera[2, 3] - self._mounting[2, 3]) > AGREE_HEIGHT_M)
 
     def _propagated(self, grid: DepthGrid, features: Features, last: Keyframe | None) -> Array:
-        """No floor in view: the last posture, turned by what the features say, then set upright by walls and tables."""
+        """Without a floor in view: the last pose, turned by features, then levelled by walls and flat surfaces."""
         before = self._mounting if last is None else last.surface.stance.T_base_camera
         followed = None if last is None else self._followed(last, features)
         guess = before if followed is None else followed
@@ -126,7 +126,7 @@ MIN_SHARE_BELOW = 0.03
 
 @dataclass(frozen=True, slots=True)
 class Floor:
-    """The floor as the camera sees it.
+    """The floor in the camera's frame.
 
     Attributes:
         up: (3,) unit vector, the vertical in the optical frame.
@@ -140,9 +140,9 @@ class Floor:
 
 
 def find_floor(grid: DepthGrid, up_nominal: Array, height_nominal_m: float, tolerance_m: float, min_cells: int) -> Floor | None:
-    """Find the floor: the best-supported plane that faces up at about the nominal height, with next to nothing below it.
+    """Find the floor: the plane of most cells that faces up at about the nominal height, with few points below it.
 
-    Every hypothesis is the plane of one grid cell (evenly spread, so nothing is random).
+    Hypotheses are the planes of evenly spread grid cells; nothing is random.
 
     Args:
         grid: depth of the frame.
@@ -175,10 +175,10 @@ def find_floor(grid: DepthGrid, up_nominal: Array, height_nominal_m: float, tole
 
 
 def vertical_of_structure(normals: Array, guesses: Array) -> Array:
-    """Vertical (3,) of an indoor scene near one of some guesses: walls stand upright, floors, tables and ceilings lie flat.
+    """Vertical (3,) of an indoor scene, of upright and flat surfaces, near one of some guesses.
 
-    From each guess least squares over the normals that belong to either (re-chosen a few times), with the guess as a weak
-    prior; of the outcomes the one that most normals agree with, less what the guess lies farther off the first one.
+    Each guess is refined by least squares over the normals of such surfaces. The result with most agreeing normals wins, less
+    a penalty for guesses far from the first.
 
     Args:
         normals: (N, 3) unit normals in the optical frame.

@@ -1,4 +1,4 @@
-"""How a camera is held at one keyframe: rigid transforms in space, what of them lies on the floor, and how sure that is."""
+"""The camera's pose in a level base at one keyframe, and rigid transforms in space."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Stance:
     Attributes:
         T_base_camera: (4, 4), the base being level.
         tilt_sigma_rad, height_sigma_m: standard deviations of roll and pitch, and of the height.
-        held: measured at this keyframe (hand-held) and not taken from the mounting.
+        held: measured at this keyframe (hand-held); False: taken from the mounting.
     """
 
     T_base_camera: Array
@@ -40,9 +40,9 @@ class LevelPair:
 
 
 def camera_on(up: Array, height_m: float, T_base_camera_nominal: Array) -> Array:
-    """Pose (4, 4) of the camera in a level base: nominal place and heading of the optical axis, given tilt and height.
+    """Pose (4, 4) of the camera in a level base, of given tilt and height and of nominal position and heading.
 
-    A camera that looks straight up or down has no heading of its axis; there the image's right-hand axis takes its place.
+    The heading is that of the optical axis; of the image's x axis for a camera that looks straight up or down.
 
     Args:
         up: (3,) the vertical in the optical frame, unit length.
@@ -68,12 +68,12 @@ def camera_on(up: Array, height_m: float, T_base_camera_nominal: Array) -> Array
 
 
 def level_pair(T_fixed_moving: Array, fixed: Stance, moving: Stance) -> LevelPair:
-    """Split a measured transform between two bases into a planar pose, by one vertical for both cameras.
+    """Level a measured transform between two bases: a planar pose, with one vertical for both cameras.
 
-    The pose between the *cameras* is what was measured; each stance says where up is, and the surer one says it louder.
+    The measured pose between the cameras is kept. The vertical is the mean of the stances', weighted by inverse variances.
 
     Args:
-        T_fixed_moving: (4, 4) between the bases as the stances had them.
+        T_fixed_moving: (4, 4) between the bases of the stances.
         fixed, moving: the stances.
     """
     T_cameras = inverse_rigid(fixed.T_base_camera) @ T_fixed_moving @ moving.T_base_camera
@@ -89,7 +89,7 @@ def level_pair(T_fixed_moving: Array, fixed: Stance, moving: Stance) -> LevelPai
 
 @dataclass(frozen=True, slots=True)
 class FloorPose:
-    """A rigid transform between two bases, split into its planar part and what should be nothing.
+    """A rigid transform between two bases: its planar part, and height and tilt, which should be 0.
 
     Attributes:
         delta: (3,) x, y in m and yaw in rad.
@@ -137,9 +137,9 @@ def rotation_of(rotvec: Array) -> Array:
 
 
 def wrenches(arm: Array, direction: Array) -> Array:
-    """Directions (3, N) over their moments (numpy's own cross product is several times slower): (6, N).
+    """Directions (3, N) over their moments about the origin, (6, N).
 
-    So the distance of a point at `arm` (3, N) along its direction changes with a shift and with a turn about the origin.
+    They are the derivatives of the distance of a point at `arm` (3, N) along its direction by a shift and a turn.
     """
     out = np.empty((6, arm.shape[1]))
     ax, ay, az = arm

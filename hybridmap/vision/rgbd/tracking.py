@@ -22,15 +22,15 @@ from hybridmap.vision.rgbd.pairs import PointPairs, point_pairs
 from hybridmap.vision.rgbd.stance import Stance, from_planar
 
 BACK = 2
-"""How many earlier nodes a new one is registered to: three registrations of three nodes show how well they close."""
+"""Number of earlier nodes that a new one is registered to: with 2, three registrations form a ring."""
 KEYPOINT_REACH_M = 0.3
-"""Matched keypoints farther apart than this at the first guess are no matches, m: wheels err less over a step."""
+"""Largest distance of matched keypoints at the first guess, m: wheels err less over a step."""
 FLOORS, HELD_FLOORS = (0.0001, 0.005), (0.002, 0.06)
 """Least standard deviations of a consecutive edge, m and degrees: of a mounted camera, and of one whose tilt comes from the
 floor plane."""
 STRAIGHTENED_RAD = float(np.deg2rad(0.4))
 STRAIGHTENED_M = 0.01
-"""What a registration adds to the uncertainty of a posture that it hands on."""
+"""Standard deviations that a registration adds to a stance that it propagates."""
 
 
 class Tracker:
@@ -69,7 +69,7 @@ class Tracker:
         return proposals
 
     def _learn(self, node: int) -> None:
-        """Let the noise level see how well the newest three registrations close."""
+        """Give the noise level the ring of the newest three registrations."""
         sides = [self._measured.get(side) for side in ((node - 2, node - 1), (node - 1, node), (node - 2, node))]
         if sides[0] is not None and sides[1] is not None and sides[2] is not None:
             self._level.observe(sides[0], sides[1], sides[2])
@@ -122,7 +122,7 @@ class Tracker:
 
 
 def _what_slides(relative: RelativePose, odometry: RelativePose) -> dict[str, float]:
-    """How loose a registration is, and the direction, seen from the new node, that odometry knows better, if there is one."""
+    """The loosest standard deviation of a registration; and that direction in the new node, if odometry knows it better."""
     loosest_m, direction = loosest_direction(relative.covariance)
     along = np.array([np.cos(direction), np.sin(direction)])
     if loosest_m**2 < along @ odometry.covariance[:2, :2] @ along:
@@ -131,7 +131,7 @@ def _what_slides(relative: RelativePose, odometry: RelativePose) -> dict[str, fl
 
 
 def _straightened(fixed: Keyframe, moving: Keyframe, fit: Registration) -> Keyframe:
-    """The moving keyframe with the posture that its surer neighbour gives it; itself if it is as sure."""
+    """The moving keyframe with the stance propagated from its neighbour, if that is more certain than its own."""
     before, of = fixed.surface.stance, moving.surface.stance
     if before.tilt_sigma_rad + STRAIGHTENED_RAD >= of.tilt_sigma_rad:
         return moving

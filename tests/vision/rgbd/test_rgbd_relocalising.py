@@ -15,7 +15,7 @@ from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status
 from hybridmap.mapper import Mapper
 from hybridmap.streams.base import Rig
 from hybridmap.vision.relocalising import ChainState
-from hybridmap.vision.rgbd import checks, whole_map
+from hybridmap.vision.rgbd import checks, global_search
 from hybridmap.vision.rgbd.global_search import GlobalSearch, chain_state
 from hybridmap.vision.rgbd.pnp import Verification, Verifier
 from hybridmap.vision.templates import Matcher
@@ -140,7 +140,7 @@ def test_the_likeliest_views_some_nodes_apart_are_verified(monkeypatch):
     for profile in profiles:
         matcher.add(profile)
     verifier = FakeVerifier({(30, 12): (0.1, 0.0, 0.0)})
-    monkeypatch.setattr(whole_map, "CANDIDATES", 3)
+    monkeypatch.setattr(global_search, "CANDIDATES", 3)
     found = GlobalSearch(keyframes, matcher, verifier, iter(range(99)).__next__).search(30, np.arange(25))
     assert len(found) == 3
     assert (found[0].target, found[0].status) == (12, Status.PENDING)
