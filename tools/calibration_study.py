@@ -15,7 +15,7 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import numpy as np
 from barred import at_least, at_most
@@ -38,6 +38,7 @@ LENGTHS_M = (16.8, 70.0)
 EVERY_M = 0.5
 _OF_RAW = "end error in % of raw"
 BARS = {("fr079", 16.8): 0.6, ("aces", 16.8): 0.6, ("fr079", 70.0): 0.7, ("aces", 70.0): 0.7}
+Row = dict[str, Any]
 COLUMNS = (
     "log",
     "trained on",
@@ -110,9 +111,9 @@ def windows(log: Log, gains: Gains, delay_s: float, length_m: float) -> tuple[Ar
     return (pairs.stamps_ns[first[near]] - stamps[0]) / NS_PER_S, errors
 
 
-def judge(log: Log, how: str, estimate: Estimate, table: TextIO) -> list[dict[str, object]]:
+def judge(log: Log, how: str, estimate: Estimate, table: TextIO) -> list[Row]:
     """Errors of raw and calibrated dead reckoning, for each length of window."""
-    rows: list[dict[str, object]] = []
+    rows: list[Row] = []
     for length in LENGTHS_M:
         start, raw = windows(log, NEUTRAL, 0.0, length)
         if not len(raw):
@@ -149,12 +150,10 @@ def judge(log: Log, how: str, estimate: Estimate, table: TextIO) -> list[dict[st
     return rows
 
 
-def line(row: dict[str, object]) -> str:
+def line(row: Row) -> str:
     """One row of the table."""
-    bar = BARS.get((str(row["log"]), float(str(row["length_m"]))))
-    s = row["sigmas"]
-    assert isinstance(s, list)
-    met = bar is not None and float(str(row["delay_mean"])) <= bar
+    bar = BARS.get((row["log"], row["length_m"]))
+    s, met = row["sigmas"], bar is not None and row["delay_mean"] <= bar
     cells = [
         f"{row['log']}",
         f"{row['trained']}",
@@ -173,22 +172,20 @@ def line(row: dict[str, object]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def judged(rows: list[dict[str, object]]) -> list[Metric]:
+def judged(rows: list[Row]) -> list[Metric]:
     """The figures that have a bar: end error of calibrated dead reckoning in % of raw, and how many robots get better.
 
     Every log is judged by gains and delay together, unrounded: that is what `calibrate --out` writes and the mapper applies.
     """
     metrics = []
     for found in rows:
-        length = float(str(found["length_m"]))
-        bar = BARS.get((str(found["log"]), length))
+        length = found["length_m"]
+        bar = BARS.get((found["log"], length))
         if bar is not None:
             name = f"end_error/{found['log']}-{length:g}m-{found['trained']}"
-            metrics.append(
-                at_most(name, 100.0 * float(str(found["delay_mean"])), 100.0 * bar, f"{_OF_RAW}, mean over all windows", "%")
-            )
+            metrics.append(at_most(name, 100.0 * found["delay_mean"], 100.0 * bar, f"{_OF_RAW}, mean over all windows", "%"))
     for how in ("reference", "reference, all robots"):
-        ratios = [float(str(r["delay_mean"])) for r in rows if r["trained"] == how and r["length_m"] == LENGTHS_M[0]]
+        ratios = [r["delay_mean"] for r in rows if r["trained"] == how and r["length_m"] == LENGTHS_M[0]]
         if ratios:
             name = f"mrclam6-{how.replace(', ', '-').replace(' ', '-')}"
             median, better = 100.0 * float(np.median(ratios)), sum(ratio < 1.0 for ratio in ratios)
@@ -206,7 +203,7 @@ def main() -> None:
     parser.add_argument("--estimators", nargs="+", default=["alternating", "joint"])
     parser.add_argument("--json", action="store_true", help="print the figures with bars; the table goes to stderr")
     options = parser.parse_args()
-    rows: list[dict[str, object]] = []
+    rows: list[Row] = []
     table = sys.stderr if options.json else sys.stdout
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", flush=True, file=table)
     for name, (source, reference) in LASER.items():
