@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import re
+from pathlib import Path
 
 import pytest
 from configuration_page import PAGE, count, page, tables
@@ -10,6 +12,8 @@ from pydantic import ValidationError
 
 from hybridmap.config import Config, gone, named_configs
 from hybridmap.errors import ConfigError
+
+BEFORE = Path(__file__).with_name("config_before.yaml")
 
 
 def test_overrides_win_over_the_file_which_wins_over_defaults(tmp_path):
@@ -72,11 +76,32 @@ def test_a_refusal_names_the_file_or_who_overrode_it(tmp_path):
         ("simulation.wheels.slip_m", 0.1, "it is the constant SLIP_M in hybridmap/simulation/motion.py"),
         ("neural.dtype", "float32", "every population has double precision"),
         ("vision.laser.probes", {"points": 3}, "it is the constant POINTS in hybridmap/vision/laser/hypotheses.py"),
+        ("vision.laser.tracking", {"narrow": {"half_m": 3}}, "it is the constant NARROW in hybridmap/vision/laser/tracking.py"),
     ],
 )
 def test_a_setting_that_has_gone_says_what_became_of_it(key, value, said):
     with pytest.raises(ConfigError, match=rf"^command line: {key}(\.\w+)? is no longer a setting: {said}$"):
         Config.load(None, {key: value})
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "named"),
+    [
+        ("vision.laser.tracking.narrow.half_m", 3, "NARROW"),
+        ("vision.laser.commitment", {}, "WAIT_M"),
+        ("vision.laser.commitment", 3, "WAIT_M"),
+        ("vision.laser.commitment", {"none_such": 3}, "WAIT_M"),
+    ],
+)
+def test_what_lies_below_or_above_a_setting_that_has_gone_says_so_too(key, value, named):
+    with pytest.raises(ConfigError, match=named):
+        Config.load(None, {key: value})
+
+
+def test_all_settings_that_have_gone_are_named_at_once():
+    with pytest.raises(ConfigError, match=r"^\S+: 160 keys are no longer settings") as error:
+        Config.load(BEFORE)
+    assert {"vision.laser.tracking", "neural.dtype", "calibration.every_m"} <= {*re.findall(r"[\w.]+", str(error.value))}
 
 
 def test_a_setting_that_was_renamed_says_its_new_name():
@@ -97,6 +122,7 @@ def test_what_became_of_a_setting_is_true():
 def test_a_stored_configuration_is_read_without_what_has_gone():
     old = "nodes: {distance_m: 0.4}\nneural: {dtype: float64, gain: 1.5, place: {theta_hz: 7.5}}\n"
     assert Config.stored(old, "session") == Config.load(None, {"nodes.distance_m": 0.4, "neural.gain": 1.5})
+    assert Config.stored(BEFORE.read_text(), "session") == Config()
 
 
 def test_the_page_of_settings_is_current():

@@ -10,6 +10,7 @@ import yaml
 from numpy.typing import NDArray
 
 from hybridmap.config import Config
+from hybridmap.config.gone import without_gone
 from hybridmap.geometry import Array
 from hybridmap.metrics import Metric
 from hybridmap.odometry_model import GAIN_KEYS, NEUTRAL, Gains
@@ -138,11 +139,12 @@ def calibrated(config_tree: dict[str, Any], estimate: Estimate, in_use: Gains) -
     Raises:
         ConfigError: the result is no configuration of this version, e.g. a delay beyond its limit.
     """
-    neural, sensors = dict(config_tree.get("neural") or {}), dict(config_tree.get("sensors") or {})
+    tree = without_gone(config_tree)
+    neural, sensors = dict(tree.get("neural") or {}), dict(tree.get("sensors") or {})
     if estimate.differs(in_use):
         neural |= dict(zip(GAIN_KEYS, estimate.kept(in_use).to_array().tolist(), strict=True))
     if estimate.delay_differs:
         sensors["odometry_delay_s"] = float(sensors.get("odometry_delay_s", 0.0)) + estimate.delay_s
-    tree = config_tree | {"neural": neural, "sensors": sensors}
+    tree |= {"neural": neural, "sensors": sensors}
     Config.from_tree(tree, "calibrated configuration, not written")
     return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True)

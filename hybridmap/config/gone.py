@@ -124,15 +124,12 @@ def constants() -> dict[str, tuple[str, str]]:
 
 
 def what_became_of(key: str, value: Any = None) -> str | None:
-    """One line on a removed setting; None if there never was such a setting.
+    """One line on a removed setting or section; None if there never was such a one.
 
     Args:
         key: dotted.
-        value: its value; if `key` is a removed section, the first key of that section is looked up.
+        value: its value; of a removed section it tells which of its settings is looked up.
     """
-    if isinstance(value, Mapping) and value and key not in {*RENAMED, *OTHERWISE}:
-        name = next(iter(value))
-        return what_became_of(f"{key}.{name}", value[name])
     if key in RENAMED:
         return f"{key} is now called {RENAMED[key]}"
     if key in OTHERWISE:
@@ -140,7 +137,12 @@ def what_became_of(key: str, value: Any = None) -> str | None:
     if key in constants():
         module, name = constants()[key]
         return f"{key} is no longer a setting: it is the constant {name} in hybridmap/{module}"
-    return None
+    inner = value.items() if isinstance(value, Mapping) else ()
+    found = next(filter(None, (what_became_of(f"{key}.{name}", held) for name, held in inner)), None)
+    first = next((old for old in (*constants(), *OTHERWISE, *RENAMED) if old.startswith(f"{key}.")), None)
+    if found is not None or first is None:
+        return found
+    return f"{key} is no longer a section of settings; {what_became_of(first)}"
 
 
 def without_gone(tree: Mapping[str, Any], at: str = "") -> dict[str, Any]:
@@ -152,7 +154,7 @@ def without_gone(tree: Mapping[str, Any], at: str = "") -> dict[str, Any]:
     """
     kept: dict[str, Any] = {}
     for dotted, value in _leaves(tree, at):
-        if dotted in OTHERWISE or dotted in constants():
+        if _is_gone(dotted):
             continue
         *sections, last = RENAMED.get(dotted, dotted).removeprefix(f"{at}." if at else "").split(".")
         place = kept
@@ -165,7 +167,11 @@ def without_gone(tree: Mapping[str, Any], at: str = "") -> dict[str, Any]:
 def _leaves(tree: Mapping[str, Any], at: str) -> Iterator[tuple[str, Any]]:
     for key, value in tree.items():
         dotted = f"{at}.{key}" if at else str(key)
-        if isinstance(value, Mapping):
+        if isinstance(value, Mapping) and not _is_gone(dotted):
             yield from _leaves(value, dotted)
         else:
             yield dotted, value
+
+
+def _is_gone(dotted: str) -> bool:
+    return dotted in OTHERWISE or dotted in constants()

@@ -32,12 +32,16 @@ def said(error: ValidationError, section: str = "") -> str:
         error: of a section.
         section: dotted name of that section in the whole configuration; empty for the whole.
     """
-    first = min(error.errors(), key=lambda complaint: complaint["type"] != "extra_forbidden")
+    complaints = error.errors()
+    unknown = {_dotted(section, *each["loc"]): each.get("input") for each in complaints if each["type"] == "extra_forbidden"}
+    gone = {key: fate for key, value in unknown.items() if (fate := what_became_of(key, value)) is not None}
+    if len(gone) > 1:
+        return f"{len(gone)} keys are no longer settings; the first: {next(iter(gone.values()))}; all: {', '.join(gone)}"
+    if gone:
+        return next(iter(gone.values()))
+    first = min(complaints, key=lambda complaint: complaint["type"] != "extra_forbidden")
     kind, message = first["type"], first["msg"]
-    where = ".".join(str(part) for part in first["loc"])
-    gone = what_became_of(f"{section}.{where}" if section else where, first.get("input"))
-    if gone is not None:
-        return gone
+    where = _dotted("", *first["loc"])
     if kind == "extra_forbidden":
         return f"unknown key {where!r}"
     if kind == "missing":
@@ -52,6 +56,10 @@ def said(error: ValidationError, section: str = "") -> str:
         expected = message.removeprefix("Input should be ")
         message = f"expected {'a number ' if expected.startswith(('greater', 'less')) else ''}{expected}"
     return f"{where}: {message}, found {repr(first.get('input'))[:80]}"
+
+
+def _dotted(section: str, *parts: int | str) -> str:
+    return ".".join(str(part) for part in (section, *parts) if part != "")
 
 
 def read_mapping(path: Path, error: type[HybridMapError] = ConfigError) -> dict[str, Any]:

@@ -30,6 +30,11 @@ def test_a_delay_is_added_to_the_one_in_use():
     assert written(tree, estimate_of(delay_s=0.05)).sensors.odometry_delay_s == 0.1  # 2.5 sigma
 
 
+def test_settings_that_have_gone_are_left_out():
+    tree = {"neural": {"dtype": "float32"}, "vision": {"laser": {"tracking": {"narrow": {"half_m": 3.0}}}}, "seed": 4}
+    assert written(tree, estimate_of()) == Config(seed=4)
+
+
 def test_what_does_not_load_is_not_written():
     tree = {"sensors": {"odometry_delay_s": 0.5}}
     with pytest.raises(ConfigError, match=r"not written: sensors\.odometry_delay_s: .*less than or equal to 1, found 1\.4"):
