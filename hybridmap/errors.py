@@ -1,6 +1,6 @@
-"""The tree of errors: one root, a subclass a stage.
+"""The errors of hybridmap: one root class, and a subclass per stage.
 
-Library code raises these; only the command line turns one into a line and exit code 2.
+The library raises them; only the command line turns an error into one line and exit code 2.
 A message names the file, topic or field, what was found, what was expected and what to do.
 """
 
@@ -18,19 +18,19 @@ class StreamError(HybridMapError):
 
 
 class OutputError(HybridMapError):
-    """A file or folder that cannot be written: taken, of another kind, being written by another run, or out of reach."""
+    """A file or folder that cannot be written: it exists, is of another kind, is in use by another run, or is not writable."""
 
 
 class GeometryError(HybridMapError):
-    """A pose, covariance or trajectory that is not one: wrong shape, NaN, not positive definite."""
+    """An invalid pose, covariance or trajectory: wrong shape, NaN, not positive definite."""
 
 
 class GraphError(HybridMapError):
-    """A graph that contradicts itself: unknown node, edge onto itself, disconnected, no edges."""
+    """An invalid graph: unknown node, edge from a node to itself, disconnected, no edges."""
 
 
 class BackendError(HybridMapError):
-    """A solver that does not exist, or that refused or failed on a graph."""
+    """A back-end that does not exist, or that refused or failed on a graph."""
 
 
 class StoreError(HybridMapError):
@@ -38,12 +38,12 @@ class StoreError(HybridMapError):
 
 
 class ExportError(HybridMapError):
-    """An export that the session cannot give."""
+    """An export that the session does not support."""
 
 
 class EvaluationError(HybridMapError):
-    """A comparison without enough common data."""
+    """An evaluation or calibration without enough common data."""
 
 
 class StudyError(HybridMapError):
-    """A study that cannot go on: its sources, its workers or its cluster."""
+    """A study that cannot continue: its sources, its workers or its cluster."""

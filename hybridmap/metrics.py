@@ -1,4 +1,4 @@
-"""A figure with its name, unit and meaning: one list gives the table for people and the JSON for programs."""
+"""A figure with its name, unit and meaning. One list gives the table for people and the JSON for programs."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class Metric:
 
     Attributes:
         name: `<measure>/<backend or stage>`, e.g. `ate_rmse/gtsam-gnc`.
-        value: NaN where it could not be computed.
+        value: NaN if it could not be computed.
         unit: `m`, `deg`, `s`, `1`, ...
         description: one line for people.
-        bar: the limit that it is held against, if any.
-        passed: whether it keeps to the bar.
+        bar: the limit of the figure, if any.
+        passed: whether the figure keeps its bar.
     """
 
     name: str
@@ -45,12 +45,12 @@ class Metric:
 
 
 FIGURES: dict[str, tuple[str, str]] = {
-    "nodes": ("1", "experiences"),
+    "nodes": ("1", "nodes of the map"),
     "loops_accepted": ("1", "loop closures in the graph"),
     "loops_pending": ("1", "loop closures still waiting at the end"),
     "loops_rejected": ("1", "loop closures refused, each with its reason"),
-    "loops_retracted": ("1", "loop closures that were in the graph and were taken back"),
-    "loops_tried_again": ("1", "loops without weight, measured again on the final map"),
+    "loops_retracted": ("1", "loop closures that were removed from the graph again"),
+    "loops_tried_again": ("1", "outlier loops, measured again on the final map"),
     "loops_readmitted": ("1", "of those, the ones that now agree with it"),
     "odometry_dropped": ("1", "odometry edges that a registration contradicted"),
     "largest_correction": ("m", "largest shift of a node at one closure"),
@@ -60,19 +60,19 @@ FIGURES: dict[str, tuple[str, str]] = {
     "cpu_s/": ("s", "process time of {what}"),
     "cpu_s_per_min": ("s/min", "process time a minute of recording"),
     # of a solution
-    "chi2_initial/": ("1", "referee's chi2 of the poses to begin with"),
-    "chi2/": ("1", "referee's chi2 at the end, over all edges"),
-    "chi2_odometry/": ("1", "share of chi2 that is not of loops"),
-    "unit_variance/": ("1", "chi2 of the edges kept per degree of freedom; 1 where the stated noise is the true one"),
+    "chi2_initial/": ("1", "chi2 of the initial poses"),
+    "chi2/": ("1", "chi2 at the end, over all edges"),
+    "chi2_odometry/": ("1", "share of chi2 from edges other than loops"),
+    "unit_variance/": ("1", "chi2 of the inlier edges per degree of freedom; 1 if the stated covariances are right"),
     "iterations/": ("1", "iterations, sweeps or updates"),
-    "loops_rejected/": ("1", "accepted loops that it gave no weight"),
-    "rejected_loops/": ("1", "loop edges that the back-end holds for false"),
+    "loops_rejected/": ("1", "accepted loops rejected as outliers by the back-end"),
+    "rejected_loops/": ("1", "loop edges rejected as outliers"),
     "rejected_together/": ("1", "of those, the ones that agree with each other"),
-    "weak_edges/": ("1", "odometry and registration edges of next to no weight"),
-    "hanging_nodes/": ("1", "nodes that only such edges and rejected loops hold"),
+    "weak_edges/": ("1", "odometry and registration edges down-weighted to less than a tenth"),
+    "hanging_nodes/": ("1", "nodes that only such edges and rejected loops join to the first node"),
     "certificate_gap/": (
         "1",
-        "proved relative gap of the isotropised objective at its optimum beside the map, over the edges kept",
+        "proved relative gap of the isotropised objective at its optimum near the map, over the inlier edges",
     ),
     # of a trajectory, against the truth
     "ate_rmse/": ("m", "absolute trajectory error after SE(2) alignment, RMSE; {when}"),
@@ -112,7 +112,7 @@ FIGURES: dict[str, tuple[str, str]] = {
     "edge_rot_p95/": ("deg", "rotational error of {which}, 95 %"),
     "edge_chi2_ratio/": ("1", "normalised squared error of {which}, median, over the expected median"),
     "edges_wrong/": ("1", "share of {which} that are wrong by more than 1 m"),
-    "edges_wrong_kept/": ("1", "of those, how many the primary back-end gave more than half weight"),
+    "edges_wrong_kept/": ("1", "of those, how many the primary back-end gave a weight above one half"),
     # of views, before any verification
     "pair_auc/": ("1", "chance that a pair of one place scores better than another, {pairs} pairs"),
     "candidate_top1/": ("1", "share whose best match of all older nodes is the same place, {views}"),
@@ -129,7 +129,7 @@ ONLINE = "_online"
 
 
 def figure(name: str, value: float, **facts: object) -> Metric:
-    """A figure of the list, `<measure>` or `<measure>/<back-end or stage>`, its words filled with `facts`."""
+    """A figure of the list, `<measure>` or `<measure>/<back-end or stage>`; `facts` fill in its description."""
     measure, slash, _ = name.partition("/")
     unit, words = FIGURES[measure.removesuffix(ONLINE) + slash]
     return Metric(name, float(value), unit, words.format(**facts))
@@ -141,10 +141,10 @@ def to_json(head: dict[str, Any], metrics: Iterable[Metric]) -> str:
 
 
 class StageClock:
-    """Process time by stage; kept apart from results, which never depend on it.
+    """Process time by stage; results never depend on it.
 
     Attributes:
-        cpu_s: seconds by stage. A stage within another counts by itself alone, so that the sum is that of all stages.
+        cpu_s: seconds by stage. A nested stage is not counted in the outer one, so the sum is the time of all stages.
     """
 
     def __init__(self) -> None:
@@ -153,7 +153,7 @@ class StageClock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the process time of the block to a stage, but for that of the stages within it."""
+        """Add the process time of the block to a stage, without the time of nested stages."""
         self._within.append(0.0)
         start = time.process_time()
         try:

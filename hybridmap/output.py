@@ -1,7 +1,7 @@
-"""What commands write: held against other runs, replaced whole or not at all, and whole again after a kill.
+"""Output files and folders: locked against other runs, replaced completely or not at all, and repaired after a kill.
 
-A folder that is written in place, such as a session, is `held`. What is written in one go, such as a recording or an export,
-is `staged` beside its place. What differs between them is a `Kind`.
+A folder that is written in place, such as a session, is `held`. An output that is written at once, such as a recording or
+an export, is `staged` in a folder next to its target. A `Kind` describes what differs between outputs.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class Kind:
     """A kind of output folder.
 
     Attributes:
-        name: what messages call it.
-        files: names of its files and folders; nothing else in the folder is ever touched.
+        name: its name in messages.
+        files: names of its files and folders; nothing else in the folder is ever changed.
         is_ours: whether a folder holds an output of this kind.
-        continued: the next run goes on with what is there, and need not be told to overwrite it.
-        useful_unfinished: what a run wrote before Ctrl-C is worth keeping.
+        continued: a new run continues an existing output, without `--overwrite`.
+        useful_unfinished: the output of a run interrupted by Ctrl-C is kept.
     """
 
     name: str
@@ -48,14 +48,14 @@ class Kind:
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """A folder that is held, as `held` gives it."""
+    """A locked folder, as given by `held`."""
 
     path: Path
     kind: Kind
 
     @contextmanager
     def replaced(self) -> Iterator[None]:
-        """Set the old output aside while the block writes the new one; an error brings it back, the end drops it."""
+        """Move the old output aside while the block writes the new one; it is restored on an error and deleted at the end."""
         with _named(self.path):
             self._set_aside()
         try:
@@ -70,7 +70,7 @@ class Held:
             shutil.rmtree(self.path / _DROPPED, ignore_errors=True)
 
     def _admit(self, *, overwrite: bool) -> None:
-        """Repair what a killed run left, and refuse what must not be written to."""
+        """Repair what a killed run left, and refuse a folder that must not be written to."""
         previous = self.path / PREVIOUS
         _refuse_strangers(self.path, self.kind, previous, self.path / _MOVING)
         self._move_back()
@@ -107,7 +107,7 @@ class Held:
             moving.rmdir()
 
     def _restore(self) -> None:
-        """Remove the new output and bring back the one that was set aside, if there is one."""
+        """Delete the new output and restore the old one, if there is one."""
         for name in self.kind.files:
             _remove(self.path / name)
         if (self.path / PREVIOUS).is_dir():
@@ -117,13 +117,13 @@ class Held:
 
 @contextmanager
 def held(folder: Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Held]:
-    """Make a folder for an output of a kind and hold it against other runs in the block.
+    """Make a folder for an output of a kind, and lock it against other runs during the block.
 
-    If the block leaves the folder empty it goes again, with the parents that were made for it.
+    If the block leaves the folder empty, the folder and the parents made for it are removed.
 
     Raises:
-        OutputError: it is a file, holds something else, holds one of the kind and `overwrite` is not given, another run
-            is writing there, or it cannot be written to.
+        OutputError: it is a file, holds something else, holds an output of this kind without `overwrite`, is in use by another
+            run, or is not writable.
     """
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file; expected a folder that is empty or does not exist")
@@ -137,17 +137,17 @@ def held(folder: Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Held]
 
 @contextmanager
 def staged(*targets: Path, kind: Kind | None = None, overwrite: bool = False) -> Iterator[Path]:
-    """Yield a folder beside the targets; what the block writes there under their names takes their places at its end.
+    """Yield a folder next to the targets. Files that the block writes there, named like the targets, replace them at its end.
 
     An error leaves everything as it was.
 
     Args:
-        targets: files side by side; with a `kind`, a file or a folder of that kind, which is replaced whole.
+        targets: files in one folder; with a `kind`, one file or folder of that kind, which is replaced completely.
         kind: of the folder.
-        overwrite: replace what is there.
+        overwrite: replace existing targets.
 
     Raises:
-        OutputError: a target is there and may not be replaced, another run is writing it, or it cannot be written.
+        OutputError: a target exists and may not be replaced, is in use by another run, or cannot be written.
     """
     with _named(targets[0]), ExitStack() as stack:
         _refuse(targets, kind, overwrite=overwrite)
@@ -163,7 +163,7 @@ def staged(*targets: Path, kind: Kind | None = None, overwrite: bool = False) ->
 
 
 def is_held(folder: Path) -> bool:
-    """Whether a run writes in a folder now."""
+    """Whether a run is writing in a folder now."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         return not _take(handle, fcntl.LOCK_SH)
@@ -172,13 +172,13 @@ def is_held(folder: Path) -> bool:
 
 
 def holds_only(folder: Path, names: tuple[str, ...]) -> bool:
-    """Whether there is something in a folder, and nothing but these names and what this module hides there."""
+    """Whether a folder is not empty, and holds nothing but these names and the hidden files of this module."""
     found = _entries(folder) - {PREVIOUS, _MOVING, _DROPPED}
     return bool(found) and found <= set(names)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file in one move, so that a reader or a crash never meets half of it; makes the folder.
+    """Write a text file atomically: a reader or a crash never sees a partial file. Makes the folder.
 
     Raises:
         OutputError: it cannot be written.
@@ -187,7 +187,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """The same for any file."""
+    """Write a binary file atomically; as `write_text`."""
     partial = _partial(path)
     with _named(path):
         try:
@@ -208,7 +208,7 @@ def _partial(path: Path) -> Path:
 
 
 def _entries(folder: Path) -> set[str]:
-    """What is in a folder, half-written files apart; empty where there is no folder."""
+    """The entries of a folder, without partial files; empty if there is no folder."""
     entries = folder.iterdir() if folder.is_dir() else ()
     return {entry.name for entry in entries if entry.is_dir() or not (entry.name[0] == "." and entry.suffix == ".partial")}
 
@@ -237,7 +237,7 @@ def _refuse_own(folder: Path, kind: Kind, *, overwrite: bool) -> None:
 
 
 def _clear(work: Path, target: Path) -> None:
-    """Empty the folder of a staged output; the old one is put back if it lies there still, between two moves."""
+    """Empty the folder of a staged output; if a kill between two moves left the old output there, restore it."""
     if (work / PREVIOUS).exists() and not target.exists():
         (work / PREVIOUS).rename(target)
     for rest in work.iterdir():
@@ -276,9 +276,9 @@ def _named(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _locked(folder: Path, what: Path) -> Iterator[None]:
-    """Make a folder and hold a lock on it: the kernel forgets the lock when the process dies, and nothing is left in it.
+    """Make a folder and lock it. The kernel releases the lock when the process dies, and no lock file remains.
 
-    A file system without locks holds nobody off.
+    A file system without locks gives no protection.
     """
     made: list[Path] = []
     handle = _lock(folder, what, made)

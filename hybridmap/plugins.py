@@ -1,4 +1,4 @@
-"""Implementations by name, to which others may add: by a call, or by an entry point of an installed package."""
+"""Tables of implementations by name, which others extend: by a call, or by an entry point of an installed package."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ T = TypeVar("T")
 
 
 class Table(Generic[T]):
-    """Name -> factory. Names of our own come first and cannot be taken; entry points are loaded when they are asked for."""
+    """Name -> factory. Our own names come first and cannot be replaced; entry points are loaded on demand."""
 
     def __init__(self, what: str, own: Mapping[str, T], group: str, error: type[HybridMapError]) -> None:
-        """A table of some implementations.
+        """Make a table.
 
         Args:
-            what: word for one of them in errors, e.g. `back-end`.
-            own: those of this package.
-            group: of the entry points by which installed packages add theirs.
-            error: raised for a name that there is not, or is there already.
+            what: what an entry is called in errors, e.g. `back-end`.
+            own: implementations of this package.
+            group: entry point group with which installed packages add theirs.
+            error: raised for an unknown name, and for a name that is taken.
         """
         self._what, self._group, self._error = what, group, error
         self._own = dict(own)
@@ -43,14 +43,14 @@ class Table(Generic[T]):
         return tuple(dict.fromkeys((*self._own, *self._registered, *(point.name for point in self._entry_points()))))
 
     def values(self) -> tuple[T, ...]:
-        """What every name stands for, ours first."""
+        """The implementations of all names, ours first."""
         return tuple(self[name] for name in self.names())
 
     def __getitem__(self, name: str) -> T:
         """The factory of a name.
 
         Raises:
-            HybridMapError: there is none; the message lists the known names. Or its package cannot be imported.
+            HybridMapError: the name is unknown (the message lists the known ones), or its package cannot be imported.
         """
         for known in (self._own, self._registered):
             if name in known:
@@ -74,12 +74,12 @@ class Table(Generic[T]):
 
 
 def packages() -> dict[str, str]:
-    """Name and version of each installed package that adds to a table of ours."""
+    """Name and version of each installed package that extends one of our tables."""
     points = entry_points()
     ours = (point for group in points.groups if group.startswith("hybridmap.") for point in points.select(group=group))
     return {point.dist.name: point.dist.version for point in ours if point.dist is not None}
 
 
 def loaded(path: str) -> Any:
-    """What `module:name` names, imported now: heavy modules wait until they are needed."""
+    """Import the object named by `module:name` now; heavy modules are imported only when needed."""
     return EntryPoint(path, path, "").load()

@@ -1,4 +1,4 @@
-"""Calibration of odometry: linear gain, turn gain and heading bias per metre, from closed loops or from a reference."""
+"""Calibration of odometry: gain, turn gain and heading bias per metre, from loop closures or from a reference trajectory."""
 
 from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.legs import Legs, Motion

@@ -1,4 +1,4 @@
-"""What a calibration says: the estimate, how sure it is, and whether it differs from what is in use."""
+"""The result of a calibration: the estimate, its covariance, and whether it differs from the values in use."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ class Estimate:
 
     Attributes:
         gains: the estimate.
-        delay_s: how late the legs' clock is against that of odometry: odometry of stamp t tells where the robot is at
-            t + delay_s. A nuisance, estimated so that it does not pass for a turn gain.
-        covariance: (4, 4) of gain, turn gain, bias and delay, by the information matrix and the unit variance; the variance
-            of what the drive does not tell is infinite, and its value the neutral one.
-        leg_m: length of the legs that it was made from.
+        delay_s: delay of the odometry clock: odometry of stamp t gives the pose at t + delay_s. Estimated together with the
+            gains, as a delay would otherwise look like an error of the turn gain.
+        covariance: (4, 4) of gain, turn gain, bias and delay, from the information matrix and the unit variance. An
+            unobservable value has infinite variance, and is neutral.
+        leg_m: length of the legs.
         legs: number of independent legs, i.e. travel over length.
         travel_m: path length that was used.
         unit_variance: mean squared residual of a leg, in units of the assumed variance.
-        downweighted: share of legs that count less than half (drop-outs).
+        downweighted: share of legs with a weight below one half (drop-outs).
     """
 
     gains: Gains
@@ -57,32 +57,30 @@ class Estimate:
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """(4,) whether the drive told gain, turn gain, bias and delay."""
+        """(4,) whether gain, turn gain, bias and delay were observable."""
         return np.isfinite(np.diag(self.covariance))
 
     def kept(self, in_use: Gains) -> Gains:
-        """The gains to use from now on: what was measured, and the one in use in place of what was not."""
+        """The gains to use from now on: the estimate where it was observable, else the value in use."""
         return Gains.from_array(np.where(self.measured[:3], self.gains.to_array(), in_use.to_array()))
 
     def off(self, other: Gains = NEUTRAL) -> Array:
-        """(3,) how many standard deviations gain, turn gain and bias lie from others; 0 where not measured."""
+        """(3,) distance of gain, turn gain and bias from other values, in standard deviations; 0 if unobservable."""
         difference = self.gains.to_array() - other.to_array()
         return np.asarray(difference / np.maximum(self.sigmas[:3], 1e-12))
 
     @property
     def delay_differs(self) -> bool:
-        """Whether the delay differs significantly from none."""
+        """Whether the delay differs significantly from zero."""
         return bool(abs(self.delay_s) > SIGNIFICANT_SIGMAS * self.sigmas[3])
 
     def differs(self, other: Gains = NEUTRAL) -> bool:
-        """Whether any of the three differs significantly from others."""
+        """Whether any of the three gains differs significantly from other values."""
         return bool(np.any(np.abs(self.off(other)) > SIGNIFICANT_SIGMAS))
 
 
 def metrics_of(estimate: Estimate, in_use: Gains) -> list[Metric]:
-    """Each gain with its standard deviation and how far it lies from the one in use (NaN where the drive does not tell it);
-    then what it was made from.
-    """
+    """Each gain with its standard deviation and distance from the value in use (NaN if unobservable); then the data used."""
     rows: list[Metric] = []
     told, sigmas, off = estimate.measured, estimate.sigmas, estimate.off(in_use)
     values = np.append(estimate.gains.to_array(), estimate.delay_s)
@@ -106,12 +104,12 @@ def metrics_of(estimate: Estimate, in_use: Gains) -> list[Metric]:
 
 
 def changes(estimate: Estimate, in_use: Gains) -> bool:
-    """Whether the estimate changes a configuration: a gain differs from the one in use, or the delay from none."""
+    """Whether the estimate changes a configuration: a gain differs from that in use, or the delay from zero."""
     return estimate.differs(in_use) or estimate.delay_differs
 
 
 def verdict(estimate: Estimate, in_use: Gains) -> str:
-    """One line for people: what is significant, what follows, and what the drive did not tell."""
+    """One line for people: which values differ significantly, what changes, and what was unobservable."""
     names = [name for name, _, _ in _NAMED]
     clear = [name for name, far in zip(names, estimate.off(in_use), strict=True) if abs(far) > SIGNIFICANT_SIGMAS]
     if clear:
@@ -131,13 +129,13 @@ def verdict(estimate: Estimate, in_use: Gains) -> str:
 
 
 def calibrated(config_tree: dict[str, Any], estimate: Estimate, in_use: Gains) -> str:
-    """A configuration (the nested mapping of its file) with what the estimate changes in it, as YAML that `Config.load` reads.
+    """A configuration (the nested mapping of its file) with the estimate, as YAML that `Config.load` reads.
 
-    The gains change together, where one of them is significant: each is estimated given the others. One that was not
-    measured stays. The delay is judged alone, and added to the one in use: it is what that one left.
+    If one gain differs significantly, all observable gains change together, as each is estimated given the others. The delay
+    is decided separately; the estimate is what remained of the delay in use, so it is added to that.
 
     Raises:
-        ConfigError: the result is no configuration of this version, e.g. a delay beyond its limit.
+        ConfigError: the result is not a valid configuration of this version, e.g. a delay beyond its limit.
     """
     tree = without_gone(config_tree)
     neural, sensors = dict(tree.get("neural") or {}), dict(tree.get("sensors") or {})

@@ -1,10 +1,9 @@
 """Joint calibration: gain, turn gain, heading bias and delay as one more variable of the GTSAM graph.
 
-A heading bias is no outlier: it is in every odometry edge, and no robust kernel takes it out. As a variable it bends the whole
-chain, so that loops which a drifted chain contradicts fit again. The problem has local minima (another winding number of
-the chain), so several starts of the bias are tried, each from poses that an incremental relaxation has grown along the
-chain made with that bias; the lowest objective wins. The odometry's share alone would not tell: a drive that has shrunk to a
-point costs it little.
+A heading bias is in every odometry edge, so no robust kernel removes it. As a variable it bends the whole chain, so that
+loops that contradict a drifted chain fit again. The problem has local minima (other winding numbers of the chain), so
+several initial biases are tried, each from poses grown by incremental relaxation along the chain made with that bias.
+The lowest objective wins. The odometry part of the objective alone would not suffice: it is small for a map shrunk to a point.
 """
 
 from __future__ import annotations
@@ -53,13 +52,13 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """The map and the calibration that explain each other.
+    """A map and the calibration estimated with it.
 
     Attributes:
         poses: (N, 3) of the nodes.
         estimate: the calibration.
         cost: the objective, robust in odometry and loops; the lowest of the starts.
-        bias_start_rad_m: from where it was found.
+        bias_start_rad_m: initial bias of this solution.
     """
 
     poses: Array
@@ -78,7 +77,7 @@ def solve(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config
         config: settings of the relaxation and the kernels.
 
     Raises:
-        EvaluationError: the drive does not tell turn gain and heading bias, or the result is no odometry's calibration.
+        EvaluationError: turn gain and heading bias are unobservable, or the result is out of range.
         BackendError: no start led to a solution.
     """
     require_told_by(Sighting(motion, stamps_ns, graph.initial))
@@ -105,15 +104,15 @@ def solve(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config
 
 
 def told_by_the_drive(estimate: Estimate) -> Estimate:
-    """The estimate without the gain and the delay that only the prior held.
+    """The estimate without a gain or delay that only the prior determined.
 
     Raises:
-        NotToldError: it holds turn gain or heading bias.
+        NotToldError: only the prior determined turn gain or heading bias.
     """
     open_ = np.diag(estimate.covariance) > _OPEN * estimate.unit_variance * PRIOR**2
     if open_[1] or open_[2]:
         raise NotToldError(
-            "calibration: the drive and its loops tell neither turn gain nor heading bias better than was known before; "
+            "calibration: the drive and its loops determine neither turn gain nor heading bias better than was known before; "
             "expected a drive that turns and closes loops"
         )
     values = np.where(open_, _NEUTRAL, np.append(estimate.gains.to_array(), estimate.delay_s))
@@ -135,12 +134,12 @@ class Problem:
         self._evaluated: tuple[bytes, Array, Array] | None = None
 
     def open_way(self) -> float:
-        """Share of the way on which nothing but odometry joins a node to the next."""
+        """Share of the travel on which only odometry joins consecutive nodes."""
         only = self.terms.components == 3
         return float(np.sum(self.terms.legs.travel_m[only])) / max(float(self.motion.travel_m[-1]), 1e-9)
 
     def grown(self, start: Gains) -> Array:
-        """Poses (N, 3) by relaxation as the graph grew, with odometry as this start has it."""
+        """Poses (N, 3) by incremental relaxation, with odometry calibrated by this start."""
         graph = chain(corrected(self.graph, self.motion, self.stamps_ns, start))
         poses = graph.initial
         for solution in backends.replay(backends.create(RELAXATION, self.config), graph):
@@ -148,7 +147,7 @@ class Problem:
         return poses
 
     def solve(self, poses: Array, variable: Array, scale: float, bias_start_rad_m: float) -> Joint | None:
-        """From given poses (N, 3) and calibration (4,); None where GTSAM fails or the poses are not finite."""
+        """Solve from given poses (N, 3) and calibration (4,); None if GTSAM fails or the poses are not finite."""
         gains = Gains.from_array(variable[:3])
         self.terms = terms_of(self.graph, self.motion, self.stamps_ns, gains).scaled(scale)
         self._evaluated = None
@@ -166,21 +165,21 @@ class Problem:
         return self._result(solved, np.asarray(marginal), float(nonlinear.error(solved)), bias_start_rad_m)
 
     def scale(self, poses: Array, variable: Array) -> float:
-        """How much larger than assumed the odometry residuals are, by their median."""
+        """Ratio of the odometry residuals to their assumed size, by the median."""
         norms = np.linalg.norm(self._residuals(poses, variable), axis=1)
         expected = np.array([_MEDIAN_OF_NORM[rows] for rows in self.terms.components])
         return max(float(np.median(norms / expected)), 1e-3)
 
     def require_held(self, poses: Array) -> None:
-        """Refuse a map that dropped nearly all that could contradict its calibration.
+        """Refuse a map that rejected nearly all edges that could contradict its calibration.
 
         Raises:
-            NotToldError: fewer than three edges besides odometry count at least half on it.
+            NotToldError: fewer than three edges besides odometry have a weight of at least one half.
         """
         held = int(np.count_nonzero(squared_norms(self.others, poses) <= self.config.robust.cauchy_scale**2))
         if held < _HELD:
             raise NotToldError(
-                f"calibration: found {held} of {self.others.n_edges} loop closures that hold on the map, "
+                f"calibration: found {held} of {self.others.n_edges} loop closures that agree with the map, "
                 f"expected {_HELD} or more; give a drive that comes back to more places"
             )
 
@@ -190,7 +189,7 @@ class Problem:
         return np.asarray(np.einsum("eij,ej->ei", self.terms.whiten, compose(inverse(predicted), apart)))
 
     def evaluate(self, variable: Array) -> tuple[Array, Array]:
-        """Displacements (E, 3) of all terms and their derivatives (E, 3, 4), computed once a value of the variable."""
+        """Displacements (E, 3) of all terms and their derivatives (E, 3, 4), computed once per value of the variable."""
         mark = variable.tobytes()
         if self._evaluated is None or self._evaluated[0] != mark:
             gains, delay_s = Gains.from_array(variable[:3]), float(variable[3])
@@ -230,7 +229,7 @@ class Problem:
 
 
 def leg_error(problem: Problem, terms: OdometryTerms, index: int) -> Callable[[Any, Any, Any], Array]:
-    """Whitened error (3,) of one term: where the target is, seen from where calibrated odometry has it."""
+    """Whitened error (3,) of one term: the pose of the target relative to its prediction by calibrated odometry."""
     source, target = int(terms.sources[index]), int(terms.targets[index])
     whiten, key = terms.whiten[index], problem.key
 

@@ -1,4 +1,4 @@
-"""Legs: stretches of raw odometry whose end is known otherwise, and how that end depends on the calibration."""
+"""Legs: stretches of raw odometry between known poses, and the derivative of their displacement by the calibration."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Motion:
     steps: Array
 
     def poses(self, gains: Gains) -> Array:
-        """Dead reckoning (S + 1, 3) from the origin under some gains, m and rad; headings are not wrapped."""
+        """Dead reckoning (S + 1, 3) from the origin with given gains, m and rad; headings are not wrapped."""
         return chain(apply(self.steps, gains))
 
     @property
@@ -49,11 +49,11 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Legs:
-    """Stretches of raw odometry between pairs of instants, on the clock of whatever measured their ends.
+    """Stretches of raw odometry between pairs of times, on the clock of the poses at their ends.
 
     Attributes:
         motion: the odometry.
-        first_ns, last_ns: (L,) int64, begin and end of each leg.
+        first_ns, last_ns: (L,) int64, start and end of each leg.
     """
 
     motion: Motion
@@ -74,7 +74,7 @@ class Legs:
         return self._difference(self.motion.turned_rad, 0.0)
 
     def select(self, kept: NDArray[np.bool_] | NDArray[np.int64]) -> Legs:
-        """Some of the legs."""
+        """A subset of the legs."""
         return Legs(self.motion, self.first_ns[kept], self.last_ns[kept])
 
     def predict(self, gains: Gains, delay_s: float = 0.0) -> Array:
@@ -82,7 +82,7 @@ class Legs:
 
         Args:
             gains: the calibration.
-            delay_s: odometry of stamp t tells where the robot is at t + delay_s on the legs' clock.
+            delay_s: odometry of stamp t gives the pose at t + delay_s on the legs' clock.
         """
         path = self.motion.poses(gains)
         first, last = self._at(path, self.first_ns, delay_s), self._at(path, self.last_ns, delay_s)
@@ -92,8 +92,8 @@ class Legs:
         """Derivative (L, 3, 4) of `predict` by (gain, turn gain, bias, delay), as a right perturbation.
 
         The heading of step k is the sum of the calibrated turns before it and half of its own; its derivatives are the same
-        sums of raw turn and of raw way forward. The chord of step k shortens as its own turn grows. The derivative by the delay
-        is a central difference.
+        sums of raw turn and of raw forward travel. The chord of step k shortens as its own turn grows. The derivative by the
+        delay is a central difference.
         """
         forward, left, turned = twists(self.motion.steps).T
         turn = gains.turn_gain * turned + gains.heading_bias_rad_m * forward
@@ -127,7 +127,7 @@ class Legs:
 
 
 def corrected(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], gains: Gains, delay_s: float = 0.0) -> PoseGraph:
-    """A graph, of nodes at some stamps (N,), with the odometry edges of calibrated odometry; uncertainties stay."""
+    """The graph with its odometry edges recomputed from calibrated odometry; their information is unchanged."""
     own, deltas = own_odometry(graph), graph.deltas.copy()
     legs = Legs(motion, stamps_ns[graph.sources[own]], stamps_ns[graph.targets[own]])
     deltas[own] = legs.predict(gains, delay_s)

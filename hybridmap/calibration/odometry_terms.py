@@ -1,7 +1,7 @@
-"""Which stretches of odometry enter the joint graph, and how sure each is.
+"""The odometry terms of the joint graph, and their covariances.
 
-Between nodes that a registration joins, the map stands without odometry: there long, overlapping legs enter, by their heading
-and length, for the reasons that `regression.py` gives. Elsewhere every consecutive pair of nodes keeps its odometry edge.
+Where registrations join all nodes, the map does not need odometry. There long, overlapping legs are used, by their heading
+and length, for the reasons given in `regression.py`. Elsewhere every consecutive pair of nodes keeps its odometry edge.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class OdometryTerms:
     Attributes:
         legs: (E,) the odometry.
         sources, targets: (E,) nodes at their ends.
-        whiten: (E, 3, 3) takes the pose of the target, seen from where odometry has it, to a residual of unit variance.
-        components: (E,) how many components the residual has.
-        overlap: how many terms cover a place of the way; their information is divided by it.
+        whiten: (E, 3, 3) maps the pose of the target relative to its prediction to a residual of unit variance.
+        components: (E,) number of components of the residual.
+        overlap: number of terms that cover each part of the drive; their information is divided by it.
     """
 
     legs: Legs
@@ -42,7 +42,7 @@ class OdometryTerms:
     overlap: float
 
     def scaled(self, scale: float) -> OdometryTerms:
-        """The same with standard deviations larger by a factor."""
+        """The terms with standard deviations multiplied by a factor."""
         return replace(self, whiten=self.whiten / scale)
 
 
@@ -53,7 +53,8 @@ def terms_of(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], gai
         graph: nodes and accepted edges.
         motion: raw odometry.
         stamps_ns: (N,) of the nodes.
-        gains: by which the direction of a long leg's chord is taken.
+        gains: used for the direction of a long leg's chord.
+        consecutive: use one term for every odometry edge, whether there are registrations or not.
     """
     own = own_odometry(graph)
     carried = np.zeros(graph.n_nodes, dtype=bool)  # node k: joined to k + 1 by a registration
@@ -78,7 +79,7 @@ def terms_of(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], gai
 def _long_legs(
     carried: NDArray[np.bool_], stamps_ns: NDArray[np.int64], motion: Motion
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Ends of legs that lie wholly on a stretch which registrations carry, four of them over each place."""
+    """Ends of legs within stretches that are joined by registrations, four legs over each place."""
     travel = np.interp(stamps_ns, motion.stamps_ns, motion.travel_m)
     leg_m = leg_length(float(travel[-1] - travel[0]))
     starts = np.searchsorted(travel, np.arange(travel[0], travel[-1], leg_m / _OVERLAP))

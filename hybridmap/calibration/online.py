@@ -1,4 +1,4 @@
-"""Calibration while driving: the gains follow the map as soon as the map is sure that they are wrong."""
+"""Online calibration: the gains change while driving, once the map shows with certainty that they are wrong."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class GainChange:
     """New gains, in use from a stamp on.
 
     Attributes:
-        stamp_ns: of the last step with the old ones.
-        gains: the new ones.
-        estimate: what they rest on.
+        stamp_ns: of the last step with the old gains.
+        gains: the new gains.
+        estimate: the estimate behind them.
     """
 
     stamp_ns: int
@@ -39,7 +39,7 @@ class GainChange:
 
     @property
     def row(self) -> list[float]:
-        """As the map file keeps it: stamp_ns, gain, turn gain, heading bias."""
+        """The row in the map file: stamp_ns, gain, turn gain, heading bias."""
         return [self.stamp_ns, *self.gains.to_array().tolist()]
 
     def __str__(self) -> str:
@@ -49,9 +49,9 @@ class GainChange:
 
 
 class OnlineCalibration:
-    """Collects raw odometry, and from time to time regresses it on the map.
+    """Collects raw odometry, and at intervals regresses it on the map. Does nothing if online calibration is off.
 
-    The odometry edges that are in the map stay as they were measured; new gains hold for the way ahead.
+    Existing odometry edges do not change; new gains apply to the rest of the drive.
     """
 
     def __init__(self, gains: Gains) -> None:
@@ -65,7 +65,7 @@ class OnlineCalibration:
         self._due_m = FIRST_M
 
     def observe(self, stamp_ns: int, delta_robot: Array) -> None:
-        """Take in a raw step (3,) that ends at a stamp; a second step at one stamp must not move."""
+        """Add a raw step (3,) that ends at a stamp; a second step with the same stamp must be zero."""
         if self._stamps_ns and stamp_ns <= self._stamps_ns[-1]:
             return
         if self._stamps_ns:
@@ -74,12 +74,12 @@ class OnlineCalibration:
         self._stamps_ns.append(stamp_ns)
 
     def follow(self, stamp_ns: int, graph: Callable[[], PoseGraph], poses: Callable[[], Array]) -> GainChange | None:
-        """A node was made: the change of gains that the map asks for, if it does.
+        """Called when a node was made: the change of gains to apply, or None.
 
         Args:
             stamp_ns: of the node.
-            graph: gives nodes and accepted edges, the new node included; called only when an estimate is due, as is
-            poses: gives (N, 3) of all nodes on the map.
+            graph: returns nodes and accepted edges, with the new node. Called only if an estimate is due, as is
+            poses: returns (N, 3) of all nodes on the map.
         """
         self._node_stamps_ns.append(stamp_ns)
         if self._travel_m < self._due_m or not np.any(graph().kinds != EdgeKind.ODOMETRY):

@@ -1,16 +1,15 @@
-"""Regression of odometry on known poses: the robust estimate of gain, turn gain, heading bias and delay.
+"""Regression of odometry on known poses: a robust estimate of gain, turn gain, heading bias and delay.
 
-Two things make it differ from a plain least-squares fit. Legs are long and overlap: drift is what counts, while the noise
-of each pose (and the choice of nodes by the very odometry that is calibrated) matters less the longer a leg is. And the
-delay between odometry and the views is estimated along: a scan that is stamped 0.1 s late looks like an error of 10 deg in
-heading at each end of a fast turn.
+It differs from plain least squares in two ways. Legs are long and overlap: the drift grows with a leg, while the noise of its
+end poses does not. The delay between odometry and the sensor is estimated as well: a scan with a stamp 0.1 s late looks like
+an error of 10 deg in heading at each end of a fast turn.
 
 Only two components of a leg are used: the heading at its end, linear in turn gain, bias and delay, and its length along the
-measured chord, linear in the gain. What is seen sideways depends on the mounting of the sensor and on *where* on the leg the
-heading went wrong, and would bias the estimate.
+measured chord, linear in the gain. The lateral component depends on the sensor's mounting and on *where* on the leg the
+heading error arose, and would bias the estimate.
 
-A drive that does not tell turn gain and heading bias is refused. A gain or a delay that it does not tell is left out of the
-fit, and out of what `Estimate.kept` changes.
+If turn gain and heading bias are unobservable, the drive is refused. An unobservable gain or delay is left out of the fit
+and is not changed by `Estimate.kept`.
 """
 
 from __future__ import annotations
@@ -67,8 +66,8 @@ class Sighting:
 
     Attributes:
         motion: raw odometry.
-        stamps_ns: (N,) int64 instants at which poses are known, increasing.
-        poses: (N, 3) the poses there, in any frame, m and rad.
+        stamps_ns: (N,) int64 stamps of the known poses, increasing.
+        poses: (N, 3) the known poses, in any frame, m and rad.
     """
 
     motion: Motion
@@ -84,15 +83,15 @@ class _Drive:
 
 
 def regress(sightings: Sequence[Sighting], leg_m: float | None = None) -> Estimate:
-    """Estimate the calibration that one or more drives have in common.
+    """Estimate one calibration from one or more drives.
 
     Args:
         sightings: drives of one robot (or of robots of one kind).
         leg_m: length of the legs, m, `SHORTEST_M` or more; default: a sixteenth of the mean drive, within `LEG_M`.
 
     Raises:
-        EvaluationError: too little travel between known poses, a drive that does not tell turn gain and heading bias, or an
-            estimate that cannot be odometry's.
+        EvaluationError: too little travel between known poses, unobservable turn gain or heading bias, or an estimate out
+            of range.
     """
     if leg_m is not None:
         require_leg(leg_m)
@@ -110,7 +109,7 @@ def regress(sightings: Sequence[Sighting], leg_m: float | None = None) -> Estima
 
 
 def require_leg(leg_m: float) -> None:
-    """Refuse a length of legs, m, that is none.
+    """Check a length of legs, m.
 
     Raises:
         EvaluationError: it is not finite or below `SHORTEST_M`.
@@ -120,10 +119,10 @@ def require_leg(leg_m: float) -> None:
 
 
 def require_told_by(sighting: Sighting) -> None:
-    """Refuse a drive whose odometry alone shows that no poses would tell turn gain and heading bias.
+    """Refuse a drive whose odometry alone shows that turn gain and heading bias are unobservable, whatever the poses.
 
     Raises:
-        NotToldError: as `require_told` has it.
+        NotToldError: as `require_told`.
     """
     way = _travel_at(sighting)
     legs = cut(sighting, way, leg_length(float(way[-1] - way[0]))).legs
@@ -131,7 +130,7 @@ def require_told_by(sighting: Sighting) -> None:
 
 
 def leg_length(travel_m: float) -> float:
-    """Length of the legs for a drive of some travel, m."""
+    """Length of the legs for a drive of a given travel, m."""
     return float(np.clip(travel_m / INDEPENDENT_LEGS, *LEG_M))
 
 
@@ -143,7 +142,7 @@ def leg_sigmas(legs: Legs) -> tuple[Array, Array]:
 
 
 def cut(sighting: Sighting, travel_m: Array, leg_m: float) -> _Drive:
-    """Legs of a length from every known pose on; a gap of known poses that makes one twice as long leaves it out."""
+    """Legs of a given length from every known pose; a leg that a gap between known poses makes twice as long is left out."""
     last = np.searchsorted(travel_m, travel_m + leg_m)
     first = np.flatnonzero(last < len(travel_m))
     last = last[first]
@@ -192,7 +191,7 @@ class _Fit:
 
 
 def _heading(drives: list[_Drive], sigma: Array, overlap: float) -> _Fit:
-    """Turn gain, bias and delay; the delay is 0 with infinite variance where the drives do not tell it."""
+    """Turn gain, bias and delay; an unobservable delay is 0 with infinite variance."""
     try:
         return _fit_heading(drives, sigma, overlap, 3)
     except NotToldError:
@@ -223,7 +222,7 @@ def _fit_heading(drives: list[_Drive], sigma: Array, overlap: float, unknowns: i
 
 
 def _require_found(values: Array, last_step: Array, sigmas: Array) -> None:
-    """Refuse a fit that says nothing, or that has not come to rest, or whose delay is none that clocks have."""
+    """Refuse a fit that is too uncertain, has not converged, or has an impossible delay."""
     vague = [name for name, sigma in zip(_HEADING, sigmas, strict=False) if not sigma <= MAX_SIGMA]
     if vague:
         raise NotToldError(
@@ -240,7 +239,7 @@ def _require_found(values: Array, last_step: Array, sigmas: Array) -> None:
 def _fit_length(
     drives: list[_Drive], gains: Gains, delay_s: float, sigma_m: Array, travel_m: Array, overlap: float
 ) -> _Fit | None:
-    """The gain from the legs' lengths along the measured chords, None if they do not tell it; `gains` has a gain of one."""
+    """The gain from the legs' lengths along the measured chords, None if unobservable; `gains` has a gain of one."""
     measured = np.concatenate([drive.measured[:, :2] for drive in drives])
     predicted = np.concatenate([drive.legs.predict(gains, delay_s)[:, :2] for drive in drives])
     length = np.hypot(measured[:, 0], measured[:, 1])
@@ -260,10 +259,10 @@ def _fit_length(
 
 
 def _weigh(residual: Array, slope: Array, overlap: float) -> _Fit:
-    """One step of iteratively reweighted least squares; `values` is what to subtract.
+    """One step of iteratively reweighted least squares; `values` are subtracted.
 
-    Cauchy weights with the scale of the residuals' median. Overlapping legs count once: the information is divided by how
-    many legs cover a place, and scaled by the weighted mean square of the residuals.
+    Cauchy weights with the scale of the residuals' median. Overlapping legs count once: the information is divided by the
+    number of legs over a place, and scaled by the weighted mean square of the residuals.
     """
     weights = _weights(residual)
     inverse = np.linalg.inv(slope.T @ (weights[:, None] * slope))
@@ -280,20 +279,20 @@ def _weights(residual: Array) -> Array:
 
 
 class NotToldError(EvaluationError):
-    """A drive that leaves open what was asked of it."""
+    """A requested parameter is unobservable in the drive."""
 
 
 def require_told(slope: Array) -> None:
-    """Refuse legs whose headings do not tell the unknowns: a value that a drive does not tell is never reported.
+    """Refuse legs whose headings leave the parameters unobservable, so that such a value is never reported.
 
-    A circle driven at one speed says how far the robot turned a metre, and nothing of whether turn gain or heading bias made it
-    so; the noise of odometry still tells the two columns of the fit apart, and the fit then explains noise.
+    On a circle at constant speed the turn per metre is known, but not whether turn gain or heading bias causes its error. The
+    noise of odometry still separates the two columns of the fit, which would then fit noise.
 
     Args:
         slope: (L, K) derivatives of the whitened (and weighted) headings by turn gain, heading bias and, with K = 3, delay.
 
     Raises:
-        NotToldError: the legs hardly turn, or two unknowns do the same to all of them.
+        NotToldError: the legs hardly turn, or two parameters have the same effect on all of them.
     """
     turn = float(np.sqrt(np.mean(slope[:, 0] ** 2)))
     if not turn >= MIN_TURN:
@@ -310,7 +309,7 @@ def require_told(slope: Array) -> None:
 
 
 def require_delay(delay_s: float) -> float:
-    """The delay, if it is one that a sensor's clock may have.
+    """Check that a delay is possible for a sensor's clock, and return it.
 
     Raises:
         EvaluationError: it is beyond `DELAY_LIMIT_S`.
@@ -324,7 +323,7 @@ def require_delay(delay_s: float) -> float:
 
 
 def condition_number(slope: Array) -> float:
-    """Condition number of the information matrix of a slope (L, K), each unknown in units of its own information."""
+    """Condition number of the information matrix of a slope (L, K), each parameter scaled by its own information."""
     norms = np.linalg.norm(slope, axis=0)
     if not (np.isfinite(norms).all() and np.all(norms > 0.0)):
         return float("inf")

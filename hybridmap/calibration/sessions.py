@@ -1,4 +1,4 @@
-"""Calibration of recorded sessions: from their closed loops, or from a reference trajectory."""
+"""Calibration of recorded sessions: from their loop closures, or from a reference trajectory."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ _ROUNDS = 5
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What a session folder holds that a calibration needs.
+    """The data of a session that a calibration needs.
 
     Attributes:
         name: the folder.
-        motion: raw odometry, i.e. with the gains of the session's configuration taken out again.
+        motion: raw odometry, without the gains of the session's configuration.
         graph: the accepted edges.
         stamps_ns: (N,) of the nodes.
         poses: (N, 3) of the nodes by the primary back-end.
-        config: of the session, as far as a calibration needs it: gains, delay and back-ends.
-        config_tree: all of it, as it stands in the map file.
-        sensors: what it was mapped with, in words.
+        config: the part of the session's configuration that a calibration needs: gains, delay and back-ends.
+        config_tree: the whole configuration, as stored in the map file.
+        sensors: the session's sensors, in words.
     """
 
     name: str
@@ -68,7 +68,7 @@ def read_drive(folder: Path) -> Drive:
 
     Raises:
         StoreError: no session there.
-        ConfigError: its gains, delay or back-ends are none.
+        ConfigError: its gains, delay or back-ends are invalid.
         EvaluationError: it holds no odometry.
     """
     SessionFolder(folder).require()
@@ -94,19 +94,19 @@ def estimate_of(
     estimator: str | None = None,
     leg_m: float | None = None,
 ) -> Estimate:
-    """Calibrate drives on references, one a drive, or without any on their own maps.
+    """Calibrate drives against references, one per drive, or, without references, against their own maps.
 
-    Drives with other sensors than the first are taken all the same, with a warning that they are hardly of one kind of robot.
+    Drives with other sensors than the first are accepted with a warning, as they may be of another kind of robot.
 
     Args:
-        drives: of one robot, or of robots of one kind, under the same gains and delay.
-        references: none, or one a drive.
+        drives: of one robot, or of robots of one kind, with the same gains and delay.
+        references: none, or one per drive.
         estimator: `alternating` (also None) or `joint`; only without references.
-        leg_m: length of the legs, m; None: by the drive. Not for `joint`, which takes its own.
+        leg_m: length of the legs, m; None: chosen from the drive. Not for `joint`.
 
     Raises:
-        EvaluationError: an option that is none or does not go with another, wrong number of references, a drive twice,
-            drives under different gains, or too little to go by.
+        EvaluationError: an invalid option or combination of options, a wrong number of references, a drive given twice,
+            drives with different gains, or too little data.
         BackendError: a map cannot be optimised.
     """
     require_options(len(drives), len(references), estimator, leg_m)
@@ -130,10 +130,10 @@ def estimate_of(
 
 
 def require_options(sessions: int, references: int, estimator: str | None, leg_m: float | None) -> None:
-    """Check what was asked for, before anything is read.
+    """Check the options before anything is read.
 
     Raises:
-        EvaluationError: as `estimate_of` has it.
+        EvaluationError: as `estimate_of`.
     """
     if estimator is not None and estimator not in ESTIMATORS:
         raise EvaluationError(f"unknown estimator {estimator!r}; there are {', '.join(ESTIMATORS)}")
@@ -150,7 +150,7 @@ def require_options(sessions: int, references: int, estimator: str | None, leg_m
 
 
 def require_one_calibration(drives: Sequence[Drive]) -> None:
-    """Refuse a recording that would count twice, and drives that no single calibration can follow on.
+    """Refuse a recording given twice, and drives with different calibrations in use.
 
     Raises:
         EvaluationError: two drives are of one recording, or their gains or delays in use differ.
@@ -169,10 +169,10 @@ def require_one_calibration(drives: Sequence[Drive]) -> None:
 
 
 def common_tree(drives: Sequence[Drive]) -> dict[str, Any]:
-    """The configuration that all drives were mapped with.
+    """The configuration shared by all drives.
 
     Raises:
-        EvaluationError: they differ; the first difference is named.
+        EvaluationError: they differ; the message names the first difference.
     """
     first = _flat(drives[0].config_tree)
     for drive in drives[1:]:
@@ -187,10 +187,10 @@ def common_tree(drives: Sequence[Drive]) -> dict[str, Any]:
 
 
 def alternating(drives: Sequence[Drive], leg_m: float | None = None) -> Estimate:
-    """Calibrate drives on their own maps: regress odometry on the map, correct the odometry edges, optimise, and again.
+    """Calibrate drives on their own maps: alternately regress odometry on the map, and optimise the map with the calibration.
 
     Raises:
-        EvaluationError: too little travel.
+        EvaluationError: a map of odometry alone, or too little travel.
         BackendError: a map cannot be optimised.
     """
     poses = [drive.poses for drive in drives]
@@ -204,7 +204,7 @@ def alternating(drives: Sequence[Drive], leg_m: float | None = None) -> Estimate
 
 
 def require_closures(drive: Drive) -> None:
-    """Refuse a map that would only give back the odometry it was made of.
+    """Refuse a map of odometry alone: a calibration against it would only give back the odometry.
 
     Raises:
         EvaluationError: there is no edge besides odometry.
@@ -232,7 +232,7 @@ def _optimise(drive: Drive, estimate: Estimate) -> Array:
 
 
 def _understood(tree: dict[str, Any], origin: str) -> Config:
-    """The calibration and back-ends of a session's configuration; the rest may be of another version."""
+    """The calibration and back-ends of a session's configuration; the other settings may be of another version."""
     in_use = {
         section: {key: value for key, value in (tree.get(section) or {}).items() if key in keys}
         for section, keys in _IN_USE.items()
@@ -246,7 +246,7 @@ def _in_use(config: Config) -> dict[str, float]:
 
 
 def _same_recording(one: Motion, other: Motion) -> bool:
-    """Whether the shorter of two motions is the begin of the longer one."""
+    """Whether the shorter of two motions is the start of the longer one."""
     steps = min(len(one.steps), len(other.steps))
     same = np.array_equal(one.stamps_ns[: steps + 1], other.stamps_ns[: steps + 1])
     return same and np.allclose(one.steps[:steps], other.steps[:steps], rtol=0.0, atol=1e-6)
@@ -261,7 +261,7 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _raw(steps: Array, stamps_ns: NDArray[np.int64], gains: Gains, changes: Sequence[Sequence[float]]) -> Array:
-    """Take the gains out again that were in use at each step."""
+    """Remove the gains that were in use at each step."""
     begin = [int(stamps_ns[0]), *(int(change[0]) for change in changes)]
     used = [gains, *(Gains.from_array(change[1:]) for change in changes)]
     parts = np.searchsorted(stamps_ns, begin)
@@ -270,7 +270,7 @@ def _raw(steps: Array, stamps_ns: NDArray[np.int64], gains: Gains, changes: Sequ
 
 
 def _seen(drive: Drive, truth: Trajectory) -> Sighting:
-    """Where the reference knows the robot, at instants a little apart."""
+    """Poses of the reference, at times a little apart."""
     motion = drive.motion
     known = np.flatnonzero(known_at(truth, motion.stamps_ns))
     if len(known) < 2:

@@ -1,4 +1,4 @@
-"""Sensors in: recordings and simulated drives as one kind of stream."""
+"""Sensor input: recordings and simulated drives as one kind of stream."""
 
 from hybridmap.streams.open import open_stream
 

@@ -1,6 +1,6 @@
-"""A bag file: its topics, its messages in the order of recording, and one clear error for whatever is wrong with it.
+"""A bag file: its topics, its messages in recorded order, and one clear error for any damage.
 
-ROS 1 `.bag`, ROS 2 folders with `metadata.yaml`, bare `.mcap` and `.db3` files, read by `rosbags` without ROS.
+ROS 1 `.bag`, ROS 2 folders with `metadata.yaml`, single `.mcap` and `.db3` files, read by `rosbags` without ROS.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Topic:
     Attributes:
         name: with its leading slash.
         msgtype: as `sensor_msgs/msg/LaserScan`, for ROS 1 too.
-        count: number of messages that the bag says it holds.
+        count: number of messages according to the bag.
     """
 
     name: str
@@ -56,7 +56,7 @@ class RawMessage:
 
     Attributes:
         topic: name.
-        number: its place within the topic, from 0.
+        number: index within the topic, from 0.
         data: serialised bytes.
     """
 
@@ -66,13 +66,13 @@ class RawMessage:
 
 
 class BagFile:
-    """A bag that opens; the file is closed between readings, so any number of them may run."""
+    """A bag that can be read. The file is closed between readings, so several readings can run at once."""
 
     def __init__(self, path: Path) -> None:
-        """Open the bag once and learn its topics.
+        """Open the bag once and read its topics.
 
         Raises:
-            StreamError: missing, empty, cut off, not indexed, or no bag at all.
+            StreamError: missing, empty, truncated, not indexed, or not a bag.
         """
         self.path = path
         self.is_ros1 = path.suffix == ".bag"
@@ -93,7 +93,7 @@ class BagFile:
         self._types = {topic.name: topic.msgtype for topic in self.topics}
 
     def raw(self, names: Collection[str]) -> Iterator[RawMessage]:
-        """Messages of the named topics in the order of recording.
+        """Messages of the named topics in recorded order.
 
         Raises:
             StreamError: the file is damaged.
@@ -129,7 +129,7 @@ class BagFile:
         return int(seconds) * NS_PER_S + int(nanoseconds)
 
     def decode(self, message: RawMessage) -> Any:
-        """The message as an object with the fields of its type.
+        """Decode a message into an object with the fields of its type.
 
         Raises:
             StreamError: the bytes are not of that type.
@@ -177,12 +177,12 @@ class BagFile:
 
 
 def _plain(part: object) -> str:
-    """What an error says, on one line, without the quotes of a nested one."""
+    """The text of an error on one line, without nested quotes."""
     return " ".join(str(part).replace("('", "").replace("',)", "").split())
 
 
 def _check_databases(path: Path) -> None:
-    """Refuse a `.db3` file that is shorter than its own header says: SQLite itself may not notice."""
+    """Refuse a `.db3` file that is shorter than its header says; SQLite itself may not notice."""
     for file in sorted(path.glob("*.db3")) if path.is_dir() else [path] if path.suffix == ".db3" else []:
         with file.open("rb") as opened:
             header = opened.read(100)
@@ -208,7 +208,7 @@ def _standard_store(is_ros1: bool) -> Any:
 
 @cache  # parsing a definition takes tens of milliseconds, and every bag of a robot carries the same ones
 def _embedded_store(definition: Any, msgtype: str) -> Any | None:
-    """Type store of the definition that the bag carries; None where it carries none that can be used."""
+    """Type store of the definitions inside the bag; None if there are none that can be used."""
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 

@@ -1,7 +1,7 @@
-"""What a bag holds, and which of its topics are used: those that the configuration names, else found by type and usual names.
+"""Index of a bag, and the choice of topics: those in the configuration, else found by type and usual name.
 
-A first pass takes every header stamp, all self-motion and transforms, and the first message of each sensor. It decodes no
-picture, so it is cheap, and it meets damage, NaN and disorder before anything is mapped.
+A first pass reads every header stamp, all self-motion and transforms, and the first message of each sensor. It decodes no
+images, so it is cheap, and it finds damage, NaN and disorder before mapping starts.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _ODOMETRY_NAMES = (r"^/odom$", r"^/(odometry|wheel_odom|wheel_odometry)$", r"whe
 
 @dataclass(slots=True)
 class PoseTrack:
-    """Poses of one frame in another, in the order of the recording.
+    """Poses of one frame in another, in recorded order.
 
     Attributes:
         parent, child: frames, without leading slash.
@@ -68,14 +68,14 @@ class PoseTrack:
         self.poses.append(pose)
 
     def sorted(self, what: str, pose_child_base: Array | None = None) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (N,) and poses (N, 3) in order of time, carried on to a frame fixed to the child if one is given."""
+        """Stamps (N,) and poses (N, 3) in order of time; of a frame fixed to the child, if its pose is given."""
         stamps = np.asarray(self.stamps_ns, dtype=np.int64)
         order = sorted_order(stamps, what)
         poses = np.asarray(self.poses, dtype=np.float64).reshape(-1, 3)[order]
         return stamps[order], poses if pose_child_base is None else compose(poses, pose_child_base)
 
     def trajectory(self, what: str) -> Trajectory:
-        """As a trajectory; of equal stamps the first is kept."""
+        """The poses as a trajectory; of equal stamps the first is kept."""
         stamps, poses = self.sorted(what)
         first = np.concatenate([[True], np.diff(stamps) > 0])
         return Trajectory(stamps[first], poses[first])
@@ -83,14 +83,14 @@ class PoseTrack:
 
 @dataclass(slots=True)
 class BagIndex:
-    """What the first pass learnt.
+    """Result of the first pass.
 
     Attributes:
         counts: topic -> messages read.
-        stamps_ns: topic -> header stamps in the order of the recording.
+        stamps_ns: topic -> header stamps in recorded order.
         first: topic -> its first message, decoded.
         odometry: topic -> its poses.
-        unusable_transforms: names of transforms that are no numbers, in order of appearance (a dict for its order).
+        unusable_transforms: names of transforms with invalid numbers, in order of appearance (a dict keeps the order).
         transforms: the transform tree; `tf_tracks` the moving transforms in it, by (parent, child).
     """
 
@@ -103,7 +103,7 @@ class BagIndex:
     tf_tracks: dict[tuple[str, str], PoseTrack] = field(default_factory=dict)
 
     def frame_of(self, topic: str) -> str:
-        """Frame of a topic's first header."""
+        """Frame in the first header of a topic."""
         return clean_frame(self.first[topic].header.frame_id) if topic in self.first else ""
 
 
@@ -113,10 +113,10 @@ def build_index(bag: BagFile, names: Iterable[str], odom_frame: str) -> BagIndex
     Args:
         bag: the bag.
         names: topics of types with a header, or with transforms.
-        odom_frame: transforms that start here are kept as tracks, for they may be the odometry.
+        odom_frame: transforms from this frame are kept as tracks, since they may be the odometry.
 
     Raises:
-        StreamError: damage, or a pose that is no number.
+        StreamError: damage, or a pose with invalid numbers.
     """
     index = BagIndex()
     types = {topic.name: topic.msgtype for topic in bag.topics}
@@ -165,7 +165,7 @@ def _take_transforms(index: BagIndex, bag: BagFile, message: RawMessage, odom_fr
 
 @dataclass(slots=True)
 class Selection:
-    """The topics that are used; None where there is none.
+    """The topics to use; None for a missing one.
 
     Attributes:
         odometry: nav_msgs/Odometry topic.
@@ -173,7 +173,7 @@ class Selection:
         groundtruth: nav_msgs/Odometry topic with the true pose.
         sensors: name of a sensor -> its topics by role.
         transforms: every topic with transforms.
-        remarks: choices that the user may want to know of.
+        remarks: choices that the user may want to know.
     """
 
     odometry: str | None = None
@@ -184,7 +184,7 @@ class Selection:
     remarks: list[str] = field(default_factory=list)
 
     def uses(self, rig: Rig) -> dict[str, str]:
-        """Role -> topic, of those that are used with the sensors of a rig."""
+        """Role -> topic, for the sensors of a rig."""
         motion = ", ".join(self.transforms) if self.odometry_tf else self.odometry
         found = {} if motion is None else {"odometry": motion}
         for name in rig.sensors:
@@ -207,14 +207,14 @@ def select(
     """Choose the topics of a bag.
 
     Args:
-        topics: what the bag holds.
-        config: names that the user gave.
-        kinds: of the sensors to look for.
-        frame_of: first header's frame of a topic.
+        topics: all topics of the bag.
+        config: names given by the user.
+        kinds: kinds of sensors to look for.
+        frame_of: gives the frame in the first header of a topic.
         source: file, for errors.
 
     Raises:
-        StreamError: a named topic does not exist or is of the wrong type; the message lists the candidates.
+        StreamError: a named topic does not exist or is of the wrong type; the message lists the possible ones.
     """
     chooser = TopicChooser([topic for topic in topics if topic.count], config, source)
     chosen = Selection(transforms=tuple(topic.name for topic in chooser.of(TRANSFORM)), remarks=chooser.remarks)
@@ -226,10 +226,10 @@ def select(
 
 
 class TopicChooser:
-    """Picks topics of a bag by type and name.
+    """Chooses topics of a bag by type and name.
 
     Attributes:
-        remarks: choices that the user may want to know of.
+        remarks: choices that the user may want to know.
     """
 
     def __init__(self, topics: Sequence[Topic], config: SensorsConfig, source: str) -> None:
@@ -237,11 +237,11 @@ class TopicChooser:
         self.remarks: list[str] = []
 
     def of(self, types: Iterable[str]) -> list[Topic]:
-        """All topics of some message types."""
+        """All topics of given message types."""
         return [topic for topic in self._topics if topic.msgtype in types]
 
     def named(self, setting: str, types: tuple[str, ...]) -> str | None:
-        """The topic that a setting of `sensors` names, if it names one.
+        """The topic given by a setting of `sensors`, if the setting is given.
 
         Raises:
             StreamError: there is no such topic of these types.
@@ -260,7 +260,7 @@ class TopicChooser:
         )
 
     def best(self, types: tuple[str, ...], names: Sequence[str], keep: Callable[[str], bool] = lambda _: True) -> str | None:
-        """The topic with the most usual name, then the most messages."""
+        """The topic with the most usual name, then with the most messages."""
         candidates = [topic for topic in self.of(types) if keep(topic.name)]
         if not candidates:
             return None

@@ -1,4 +1,4 @@
-"""What a sensor stream is: samples in time order, the sensors, what a kind of sensor is, and what was lost on the way."""
+"""The interface of sensor streams: samples in time order, sensors, kinds of sensors, and a report of losses."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class SelfMotion:
 
 @dataclass(frozen=True, slots=True)
 class Velocity:
-    """One velocity command or wheel-speed reading; it holds until the next one (zero-order hold)."""
+    """One velocity command or wheel-speed reading; it is valid until the next one (zero-order hold)."""
 
     precedence: ClassVar[int] = 0
     stamp_ns: int
@@ -47,10 +47,10 @@ class Velocity:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What an exteroceptive sensor saw at one instant; each kind of sensor has its own subclass.
+    """A measurement of an exteroceptive sensor at one time; each kind of sensor has its own subclass.
 
     Attributes:
-        precedence: at equal stamps the sample with the lower one comes first; self-motion has 0.
+        precedence: of samples with equal stamps, the lower precedence comes first; self-motion has 0.
         stamp_ns: header stamp, ns.
     """
 
@@ -64,10 +64,10 @@ Sample = Motion | Observation
 
 @dataclass(frozen=True, init=False)
 class Rig:
-    """The exteroceptive sensors of a stream and where they sit: `Rig(laser=laser, camera=camera)`.
+    """The exteroceptive sensors of a stream with their mountings: `Rig(laser=laser, camera=camera)`.
 
     Attributes:
-        sensors: by the name that their kind gives them; only those that are there.
+        sensors: name (as defined by the kind of sensor) -> sensor.
     """
 
     sensors: Mapping[str, Any]
@@ -78,14 +78,14 @@ class Rig:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What a keyframe shows, in `base_link`.
+    """The points of a keyframe, in `base_link`.
 
     Attributes:
         xyz: (P, 3) points, m.
         rgb: (P, 3) their colours in 0..1, None without colour.
-        origin: (2,) where the sensor sits, m.
-        bearings: (P,) rad, increasing along the sweep, of a sensor that scans a level plane; None: points of any height.
-        column_rad: width of the columns in which the nearest of such points hides those behind it, rad.
+        origin: (2,) position of the sensor, m.
+        bearings: (P,) rad, increasing along the sweep, for a sensor that scans a level plane; None: points of any height.
+        column_rad: width of the columns in which the nearest point hides those behind it, rad.
     """
 
     xyz: Array
@@ -97,14 +97,14 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """An observation that is to come: its stamp, and the messages that it is made of."""
+    """An observation to be read: its stamp, and the messages that it needs."""
 
     stamp_ns: int
     needs: tuple[MessageKey, ...]
 
 
 class Decoder(Protocol):
-    """Makes an observation of the messages that it needs; counts what was odd about them."""
+    """Makes an observation of its messages, and counts irregularities."""
 
     counts: dict[str, int]
 
@@ -120,8 +120,8 @@ class SensorPlan:
         rig: the sensor, with its mounting.
         planned: in order of stamp.
         decode: makes an observation of a stamp and the decoded messages.
-        losses: counts of what found no partner.
-        remarks: what was assumed.
+        losses: counts of messages without a partner.
+        remarks: assumptions that were made.
     """
 
     rig: Rig = field(default_factory=Rig)
@@ -133,13 +133,13 @@ class SensorPlan:
 
 @dataclass(frozen=True, slots=True)
 class InBag:
-    """How a kind of sensor is found in a bag, and what is made of its messages.
+    """How a kind of sensor is found in a bag, and how its messages become observations.
 
     Attributes:
         types: message types, each with a header.
-        find: chooses the topics: role -> topic, empty where the bag has none.
-        plan: (topics, index, base frame, settings, file) -> every observation. It raises a StreamError where something is
-            missing, also for empty topics, as the user may have asked for this kind.
+        find: chooses the topics: role -> topic, empty if the bag has none.
+        plan: (topics, index, base frame, settings, file) -> every observation. Raises a StreamError if something is missing,
+            also for empty topics, as the user may have asked for this kind.
     """
 
     types: tuple[str, ...]
@@ -149,23 +149,23 @@ class InBag:
 
 @dataclass(frozen=True, slots=True)
 class SensorKind:
-    """All that tells one kind of exteroceptive sensor from another; `streams.sensors` has the table of them.
+    """Definition of a kind of exteroceptive sensor; `streams.sensors` has the table of kinds.
 
     Attributes:
-        name: what `vision.sensor` calls it.
-        sensor_name: what the rig and the map file call its sensor.
+        name: its name in `vision.sensor`.
+        sensor_name: name of its sensor in the rig and the map file.
         sensor: type of the sensor, a dataclass of numbers and arrays.
         sample: type of its observations.
-        counted: what observations are called in counts (`scans`).
-        needs: what a source must have for it (`laser scans`).
-        words: says in a few words what a sensor is.
-        front_end: makes what closes loops with it, a `vision.Factory`; or its `module:name`, imported when it is needed.
-        compact: what the map file keeps of an observation.
-        restore: the observation that `compact` was given; None where a keyframe has none. The stamp is the node's.
-        see: points of a keyframe up to a range, m; None where it holds nothing of this kind.
-        seeks_every: setting of the travel after which its front-end looks for loops, m; empty: it looks at every node.
-        in_bag: how it is found in a bag; None: it never is.
-        configured: the sensor that a configuration alone describes, for those who feed the mapper themselves.
+        counted: name of observations in counts (`scans`).
+        needs: what a source must have (`laser scans`).
+        words: describes a sensor in a few words.
+        front_end: makes the front-end for loop closure, a `vision.Factory`; or its `module:name`, imported when needed.
+        compact: the part of an observation that the map file stores.
+        restore: the observation from what `compact` returned; None if a keyframe has none. The stamp is the node's.
+        see: points of a keyframe up to a range, m; None if it has no data of this kind.
+        seeks_every: setting with the travel between two searches for loops, m; empty: it searches at every node.
+        in_bag: how it is found in a bag; None: never.
+        configured: the sensor described by a configuration alone, for users who feed the mapper themselves.
     """
 
     name: str
@@ -186,25 +186,25 @@ class SensorKind:
 
 @dataclass(slots=True)
 class StreamReport:
-    """What a stream met while it was read: counts by name (`odometry`, `frames`, `unmatched color`, ...) and remarks."""
+    """Counts by name (`odometry`, `frames`, `unmatched color`, ...) and remarks from reading a stream."""
 
     counts: dict[str, int] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
 
     def count(self, name: str, increment: int = 1) -> None:
-        """Add to a named count."""
+        """Add to a count."""
         self.counts[name] = self.counts.get(name, 0) + increment
 
 
 class Stream(Protocol):
-    """A source of samples, in order of stamp; at equal stamps motion comes before observations.
+    """A source of samples, in order of stamp; of samples with equal stamps, motion comes first.
 
-    A stream can be iterated more than once and gives the same samples each time.
+    A stream can be iterated several times and gives the same samples each time.
     """
 
     @property
     def name(self) -> str:
-        """What to call it in a report: file name or world."""
+        """Name in reports: of the file or world."""
 
     @property
     def rig(self) -> Rig:
@@ -212,15 +212,15 @@ class Stream(Protocol):
 
     @property
     def groundtruth(self) -> Trajectory | None:
-        """True poses of `base_link`, where they are known."""
+        """True poses of `base_link`, if known."""
 
     @property
     def expected_observations(self) -> int | None:
-        """How many observations will come, for a progress bar; None where unknown."""
+        """Number of observations, for a progress bar; None if unknown."""
 
     @property
     def report(self) -> StreamReport:
-        """What the last iteration met."""
+        """The report of the last iteration."""
 
     def __iter__(self) -> Iterator[Sample]:
         """Yield the samples.

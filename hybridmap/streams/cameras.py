@@ -1,4 +1,4 @@
-"""Pictures and their calibration: messages decoded (REP-118), distortion taken out, depth brought to the colour camera."""
+"""Images and calibrations: decoding (REP-118), undistortion, and registration of depth to the colour camera."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _DEPTH_HEADER_BYTES = 12  # compressedDepth: int32 format, float32 A, float32 B
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """How a pixel is stored: type, channels, and which of them are red, green, blue."""
+    """Storage of a pixel: type, channels, and the indices of red, green and blue."""
 
     dtype: str
     channels: int
@@ -65,7 +65,7 @@ class Calibration:
 
     @property
     def is_distorted(self) -> bool:
-        """Whether there is any distortion to take out."""
+        """Whether the lens has distortion."""
         return any(self.distortion)
 
     @cached_property
@@ -78,7 +78,7 @@ class Calibration:
         return cv2.initUndistortRectifyMap(self.K, D, np.eye(3), self.K, size, cv2.CV_32FC1)
 
     def undistort_color(self, color: ColorImage) -> ColorImage:
-        """(H, W, 3) picture as the pinhole alone would see it; unchanged where there is no distortion."""
+        """(H, W, 3) image of an ideal pinhole; unchanged without distortion."""
         if not self.is_distorted:
             return color
         import cv2
@@ -86,7 +86,7 @@ class Calibration:
         return np.asarray(cv2.remap(color, *self._maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
 
     def undistort_depth(self, depth_m: DepthImage) -> DepthImage:
-        """(H, W) depth as the pinhole alone would see it, nearest pixel; 0 where nothing is seen."""
+        """(H, W) depth of an ideal pinhole, by the nearest pixel; 0 for pixels outside the image."""
         if not self.is_distorted:
             return depth_m
         import cv2
@@ -95,13 +95,13 @@ class Calibration:
 
 
 def from_intrinsics(given: CameraIntrinsics) -> Calibration:
-    """Calibration of the configuration."""
+    """Calibration from the configuration."""
     K = np.array([[given.fx_px, 0.0, given.cx_px], [0.0, given.fy_px, given.cy_px], [0.0, 0.0, 1.0]])
     return Calibration(given.width_px, given.height_px, K, given.distortion)
 
 
 def mounted(mounting: CameraMounting) -> Array:
-    """(4, 4) pose of the optical frame in the base, of the configuration."""
+    """(4, 4) pose of the optical frame in the base, from the configuration."""
     return matrix(mounting.translation_m, mounting.quaternion_xyzw)
 
 
@@ -122,17 +122,17 @@ def depth_from_units(values: NDArray[np.uint16], units_per_m: float) -> DepthIma
 
 
 class DepthRegistration:
-    """Moves depth from the depth camera into the colour camera's pixels.
+    """Projects depth from the depth camera into the colour camera's pixels.
 
-    Every depth pixel becomes a point, is carried over by the extrinsics and projected; the nearest of the points that fall on
-    one pixel wins. Where the colour camera has the finer pixels, each depth pixel is first split, so that no holes appear.
+    Every depth pixel becomes a point, is transformed by the extrinsics and projected; if several points fall on one pixel, the
+    nearest is kept. If the colour camera has finer pixels, each depth pixel is split first, so that no holes appear.
     """
 
     def __init__(self, depth: Calibration, color: Calibration, T_color_depth: Array) -> None:
         """Prepare the rays of the depth pixels.
 
         Args:
-            depth, color: calibrations of undistorted pictures.
+            depth, color: calibrations of undistorted images.
             T_color_depth: (4, 4) pose of the depth camera in the colour camera's optical frame, m.
         """
         self._color, self._T = color, T_color_depth
@@ -146,7 +146,7 @@ class DepthRegistration:
         self._rays = np.stack([*np.meshgrid(x, y), np.ones((len(y), len(x)))], axis=-1)
 
     def __call__(self, depth_m: DepthImage) -> DepthImage:
-        """(H, W) depth in the colour camera, m; 0 where nothing falls."""
+        """(H, W) depth in the colour camera, m; 0 for pixels without depth."""
         fine = depth_m.repeat(self._split, axis=0).repeat(self._split, axis=1).astype(np.float64)
         valid = fine > 0
         points = self._rays[valid] * fine[valid][:, None] @ self._T[:3, :3].T + self._T[:3, 3]
@@ -162,7 +162,7 @@ class DepthRegistration:
 
 
 def check_size(picture: NDArray[Any], calibration: Calibration, what: str) -> None:
-    """Refuse a picture that is not of its calibration's size.
+    """Check that an image has the size of its calibration.
 
     Raises:
         StreamError: naming both sizes.
@@ -176,10 +176,10 @@ def check_size(picture: NDArray[Any], calibration: Calibration, what: str) -> No
 
 
 def decode_color(message: Any, what: str) -> ColorImage:
-    """(H, W, 3) uint8 RGB of an Image or CompressedImage message; grey pictures repeat their channel.
+    """(H, W, 3) uint8 RGB of an Image or CompressedImage message; grey images repeat their channel.
 
     Raises:
-        StreamError: an encoding that is no colour, or data that are cut off.
+        StreamError: an encoding without colour, or truncated data.
     """
     if hasattr(message, "encoding"):
         layout = _layout_of(message.encoding, _COLOR, "colour", what)
@@ -191,7 +191,7 @@ def decode_color(message: Any, what: str) -> ColorImage:
 
 
 def decode_depth(message: Any, units_per_m: float, what: str) -> DepthImage:
-    """(H, W) float32 depth in m of an Image or CompressedImage message; may still hold NaN.
+    """(H, W) float32 depth in m of an Image or CompressedImage message; may contain NaN.
 
     Args:
         message: 16UC1, mono16 or 32FC1; or a 16 bit PNG, or `compressedDepth` of either encoding.
@@ -199,7 +199,7 @@ def decode_depth(message: Any, units_per_m: float, what: str) -> DepthImage:
         what: file and topic, for errors.
 
     Raises:
-        StreamError: an encoding that is no depth, or data that are cut off.
+        StreamError: an encoding without depth, or truncated data.
     """
     if hasattr(message, "encoding"):
         layout = _layout_of(message.encoding, _DEPTH, "depth", what)
@@ -265,7 +265,7 @@ def _decompress_depth(message: Any, units_per_m: float, what: str) -> DepthImage
 
 
 def calibration_of(info: Any, image_topic: str, what: str) -> Calibration:
-    """Calibration of a CameraInfo message; a rectified picture has its projection matrix and no distortion.
+    """Calibration of a CameraInfo message; of a rectified image, the projection matrix without distortion.
 
     Raises:
         StreamError: the camera is not calibrated, or its distortion model is unknown.
@@ -287,5 +287,5 @@ def calibration_of(info: Any, image_topic: str, what: str) -> Calibration:
 
 
 def _field(info: Any, name: str) -> Any:
-    """A CameraInfo field, which ROS 1 writes large and ROS 2 small."""
+    """A CameraInfo field, named in upper case in ROS 1 and in lower case in ROS 2."""
     return getattr(info, name) if hasattr(info, name) else getattr(info, name.upper())

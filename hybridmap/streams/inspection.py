@@ -1,4 +1,4 @@
-"""What a source holds, what mapping would use of it, and what is missing or damaged."""
+"""Inspect a source: its contents, what mapping would use, and what is missing or damaged."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Part:
 
     Attributes:
         name: topic or file.
-        kind: message type, or what the file is.
-        count: messages, pictures or rows.
-        stamps_ns: header stamps in the order of recording; empty where they are not known.
+        kind: message type, or kind of file.
+        count: messages, images or rows.
+        stamps_ns: header stamps in recorded order; empty if unknown.
     """
 
     name: str
@@ -43,17 +43,17 @@ class Part:
 
     @property
     def duration_s(self) -> float:
-        """Last minus first stamp, s; 0 where unknown."""
+        """Last minus first stamp, s; 0 if unknown."""
         return int(self.stamps_ns.max() - self.stamps_ns.min()) / NS_PER_S if len(self.stamps_ns) else 0.0
 
     @property
     def rate_hz(self) -> float:
-        """Mean rate, Hz; NaN where unknown."""
+        """Mean rate, Hz; NaN if unknown."""
         return (len(self.stamps_ns) - 1) / self.duration_s if self.duration_s > 0 else float("nan")
 
     @property
     def longest_gap_s(self) -> float:
-        """Longest time without a message, s; 0 where unknown."""
+        """Longest time without a message, s; 0 if unknown."""
         return float(np.diff(np.sort(self.stamps_ns)).max(initial=0) / NS_PER_S)
 
 
@@ -62,13 +62,13 @@ class Inspection:
     """The findings.
 
     Attributes:
-        source: what was inspected.
+        source: the inspected source.
         kind: `ROS 1 bag`, `TUM RGB-D folder`, ...
-        parts: what it holds.
-        uses: role -> topic or file that mapping would take.
-        rig: sensors that it would map with.
+        parts: its contents.
+        uses: role -> topic or file that mapping would use.
+        rig: sensors that mapping would use.
         remarks: choices and assumptions.
-        problems: what is missing or damaged, a line each.
+        problems: missing or damaged parts, one line each.
         reason: why it cannot be mapped; None if it can.
     """
 
@@ -88,14 +88,14 @@ class Inspection:
 
 
 def inspect_source(source: str | Path, config: Config) -> Inspection:
-    """Look into a source without mapping it.
+    """Inspect a source without mapping it.
 
     Args:
         source: as for `open_stream`.
         config: topic names, mounting, sensor.
 
     Raises:
-        StreamError: it cannot even be opened.
+        StreamError: it cannot be opened at all.
     """
     world = world_of(source)
     if world is not None:
@@ -113,7 +113,7 @@ def inspect_source(source: str | Path, config: Config) -> Inspection:
 
 
 def _try_to_open(found: Inspection, source: str | Path, config: Config) -> None:
-    """Open as mapping would, and note what it would use or why it cannot."""
+    """Open as mapping would; note what it would use, or why it cannot."""
     try:
         stream = open_stream(source, config)
         truth = stream.groundtruth
@@ -131,7 +131,7 @@ def _try_to_open(found: Inspection, source: str | Path, config: Config) -> None:
 
 
 def _gaps(part: Part) -> list[str]:
-    """A line on the longest time without a message, where it is long and far from usual."""
+    """A line about the longest time without a message, if that is unusually long."""
     if len(part.stamps_ns) < 2:
         return []
     stamps = np.sort(part.stamps_ns)

@@ -1,4 +1,4 @@
-"""The planar laser as a kind of sensor: its scans, how a bag has them, what a keyframe keeps and shows of them."""
+"""The planar laser as a kind of sensor: its scans, reading them from a bag, and keyframes in the map file."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Laser:
 
     Attributes:
         bearings_rad: (B,) float64, bearing of each beam in the laser's frame, counter-clockwise positive.
-        range_min_m, range_max_m: valid ranges lie between them.
+        range_min_m, range_max_m: limits of valid ranges.
         pose_base_laser: (3,) mounting in `base_link`, m and rad (a laser mounted upside down has its bearings negated).
     """
 
@@ -48,22 +48,22 @@ class LaserScan(Observation):
 
     Attributes:
         stamp_ns: header stamp, ns.
-        ranges_m: (B,) float32; NaN where there is no valid return (REP-117 and the range limits are applied by the reader).
+        ranges_m: (B,) float32; NaN without a valid return (the reader applies REP-117 and the range limits).
     """
 
     ranges_m: NDArray[np.float32]
 
 
 class ScanDecoder:
-    """Brings every scan of a topic to the beams of its first one, counter-clockwise in the base."""
+    """Resamples every scan of a topic to the beams of its first one, counter-clockwise in the base."""
 
     def __init__(self, first: Any, pose_base_laser: Array, upside_down: bool, config: SensorsConfig, what: str) -> None:
-        """Learn the beams from the first message.
+        """Read the beams of the first message.
 
         Args:
             first: message with the fields of sensor_msgs/LaserScan.
             pose_base_laser: (3,) mounting, m and rad.
-            upside_down: whether the beams turn the other way in the base.
+            upside_down: whether the laser is mounted upside down, which reverses the order of its beams.
             config: range limits.
             what: file and topic, for errors.
 
@@ -112,7 +112,7 @@ class ScanDecoder:
         return len(message.ranges), float(message.angle_min), float(message.angle_increment)
 
     def _resample(self, message: Any, ranges: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Nearest beam within half a step of each of the first scan's bearings."""
+        """The nearest beam within half a step of each bearing of the first scan."""
         self.counts["scans with other beams"] = self.counts.get("scans with other beams", 0) + 1
         out = np.full(len(self.laser.bearings_rad), np.nan, dtype=np.float32)
         bearings = self._bearings(message)
@@ -138,7 +138,7 @@ def _plan(topics: Mapping[str, str], index: BagIndex, base_frame: str, config: S
     """Every scan of a topic.
 
     Raises:
-        StreamError: no scans, no mounting, a leaning laser, no beams, or stamps that go back.
+        StreamError: no scans, no mounting, a laser that is not level, no beams, or stamps out of order.
     """
     if not topics:
         raise StreamError(f"{source}: no laser: expected a topic of type sensor_msgs/LaserScan")
@@ -157,10 +157,10 @@ def _plan(topics: Mapping[str, str], index: BagIndex, base_frame: str, config: S
 
 
 def _laser_pose(T_base_laser: Array, what: str) -> tuple[Array, bool]:
-    """Planar mounting (3,) of a laser, and whether it hangs upside down.
+    """Planar mounting (3,) of a laser, and whether it is upside down.
 
     Raises:
-        StreamError: the laser does not scan level.
+        StreamError: the laser is not level.
     """
     up = T_base_laser[2, 2]
     if abs(up) < _MOST_TILT_COS:
@@ -174,7 +174,7 @@ def _restore(keyframe: Keyframe, stamp_ns: int) -> LaserScan | None:
 
 
 def _see(keyframe: Keyframe, laser: Laser, max_range_m: float) -> Seen | None:
-    """End points of the beams that returned; the plane of the scan is drawn on the floor."""
+    """End points of the beams with a return; the plane of the scan is drawn at the floor."""
     del max_range_m  # a laser has limits of its own
     if "ranges_m" not in keyframe:
         return None

@@ -1,4 +1,4 @@
-"""Where the sensors sit on the robot: the constant part of the transform tree."""
+"""Mountings of the sensors on the robot: the constant part of the transform tree."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ class _Edge:
 
 
 class TransformTree:
-    """Frames joined by transforms; those that never change, static or not, carry the mounting."""
+    """Frames joined by transforms; the constant ones, static or not, give the mountings."""
 
     def __init__(self) -> None:
         self._edges: dict[tuple[str, str], _Edge] = {}
 
     def add(self, parent: str, child: str, T_parent_child: Array, *, static: bool) -> None:
-        """Take in one transform; a static one wins over a moving one, the newest static one over the older."""
+        """Add one transform; a static one replaces a moving one, and a newer static one an older."""
         key = (clean_frame(parent), clean_frame(child))
         edge = self._edges.get(key)
         if edge is None or static:
@@ -67,7 +67,7 @@ class TransformTree:
         return sorted({frame for key in self._edges for frame in key})
 
     def between(self, base: str, sensor: str) -> Array | None:
-        """(4, 4) pose of the sensor's frame in the base, along constant transforms; None where there is no such way."""
+        """(4, 4) pose of the sensor's frame in the base, along constant transforms; None if there is no such path."""
         return self._search(clean_frame(base), clean_frame(sensor), allow_moving=False)
 
     def _search(self, base: str, sensor: str, *, allow_moving: bool) -> Array | None:
@@ -89,10 +89,10 @@ class TransformTree:
         return None
 
     def require(self, base: str, sensor: str, what: str, setting: str) -> Array:
-        """As `between`, but an error where there is no way.
+        """As `between`, with an error if there is no path.
 
         Raises:
-            StreamError: naming both frames and the setting that helps.
+            StreamError: naming both frames and the setting to use.
         """
         found = self.between(base, sensor)
         if found is not None:

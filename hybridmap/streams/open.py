@@ -1,4 +1,4 @@
-"""One name for every source: world, bag, folder or table -> stream."""
+"""Open any source by its name: world, bag, folder or table."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ _SIGNS_OF_TUM = ("rgb.txt", "depth.txt", "associations.txt", "rgb", "depth")
 
 
 def world_of(source: str | Path) -> str | None:
-    """Name of the simulated world that a source means (`office` or `sim:office`); None if it means none.
+    """Name of the simulated world of a source (`office` or `sim:office`); None if the source is no world.
 
-    A world's name wins over a file of that name; write `./office` for the file.
+    The name of a world takes precedence over a file of that name; write `./office` for the file.
 
     Raises:
-        StreamError: `sim:` with the name of no world.
+        StreamError: `sim:` with an unknown world.
     """
     text = str(source)
     explicit = text.startswith("sim:")
@@ -55,10 +55,10 @@ def world_of(source: str | Path) -> str | None:
 
 
 def kind_of(path: Path) -> str:
-    """What a file or folder holds, by its name and look.
+    """The kind of a file or folder, by its name and content.
 
     Raises:
-        StreamError: it does not exist, is empty, or is nothing that can be read.
+        StreamError: it does not exist, is empty, or is of no readable kind.
     """
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
@@ -87,7 +87,7 @@ def open_stream(source: str | Path, config: Config, *, start_s: float | None = N
         start_s, end_s: only this part, seconds from the first stamp, inclusive.
 
     Raises:
-        StreamError: it cannot be opened, or holds no stream that can be mapped; the message says why.
+        StreamError: it cannot be opened, or cannot be mapped; the message says why.
     """
     window = Window(start_s, end_s)
     world = world_of(source)
@@ -114,7 +114,7 @@ class WindowedStream:
 
     @property
     def report(self) -> StreamReport:
-        """What the whole stream met."""
+        """Report of the whole stream."""
         return self._stream.report
 
     def __iter__(self) -> Iterator[Sample]:

@@ -1,4 +1,4 @@
-"""Order in time: stamps within a topic, pairs across topics, one sorted stream out of several."""
+"""Order in time: stamps within a topic, pairs across topics, and merging of streams."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ Stamps = NDArray[np.int64]
 
 
 def sorted_order(stamps_ns: Stamps, what: str) -> NDArray[np.intp]:
-    """Order that sorts the stamps `(N,)`; a message may have slipped behind its direct successor, no further.
+    """Indices that sort the stamps `(N,)`; a message may be swapped with its direct successor, no further.
 
     Args:
-        stamps_ns: (N,) header stamps in the order of the recording, ns.
+        stamps_ns: (N,) header stamps in recorded order, ns.
         what: file and topic, for the error.
 
     Raises:
-        StreamError: a stamp goes back behind more than the one message before it, or all stamps are one.
+        StreamError: a stamp is older than that of the message before the previous one, or all stamps are equal.
     """
     if len(stamps_ns) > 2:
         if stamps_ns.min() == stamps_ns.max():
@@ -46,11 +46,11 @@ def sorted_order(stamps_ns: Stamps, what: str) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, slots=True)
 class Pairs:
-    """Which colour picture goes with which depth picture.
+    """Pairs of colour and depth images.
 
     Attributes:
         color, depth: (P,) indices into either list, one to one.
-        unmatched_color, unmatched_depth: how many pictures found no partner.
+        unmatched_color, unmatched_depth: number of images without a partner.
     """
 
     color: NDArray[np.intp]
@@ -60,7 +60,7 @@ class Pairs:
 
 
 def pair_nearest(color_ns: Stamps, depth_ns: Stamps, tolerance_s: float) -> Pairs:
-    """Pair pictures by stamp, nearest first, each used once, none further apart than the tolerance.
+    """Pair images by stamp, nearest first, each used once, none further apart than the tolerance.
 
     Args:
         color_ns: (C,) sorted stamps, ns.
@@ -85,7 +85,7 @@ def pair_nearest(color_ns: Stamps, depth_ns: Stamps, tolerance_s: float) -> Pair
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """The part of a recording that is wanted.
+    """The part of a recording to use.
 
     Attributes:
         start_s, end_s: seconds from the first stamp, both inclusive; None: open.
@@ -102,14 +102,14 @@ class Window:
             raise StreamError(f"--end {self.end_s} s lies before --start {self.start_s} s")
 
     def limits_ns(self, first_ns: int) -> tuple[int, int]:
-        """First and last stamp wanted, ns, for a recording whose first stamp is given."""
+        """First and last stamp of the part, ns, given the first stamp of the recording."""
         low = -(2**62) if self.start_s is None else first_ns + round(self.start_s * NS_PER_S)
         high = 2**62 if self.end_s is None else first_ns + round(self.end_s * NS_PER_S)
         return low, high
 
 
 def check_overlap(motion_ns: Stamps, observation_ns: Stamps, what: str) -> None:
-    """Refuse observations that share no time with the self-motion, give or take a second.
+    """Refuse observations without a common time with the self-motion, with a tolerance of one second.
 
     Raises:
         StreamError: naming both spans.
@@ -128,22 +128,22 @@ def _span(stamps_ns: Stamps) -> str:
 
 
 def sort_key(sample: Sample) -> tuple[int, int]:
-    """Order of a stream: by stamp; at equal stamps the lower precedence, so motion, comes first."""
+    """Order of a stream: by stamp, then by precedence, so that motion comes first."""
     return sample.stamp_ns, sample.precedence
 
 
 class ReorderBuffer:
-    """Sorts samples that arrive a little late, as a live robot's do; whatever comes in order passes at once at latency 0."""
+    """Sorts samples that arrive a little late, as on a live robot; with latency 0, samples pass at once."""
 
     def __init__(self, latency_s: float) -> None:
-        """Hold samples back until the newest stamp is `latency_s` ahead of theirs."""
+        """Hold each sample until the newest stamp is `latency_s` later."""
         self._latency_ns = round(latency_s * NS_PER_S)
         self._newest_ns: int | None = None
         self._heap: list[tuple[tuple[int, int], int, Sample]] = []
         self._arrivals = 0
 
     def push(self, sample: Sample) -> list[Sample]:
-        """Take in one sample; return those that have waited long enough, in order."""
+        """Add one sample; return those that are due, in order."""
         heapq.heappush(self._heap, (sort_key(sample), self._arrivals, sample))
         self._arrivals += 1
         newest = sample.stamp_ns if self._newest_ns is None else max(self._newest_ns, sample.stamp_ns)
@@ -151,7 +151,7 @@ class ReorderBuffer:
         return self._pop_until(newest - self._latency_ns)
 
     def flush(self) -> list[Sample]:
-        """Everything that still waits, in order."""
+        """Return all remaining samples, in order."""
         return self._pop_until(self._newest_ns or 0)
 
     def _pop_until(self, stamp_ns: int) -> list[Sample]:
@@ -162,5 +162,5 @@ class ReorderBuffer:
 
 
 def merge(*sources: Iterable[Sample]) -> Iterator[Sample]:
-    """One stream out of several sorted ones, by stamp; at equal stamps the lower precedence, so motion, comes first."""
+    """Merge sorted streams by stamp, then by precedence, so that motion comes first."""
     return heapq.merge(*sources, key=sort_key)

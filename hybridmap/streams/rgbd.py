@@ -1,4 +1,4 @@
-"""The RGB-D camera as a kind of sensor: its frames, how a bag has them, what a keyframe keeps and shows of them."""
+"""The RGB-D camera as a kind of sensor: its frames, reading them from a bag, and keyframes in the map file."""
 
 from __future__ import annotations
 
@@ -112,12 +112,12 @@ def _find(chooser: TopicChooser) -> dict[str, str]:
 
 
 def _namespace(topic: str) -> str:
-    """First part of a topic's name: the camera, as a rule."""
+    """First part of a topic's name, which usually names the camera."""
     return topic.strip("/").split("/")[0]
 
 
 def _info_of(image: str | None, infos: Sequence[str], *, alone_is_enough: bool) -> str | None:
-    """The CameraInfo topic beside an image topic, as image_transport has it."""
+    """The CameraInfo topic of an image topic, by the convention of image_transport."""
     if image is None:
         return None
     plain = TRANSPORT.sub("", image)
@@ -130,10 +130,10 @@ def _info_of(image: str | None, infos: Sequence[str], *, alone_is_enough: bool) 
 
 
 def _plan(topics: Mapping[str, str], index: BagIndex, base_frame: str, config: SensorsConfig, source: str) -> SensorPlan:
-    """Every pair of colour and depth pictures.
+    """Every pair of colour and depth images.
 
     Raises:
-        StreamError: colour, depth, calibration or mounting is missing, sizes contradict each other, or nothing fits in time.
+        StreamError: colour, depth, calibration or mounting is missing, sizes contradict each other, or no stamps match.
     """
     color, depth = topics.get("color"), topics.get("depth")
     if color is None or depth is None:
@@ -157,10 +157,10 @@ def _plan(topics: Mapping[str, str], index: BagIndex, base_frame: str, config: S
 
 
 class FrameDecoder:
-    """A colour and a depth message -> one frame: undistorted, depth in the colour camera's pixels, limits applied."""
+    """Makes one frame of a colour and a depth message: undistorted, depth in the colour camera's pixels, limits applied."""
 
     def __init__(self, topics: Mapping[str, str], index: BagIndex, base_frame: str, config: SensorsConfig, source: str) -> None:
-        """Learn sizes, calibration and mounting from the first messages."""
+        """Read sizes, calibration and mounting from the first messages."""
         self._config = config
         self._what_color, self._what_depth = f"{source}: {topics['color']}", f"{source}: {topics['depth']}"
         self.remarks: list[str] = []
@@ -210,7 +210,7 @@ class FrameDecoder:
     def _depth_calibration(
         self, topics: Mapping[str, str], index: BagIndex, size: tuple[int, ...]
     ) -> tuple[Calibration, DepthRegistration | None]:
-        """Calibration of the depth pictures, and how they come to the colour camera; None where they are there already."""
+        """Calibration of the depth images, and their registration to colour; None if they are registered already."""
         color, color_topic, depth_topic = self._color, topics["color"], topics["depth"]
         same_size = size == (color.height_px, color.width_px)
         if same_size and (_REGISTERED.search(depth_topic) or "depth_info" not in topics):
@@ -229,7 +229,7 @@ class FrameDecoder:
         return depth, DepthRegistration(depth, color, np.eye(4) if T is None else T)
 
     def _extrinsics(self, index: BagIndex, color_frame: str, depth_frame: str, same_size: bool) -> Array | None:
-        """(4, 4) pose of the depth camera in the colour camera; None where they are one."""
+        """(4, 4) pose of the depth camera in the colour camera; None if both are the same camera."""
         if color_frame == depth_frame:
             return None
         T = index.transforms.between(color_frame, depth_frame)
@@ -244,14 +244,14 @@ class FrameDecoder:
 
 
 def _configured(config: SensorsConfig) -> Camera | None:
-    """The camera, where both its intrinsics and its mounting are set."""
+    """The camera of the configuration, if both its intrinsics and its mounting are set."""
     if config.camera_intrinsics is None or config.camera_mounting is None:
         return None
     return pinhole(from_intrinsics(config.camera_intrinsics), mounted(config.camera_mounting))
 
 
 def _compact(frame: RgbdFrame) -> dict[str, NDArray[Any]]:
-    """Colour as it is; depth in whole millimetres (H, W) uint16, 0 where invalid."""
+    """Colour unchanged; depth in whole millimetres (H, W) uint16, 0 if invalid."""
     millimetres = np.rint(np.nan_to_num(frame.depth_m, posinf=0.0) * _MM_PER_M)
     return {"color": frame.color, "depth_mm": np.asarray(np.clip(millimetres, 0, 65535), dtype=np.uint16)}
 
@@ -264,12 +264,12 @@ def _restore(keyframe: Keyframe, stamp_ns: int) -> RgbdFrame | None:
 
 
 def _see(keyframe: Keyframe, camera: Camera, max_range_m: float) -> Seen | None:
-    """Back-project the depth image of a keyframe; pixels that hang in the air between two surfaces are left out.
+    """Back-project the depth image of a keyframe, without pixels on depth discontinuities.
 
     Args:
-        keyframe: with `depth_mm` (H, W) uint16, perhaps `color` (H, W, 3) uint8 and its own `T_base_camera` (4, 4): a
-            carried camera tilts.
-        camera: of the whole picture; a smaller keyframe is taken as the same picture scaled.
+        keyframe: with `depth_mm` (H, W) uint16, perhaps `color` (H, W, 3) uint8, and `T_base_camera` (4, 4) if the camera is
+            hand-held and tilts.
+        camera: of the whole image; a smaller keyframe is the same image, scaled.
         max_range_m: depth beyond this is left out.
     """
     import cv2

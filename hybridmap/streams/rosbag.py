@@ -1,4 +1,4 @@
-"""A bag as a stream: two passes, the first over stamps and self-motion, the second over scans or pictures."""
+"""A bag as a stream, read in two passes: first stamps and self-motion, then scans or images."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from hybridmap.trajectory import Trajectory
 class BagStream:
     """ROS 1 bag, ROS 2 folder, `.mcap` or `.db3` file.
 
-    Samples carry header stamps. The rig holds the sensor that is mapped with: `vision.sensor`, or with `auto` the first
-    kind of the table that the bag has.
+    Samples have header stamps. The rig holds the sensor to map with: `vision.sensor`, or, for `auto`, the first kind of the
+    table that the bag has.
     """
 
     def __init__(self, path: Path, config: Config, window: Window | None = None) -> None:
         """Index the bag.
 
         Raises:
-            StreamError: the bag is damaged, or lacks what mapping needs; the message says what.
+            StreamError: the bag is damaged, or lacks data that mapping needs; the message names them.
         """
         self._bag = BagFile(path)
         self._config, self._sensors = config, config.sensors
@@ -63,7 +63,7 @@ class BagStream:
 
     @property
     def groundtruth(self) -> Trajectory | None:
-        """True poses of the base, from an Odometry topic that says so."""
+        """True poses of the base, from an Odometry topic whose name suggests ground truth."""
         topic = self.selection.groundtruth
         return None if topic is None else self._index.odometry[topic].trajectory(f"{self._bag.path}: {topic}")
 
@@ -90,7 +90,7 @@ class BagStream:
             yield SelfMotion(int(stamp), pose)
 
     def _observations(self) -> Iterator[Sample]:
-        """Second pass: read on until the messages of the next planned observation have come."""
+        """Second pass: read until all messages of the next planned observation are there."""
         needed = {key for planned in self._planned for key in planned.needs}
         waiting: dict[MessageKey, Any] = {}
         upcoming = iter(self._planned)
@@ -133,19 +133,19 @@ class BagStream:
         return tracks[0], f"{self._bag.path}: transform {tracks[0].parent} -> {tracks[0].child}"
 
     def _lost_messages(self) -> list[str]:
-        """A line for every used topic that holds fewer messages than the bag says: a sign of damage."""
+        """A line for every used topic with fewer messages than the bag states: a sign of damage."""
         read, used = self._index.counts, frozenset(self.uses.values())
         lost = [topic for topic in self._bag.topics if topic.name in used and read.get(topic.name, 0) < topic.count]
         return [f"{topic.name}: {read.get(topic.name, 0)} messages of {topic.count} can be read" for topic in lost]
 
     def _choose_base(self, track: PoseTrack) -> str:
-        """Frame that is mapped: the configured one, else the one that the odometry moves, else a usual name."""
+        """The frame to map: the configured one, else the child frame of the odometry, else a usual name."""
         named = clean_frame(self._sensors.base_frame or "") or track.child
         usual = (frame for frame in ("base_link", "base_footprint") if frame in self._index.transforms.frames)
         return named or next(usual, "base_link")
 
     def _carry(self, track: PoseTrack, what: str) -> Array | None:
-        """(3,) pose of the base in the frame that the odometry moves; None where they are the same."""
+        """(3,) pose of the base in the child frame of the odometry; None if they are the same."""
         if track.child in ("", self._base_frame):
             return None
         T = self._index.transforms.require(track.child, self._base_frame, what, "another sensors.base_frame")

@@ -1,6 +1,6 @@
-"""The kinds of sensors, by name, and what can be said of any of them.
+"""The table of kinds of sensors, and functions for any of them.
 
-A new kind is one `SensorKind`, given to `register`. Nothing else in the package has to know of it.
+A new kind is one `SensorKind`, given to `register`. Nothing else in the package needs to change.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ SENSORS: Table[SensorKind] = Table(
 
 
 def register(kind: SensorKind) -> None:
-    """Add a kind of sensor: sources, map files, exports, pages and `vision.sensor` know it from now on.
+    """Add a kind of sensor for sources, map files, exports, pages and `vision.sensor`.
 
-    Packages have entry points `hybridmap.sensors`.
+    Installed packages use the entry points `hybridmap.sensors`.
 
     Raises:
-        ConfigError: there is one of this name already.
+        ConfigError: the name is taken.
     """
     SENSORS.register(kind.name, kind)
 
 
 def kinds() -> tuple[SensorKind, ...]:
-    """Every kind there is, in the order in which they are looked for."""
+    """Every kind, in the order in which they are searched for."""
     return SENSORS.values()
 
 
 def wanted(sensor: str) -> tuple[SensorKind, ...]:
-    """The kinds that a value of `vision.sensor` can map with: one by its name, none; all for `auto` and other front-ends."""
+    """The kinds for a value of `vision.sensor`: one by its name; none for `none`; all for `auto` and other front-ends."""
     if sensor == "none":
         return ()
     return tuple(kind for kind in kinds() if kind.name == sensor) or kinds()
@@ -57,7 +57,7 @@ def kind_of(observation: Observation) -> SensorKind:
 
 
 def rig_of(config: SensorsConfig) -> Rig:
-    """The rig that a configuration alone gives, for those who feed the mapper themselves."""
+    """The rig described by a configuration alone, for users who feed the mapper themselves."""
     return Rig(**{kind.sensor_name: kind.configured(config) for kind in kinds()})
 
 
@@ -67,11 +67,11 @@ def message_types() -> tuple[str, ...]:
 
 
 def words(rig: Rig) -> list[str]:
-    """Each sensor of a rig in a few words."""
+    """Description of each sensor of a rig, in a few words."""
     return [kind.words(sensor) for kind, sensor in carried(rig)]
 
 
 def see(keyframe: Keyframe, rig: Rig, max_range_m: float) -> Seen | None:
-    """What a keyframe shows, by the first sensor of the rig that made it; None where it shows nothing."""
+    """The points of a keyframe, by the first sensor of the rig that has data in it; None if there is none."""
     seen = (kind.see(keyframe, sensor, max_range_m) for kind, sensor in carried(rig))
     return next((found for found in seen if found is not None), None)

@@ -1,6 +1,6 @@
-"""Self-motion and observations on one clock: the steps that a mapper takes, one after the other.
+"""Synchronise self-motion and observations: the steps of a mapper, one after the other.
 
-It stands inside the mapper, so that a live robot and a recording give the same steps.
+The mapper calls it, so a live robot and a recording give the same steps.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ class Ready:
 
     Attributes:
         stamp_ns: ns.
-        delta_robot: (3,) displacement since the step before, in the robot's frame at that step, m and rad.
-        dt_s: time since the step before, s.
+        delta_robot: (3,) displacement since the previous step, in the robot's frame at that step, m and rad.
+        dt_s: time since the previous step, s.
         pose_odom_robot: (3,) pose in `odom` at the stamp (velocities: integrated from the identity), m and rad.
-        observation: what was seen at the stamp; None for a step of self-motion alone.
+        observation: the observation at the stamp; None for a step of self-motion alone.
     """
 
     stamp_ns: int
@@ -39,22 +39,23 @@ class Ready:
 
 
 class Synchroniser:
-    """Turns sorted samples into steps, strictly in order of stamp; at one stamp motion comes before observations.
+    """Turns sorted samples into steps, strictly in order of stamp; at equal stamps motion comes before observations.
 
-    Every distinct stamp of self-motion gives one step without observation; every observation gives one step with it, at
-    the odometry interpolated to its own stamp, as soon as odometry at or after it has come. Of odometry messages with one
-    stamp the first counts; of velocities with one stamp the last, since each holds until the next.
+    Every distinct stamp of self-motion gives one step without observation. Every observation gives one step, at the odometry
+    interpolated to its stamp, once odometry at or after that stamp has arrived. Of odometry messages with equal stamps the
+    first counts; of velocities the last, since each is valid until the next.
 
-    A live robot's messages arrive out of order across topics: `latency_s` is how long samples wait to be sorted. The steps
-    are the same whatever the latency, as long as it covers the delay; a scan that comes behind it is dropped and counted.
+    A live robot's messages arrive out of order across topics: samples wait `latency_s` to be sorted. The steps do not depend on
+    the latency as long as it covers the delay; an observation that comes later is dropped and counted.
     """
 
     def __init__(self, latency_s: float = 0.0, odometry_delay_s: float = 0.0) -> None:
         """Start without any sample.
 
         Args:
-            latency_s: samples are held back until the newest stamp is this much ahead of theirs, s; 0 for sorted streams.
-            odometry_delay_s: added to the stamps of self-motion, so that they mean the same instants as those of views.
+            latency_s: samples are held until the newest stamp is this much later, s; 0 for sorted streams.
+            odometry_delay_s: added to the stamps of self-motion, to put them on the clock of the observations.
+            max_hold_s: at the end, observations later than the last odometry by more than this are dropped, s.
         """
         self.report = StreamReport()
         self._arrived = ReorderBuffer(latency_s + abs(odometry_delay_s))
@@ -66,17 +67,17 @@ class Synchroniser:
         self._waiting: deque[Observation] = deque()
 
     def push(self, sample: Sample) -> list[Ready]:
-        """Take in a sample; return the steps that have become ready.
+        """Add a sample; return the steps that have become ready.
 
         Raises:
-            StreamError: stamps go back, self-motion is not finite, or odometry and velocities are mixed.
+            StreamError: stamps out of order, self-motion that is not finite, or odometry mixed with velocities.
         """
         if self._odometry_delay_ns and isinstance(sample, SelfMotion | Velocity):
             sample = replace(sample, stamp_ns=sample.stamp_ns + self._odometry_delay_ns)
         return [step for ready in self._arrived.push(sample) for step in self._take(ready)]
 
     def flush(self) -> list[Ready]:
-        """End of the stream: the samples still held back, then the observations still waiting, at the last pose."""
+        """End of the stream: return the steps of all remaining samples; late observations get the last pose."""
         steps = [step for ready in self._arrived.flush() for step in self._take(ready)]
         if self._last is None:
             self._drop("observations before odometry", len(self._waiting))
@@ -128,7 +129,7 @@ class Synchroniser:
         return [self._make(sample.stamp_ns, self._last[1], sample)]
 
     def _release(self, stamp_ns: int, pose: Array) -> list[Ready]:
-        """Steps of the observations between the newest self-motion and the one that has just come."""
+        """Steps of the observations between the previous and the new self-motion sample."""
         assert self._last is not None
         steps = []
         before_ns, before = self._last

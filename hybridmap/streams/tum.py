@@ -1,4 +1,4 @@
-"""A folder in the TUM RGB-D format, with wheel odometry and calibration beside it."""
+"""A folder in the TUM RGB-D format, with files of wheel odometry and calibration."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ class TumStream:
     """`rgb/`, `depth/` with their lists or `associations.txt`, `odometry.txt` of base_link, `camera.yaml`."""
 
     def __init__(self, folder: Path, config: Config, window: Window | None = None) -> None:
-        """Read the lists, the odometry and the calibration, and see that every picture is there.
+        """Read the lists, the odometry and the calibration, and check that every image exists.
 
         Raises:
-            StreamError: a file is missing, damaged or contradicts another; the message says which.
+            StreamError: a file is missing, damaged or contradicts another; the message names it.
         """
         self.name = folder.name or str(folder)
         self._folder, self._sensors = folder, config.sensors
@@ -81,7 +81,7 @@ class TumStream:
         """Yield odometry and frames in order of stamp.
 
         Raises:
-            StreamError: a picture is damaged or of another size or kind than expected.
+            StreamError: an image is damaged, or of another size or kind than expected.
         """
         self.report = StreamReport(dict(self.losses), list(self.remarks))
         for sample in merge(self._motions(), self._frames()):
@@ -125,7 +125,7 @@ class TumStream:
         )
 
     def _read_groundtruth(self) -> Trajectory | None:
-        """`groundtruth_base.txt`, else `groundtruth.txt` (camera) carried to the base by `base_to_camera`."""
+        """`groundtruth_base.txt`, else `groundtruth.txt` (of the camera), transformed to the base by `base_to_camera`."""
         base, camera = self._folder / "groundtruth_base.txt", self._folder / "groundtruth.txt"
         if base.is_file():
             return read_tum(base)
@@ -173,7 +173,7 @@ def read_picture_list(path: Path, stamp_column: int = 0) -> tuple[NDArray[np.int
     """Stamps (N,) and fields of the lines of `rgb.txt`, `depth.txt` or `associations.txt`, sorted by stamp.
 
     Raises:
-        StreamError: the file is missing, empty or damaged, or its stamps go back.
+        StreamError: the file is missing, empty or damaged, or its stamps are out of order.
     """
     lines = _read_lines(path, 4 if path.name == "associations.txt" else 2)
     stamps = np.array([_stamp_ns(words[stamp_column], path, number) for number, words in lines], dtype=np.int64)
@@ -182,7 +182,7 @@ def read_picture_list(path: Path, stamp_column: int = 0) -> tuple[NDArray[np.int
 
 
 def _read_pairs(folder: Path, tolerance_s: float) -> tuple[list[_Pair], dict[str, int]]:
-    """Colour and depth that belong together, and how many pictures found no partner."""
+    """Pairs of colour and depth images, and the number of images without a partner."""
     listed = folder / "associations.txt"
     if listed.is_file():
         return _read_associations(listed), {}
@@ -197,7 +197,7 @@ def _read_pairs(folder: Path, tolerance_s: float) -> tuple[list[_Pair], dict[str
 
 
 def _read_associations(path: Path) -> list[_Pair]:
-    """`stamp rgb stamp depth`; where the first picture is the depth one, the other way round."""
+    """`stamp rgb stamp depth`, or with depth first if the first image is a depth image."""
     first = _read_lines(path, 4)[0][1]
     swapped = "depth" in first[1] and "depth" not in first[3]
     color, depth = (2, 0) if swapped else (0, 2)

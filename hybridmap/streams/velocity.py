@@ -1,4 +1,4 @@
-"""A velocity table `stamp_s,v_m_s,omega_rad_s`: self-motion alone, for the neural part and dead reckoning."""
+"""A velocity table `stamp_s,v_m_s,omega_rad_s`: self-motion alone, for path integration and dead reckoning."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ COLUMNS = ("stamp_s", "v_m_s", "omega_rad_s")
 
 
 class VelocityStream:
-    """Forward speed and turn rate; each holds until the next. A `<name>_groundtruth.tum` beside the table is its truth."""
+    """Forward speed and turn rate, each valid until the next. Its ground truth is `<name>_groundtruth.tum` next to it."""
 
     def __init__(self, path: Path, config: Config, window: Window | None = None) -> None:
         """Read the table.
 
         Raises:
-            StreamError: missing, empty, wrong columns, a value that is no finite number, or stamps that go back.
+            StreamError: missing, empty, wrong columns, a value that is not a finite number, or stamps out of order.
         """
         self.name = path.name
         self.rig = Rig()

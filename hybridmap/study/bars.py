@@ -1,4 +1,4 @@
-"""What the figures of a study have to keep to: each bar, group by group, over the seeds."""
+"""Bars: limits for the figures of a study, checked per group over the seeds."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _ROUND_OFF = 1e-6  # a map without any loop is that of odometry; by so much may 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A bar held against one group and back-end.
+    """Result of one bar for one group and back-end.
 
     Attributes:
-        bar: what is asked.
-        cell: the first cell of the group; its labels are those of all but for the seed.
-        values: of the cells over the seeds; None where there is no such figure, which misses any bar.
-        limits: what each value is held against.
-        value, limit: the statistic of the values, and the limit that goes with it; NaN where a value is missing.
+        bar: the bar.
+        cell: the first cell of the group; its labels are those of the group, except for the seed.
+        values: of the cells over the seeds; None for a missing figure, which misses any bar.
+        limits: the limit of each value.
+        value, limit: the statistic of the values, and its limit; NaN if a value is missing.
         passed: whether the bar is kept.
     """
 
@@ -45,17 +45,17 @@ class Verdict:
 
     @property
     def unit(self) -> str:
-        """Of the figure."""
+        """Unit of the figure."""
         return unit_of(self.bar.figure)
 
     @property
     def median(self) -> float:
-        """Of the values; NaN where one is missing."""
+        """Median of the values; NaN if one is missing."""
         return float(np.median(_whole(self.values)))
 
     @property
     def worst(self) -> float:
-        """Of the values: the least for a lower bar, the greatest for an upper one; NaN where one is missing."""
+        """Worst of the values: the least for `at_least`, the greatest for `at_most`; NaN if one is missing."""
         return float((np.min if self.bar.side == "at least" else np.max)(_whole(self.values)))
 
     @property
@@ -68,7 +68,7 @@ class Verdict:
 
 
 def judge(grid: Grid, results: Mapping[str, CellResult]) -> list[Verdict]:
-    """Hold every bar of the study against every group that it is for, in their order."""
+    """Check every bar of the study against every group that it applies to, in order."""
     groups = grid.groups()
     return [
         _verdict(bar, cells, groups, results)
@@ -113,5 +113,5 @@ def _verdict(
 
 
 def _whole(values: Sequence[float | None]) -> np.ndarray:
-    """(N,) with NaN for what is missing."""
+    """(N,) with NaN for missing values."""
     return np.array([math.nan if value is None else value for value in values])

@@ -1,4 +1,4 @@
-"""One cell of a study: one graph, disturbed, through one back-end, and what the referee says of the outcome."""
+"""One cell of a study: disturb one graph, solve it with one back-end, and compute the errors."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ UNMAPPED, MAPPED = "unmapped", "mapped"
 
 @dataclass(frozen=True, slots=True)
 class CellTask:
-    """All that a cell needs; it may be sent to another machine.
+    """The input of a cell; it may be sent to another machine.
 
     Attributes:
-        key: digest of all that determines the figures.
+        key: digest of everything that determines the figures.
         frozen: the graph with its reference, packed.
-        drift, kind, rate, seed: what is done to it first.
-        variant: through which back-end, and how.
+        drift, kind, rate, seed: disturbance of the graph.
+        backend, settings, start, way: as in `model.BackendVariant`.
     """
 
     key: str
@@ -51,15 +51,15 @@ class CellTask:
 
 @dataclass(frozen=True, slots=True)
 class CellResult:
-    """What came out.
+    """The result of a cell.
 
     Attributes:
         key: of the task.
-        status: the back-end's word, `failed` for a typed error, `unmapped` where there was no graph.
+        status: that of the back-end, `failed` for a typed error, `unmapped` if there was no graph.
         message: one line for people.
-        figures: of `measures`, and counts of the graph; None where there is no such figure (no map, no error).
-        timings: `measures.TIMINGS`; apart from all results.
-        code: digest of the code that computed it.
+        figures: of `measures`, and counts of the graph; None for a missing figure (no map, no error).
+        timings: `measures.TIMINGS`; kept apart from the results.
+        code: digest of the code that computed the result.
     """
 
     key: str
@@ -70,18 +70,19 @@ class CellResult:
     code: str = field(default_factory=lambda: provenance.solving())
 
     def figure(self, name: str) -> float | None:
-        """Any figure or timing; None where there is none."""
+        """A figure or timing by name; None if missing."""
         return self.figures.get(name, self.timings.get(name))
 
 
 def key_of(source_key: str, drift: DriftConfig, false_loops: tuple[str, float, int], variant: BackendVariant) -> str:
-    """Digest of all that determines a cell; what plays no part (a rate of 0 has no kind and no seed) does not enter.
+    """Digest of everything that determines a cell. Inputs without effect are left out: at a rate of 0, kind and seed.
 
     Args:
         source_key: of the clean graph.
-        drift: put on its odometry.
+        drift: disturbance of its odometry.
         false_loops: kind, rate and seed.
-        variant: the back-end's name, settings, start and way.
+        variant: the back-end's name, start and way.
+        settings: its whole section, a `BackendsConfig`.
     """
     kind, rate, seed = false_loops
     return provenance.digest(
@@ -98,7 +99,7 @@ def key_of(source_key: str, drift: DriftConfig, false_loops: tuple[str, float, i
 
 
 def run(task: CellTask) -> CellResult:
-    """Disturb the graph, solve it, judge it. A typed error is a result; anything else is a mistake of ours and raised."""
+    """Disturb the graph, solve it and compute the errors. A typed error becomes a result; any other exception is raised."""
     frozen = Frozen.unpack(task.frozen)
     if frozen.graph is None:
         return CellResult(task.key, UNMAPPED, frozen.failure)
@@ -123,7 +124,7 @@ def run(task: CellTask) -> CellResult:
 
 
 def _as_mapped(task: CellTask, frozen: Frozen) -> CellResult:
-    """What the drive itself came to; the time of mapping is that of the back-end that drove."""
+    """The result of the drive itself; the time of mapping is assigned to the primary back-end."""
     assert frozen.mapped is not None
     name = frozen.mapped.primary if task.variant.backend == "primary" else task.variant.backend
     if name not in frozen.mapped.figures:
@@ -155,7 +156,7 @@ def judge(own: PoseGraph, graph: PoseGraph, solution: Solution, reference: Array
 
 
 def errors(poses: Array, reference: Array) -> tuple[float, float]:
-    """RMSE of position (m) and of heading (deg) after SE(2) alignment, over the nodes whose reference is known; else NaN."""
+    """RMSE of position (m) and heading (deg) after SE(2) alignment, over the nodes with a known reference; NaN without."""
     known = np.isfinite(reference).all(axis=1)
     if np.count_nonzero(known) < 3:
         return math.nan, math.nan
@@ -165,7 +166,7 @@ def errors(poses: Array, reference: Array) -> tuple[float, float]:
 
 
 def _solve(task: CellTask, graph: PoseGraph) -> Solution:
-    """At once, node by node, or node by node with the end of the drive; the report counts everything."""
+    """Solve in batch, incrementally, or incrementally with `finish`; the report covers everything."""
     backend = create(task.variant.backend, backend_settings(task.variant))
     if task.variant.way == "solve":
         return backend.solve(graph)
@@ -180,10 +181,10 @@ def _solve(task: CellTask, graph: PoseGraph) -> Solution:
 
 
 def _begun(graph: PoseGraph, start: str, reference: Array) -> PoseGraph:
-    """The graph with the poses to begin with; node 0 stays where it is.
+    """The graph with its initial poses; node 0 keeps its pose.
 
     Raises:
-        BackendError: there is no such start for this graph.
+        BackendError: this graph has no such start.
     """
     if start == "odometry":
         return replace(graph, initial=dead_reckoning(graph, graph.initial[:1]))
@@ -202,9 +203,9 @@ def _begun(graph: PoseGraph, start: str, reference: Array) -> PoseGraph:
 
 
 def _fates(graph: PoseGraph, solution: Solution) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """(E,) which edges were kept and (E,) which were held for false; dead reckoning uses no loop at all.
+    """(E,) which edges were kept and (E,) which were rejected; dead reckoning uses no loop at all.
 
-    A kernel may do neither: it weighs an edge down by more than a half long before its residual is beyond the gate.
+    Both may be false: a kernel weighs an edge below one half long before its residual is beyond the gate.
     """
     report = solution.report
     if report.backend == ODOMETRY:

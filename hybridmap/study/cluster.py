@@ -1,4 +1,4 @@
-"""The work done by a Dask cluster: any number of machines that have the same hybridmap installed."""
+"""Computing on a Dask cluster: any number of machines with the same hybridmap installed."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ _CONNECT_S = 30
 
 
 class DaskCluster:
-    """A scheduler and whatever workers it has; a task whose worker dies goes to another one.
+    """A Dask scheduler with its workers; if a worker dies, another one gets its task.
 
-    Start the workers with one thread each (`dask worker --nthreads 1`), which also pins their numerical libraries to one.
+    Start the workers with one thread each (`dask worker --nthreads 1`), which also limits their numerical libraries to one.
     """
 
     def __init__(self, address: str) -> None:
         """Connect to `tcp://host:port`.
 
         Raises:
-            StudyError: the extra `cluster` is not installed, or nobody answers there, or no worker comes.
+            StudyError: the extra `cluster` is not installed, there is no scheduler at the address, or it has no worker.
         """
         try:
             import distributed
@@ -48,7 +48,7 @@ class DaskCluster:
         """See `pools.Pool.run`.
 
         Raises:
-            StudyError: the connection to the scheduler is lost; what is done so far has been yielded.
+            StudyError: the connection to the scheduler is lost; finished tasks have been yielded.
         """
         futures = {self._client.submit(work, task, pure=False): index for index, task in enumerate(tasks)}
         try:
@@ -62,21 +62,21 @@ class DaskCluster:
             self._client.cancel(list(futures))
 
     def close(self) -> None:
-        """End the connection; scheduler and workers stay."""
+        """Close the connection; scheduler and workers keep running."""
         self._client.close()
 
     def _lost(self, error: BaseException) -> Lost:
-        """What to say of a task that raised or that killed its workers; a worker without our package ends the study."""
+        """The outcome of a task that raised or that killed its workers; a worker without our package ends the study."""
         if isinstance(error, ImportError):
             raise StudyError(f"a worker cannot import hybridmap: {error}; install the same version on all") from None
         return Lost.by(error)
 
 
 def _require_listener(address: str) -> None:
-    """Refuse an address at which nobody listens, at once and before Dask starts to try again and again.
+    """Refuse an address without a listener at once, before Dask retries for a long time.
 
     Raises:
-        StudyError: it is no address, or the connection is refused.
+        StudyError: it is not an address, or the connection is refused.
     """
     found = re.fullmatch(r"(tcp|tls)://\[?([^/]+?)\]?:(\d{1,5})", address)
     if found is None:

@@ -1,7 +1,7 @@
-"""What is done to the samples of a drive before it is mapped: worse scans, frames, wheels and clocks, and kidnapping.
+"""Disturbances of a drive before it is mapped: worse scans, frames, wheels and clocks, and kidnapping.
 
-A disturbance is a small function in `TABLE`; a study names it with its strength. Strength 0 changes nothing, and the same
-seed gives the same bits.
+A disturbance is a function in `TABLE`; a study gives its name and strength. Strength 0 changes nothing. The same seed
+gives the same bits.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ class Disturbance:
     """An entry of the table.
 
     Attributes:
-        apply: the samples, its strength (a number, or as many as `count`), its own generator and the rig to worse samples.
-        by_chance: whether the seed plays a part.
+        apply: (samples, strength, generator, rig) -> disturbed samples. The strength is a number, or `count` numbers.
+        by_chance: whether it is random.
         most: the greatest strength.
-        count: how many numbers its strength is of.
+        count: how many numbers the strength consists of.
     """
 
     apply: Callable[[Samples, Any, np.random.Generator, Rig], Iterator[Sample]]
@@ -51,13 +51,13 @@ class Disturbance:
 
 
 def disturbed(samples: Samples, rig: Rig, disturbances: Mapping[str, float | tuple[float, ...]], seed: int) -> Iterator[Sample]:
-    """The samples made worse, in the order of `TABLE`.
+    """The disturbed samples; the disturbances apply in the order of `TABLE`.
 
     Args:
         samples: of a stream, in order of stamp.
         rig: its sensors.
         disturbances: name -> strength.
-        seed: of those that are left to chance; each draws from a stream of its own.
+        seed: of the random ones; each has a generator of its own.
     """
     for name, one in TABLE.items():
         strength = disturbances.get(name, 0.0)
@@ -67,7 +67,7 @@ def disturbed(samples: Samples, rig: Rig, disturbances: Mapping[str, float | tup
 
 
 def by_chance(disturbances: Mapping[str, float | tuple[float, ...]]) -> bool:
-    """Whether another seed gives other samples."""
+    """Whether the samples depend on the seed."""
     return any(TABLE[name].by_chance and np.any(strength) for name, strength in disturbances.items())
 
 
@@ -75,7 +75,7 @@ def check(name: str, strength: float | tuple[float, ...], origin: str) -> None:
     """Check an entry of a study.
 
     Raises:
-        ConfigError: there is no such disturbance, or its strength cannot be.
+        ConfigError: an unknown disturbance, or an invalid strength.
     """
     if name not in TABLE:
         raise ConfigError(f"{origin}: unknown disturbance {name!r}; there are {', '.join(TABLE)}")
@@ -89,35 +89,35 @@ def check(name: str, strength: float | tuple[float, ...], origin: str) -> None:
 
 
 def scan_range_m(ranges: Ranges, limit_m: float, _rng: np.random.Generator) -> Ranges:
-    """Returns beyond this are lost, m."""
+    """Remove returns beyond this range, m."""
     return np.where(ranges < limit_m, ranges, np.float32(np.nan))
 
 
 def scan_covered(ranges: Ranges, share: float, _rng: np.random.Generator) -> Ranges:
-    """This share of the fan is covered, half of it at either end."""
+    """Cover this share of the field of view, half of it at either end."""
     ranges, covered = ranges.copy(), round(0.5 * share * len(ranges))
     ranges[:covered] = ranges[len(ranges) - covered :] = np.nan
     return ranges
 
 
 def scan_noise_m(ranges: Ranges, sigma_m: float, rng: np.random.Generator) -> Ranges:
-    """White noise of every range, standard deviation, m."""
+    """Add white noise to every range; standard deviation, m."""
     return ranges + np.float32(sigma_m) * rng.standard_normal(ranges.shape, dtype=np.float32)
 
 
 def beams_lost(ranges: Ranges, share: float, rng: np.random.Generator) -> Ranges:
-    """This share of the beams has no return."""
+    """Remove the returns of this share of the beams."""
     return np.where(rng.random(ranges.shape) < share, np.float32(np.nan), ranges)
 
 
 def beams_short(ranges: Ranges, share: float, rng: np.random.Generator) -> Ranges:
-    """This share of the beams is stopped somewhere on its way."""
+    """Stop this share of the beams at a random part of their range."""
     stopped, where = rng.random((2, *ranges.shape), dtype=np.float32)
     return np.where(stopped < share, where * ranges, ranges)
 
 
 def blur_s(samples: Samples, exposure_s: float, _rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
-    """Pictures are smeared along their rows by what the robot turns within this exposure, s."""
+    """Blur images along their rows by the robot's turn during this exposure time, s."""
     newest: SelfMotion | None = None
     rate_rad_s, camera = 0.0, rig.sensors.get("camera")
     for sample in samples:
@@ -133,53 +133,53 @@ def blur_s(samples: Samples, exposure_s: float, _rng: np.random.Generator, rig: 
 
 
 def darker(frame: RgbdFrame, share: float, _rng: np.random.Generator) -> RgbdFrame:
-    """Every colour value is less by this share: 0.9 is dusk, 1 is night."""
+    """Reduce every colour value by this share: 0.9 is dusk, 1 is night."""
     return replace(frame, color=np.rint(round(1.0 - share, 9) * frame.color).astype(np.uint8))
 
 
 def color_noise(frame: RgbdFrame, sigma: float, rng: np.random.Generator) -> RgbdFrame:
-    """White noise of every colour value, standard deviation, of 255."""
+    """Add white noise to every colour value; standard deviation, out of 255."""
     grain = np.float32(sigma) * rng.standard_normal(frame.color.shape, dtype=np.float32)
     return replace(frame, color=np.clip(frame.color + grain + np.float32(0.5), 0, 255).astype(np.uint8))
 
 
 def depth_noise_m(frame: RgbdFrame, sigma_m: float, rng: np.random.Generator) -> RgbdFrame:
-    """White noise of every depth, standard deviation at 1 m, growing with the square of the depth, m."""
+    """Add white noise to every depth; standard deviation at 1 m, growing with the square of the depth, m."""
     grain = np.float32(sigma_m) * rng.standard_normal(frame.depth_m.shape, dtype=np.float32)
     noisy = frame.depth_m + grain * (frame.depth_m / np.float32(_NEAR_DEPTH_M)) ** 2
     return replace(frame, depth_m=np.where(frame.depth_m > 0.0, np.maximum(noisy, 0.0), frame.depth_m))
 
 
 def depth_range_m(frame: RgbdFrame, limit_m: float, _rng: np.random.Generator) -> RgbdFrame:
-    """Depth beyond this is lost, m."""
+    """Remove depth beyond this, m."""
     return replace(frame, depth_m=np.where(frame.depth_m > limit_m, np.float32(0.0), frame.depth_m))
 
 
 def depth_lost(frame: RgbdFrame, share: float, rng: np.random.Generator) -> RgbdFrame:
-    """This share of the pixels has no depth."""
+    """Remove the depth of this share of the pixels."""
     gone = rng.random(frame.depth_m.shape, dtype=np.float32) < share
     return replace(frame, depth_m=np.where(gone, np.float32(0.0), frame.depth_m))
 
 
 def wheel_scale(step: Array, share: float, _rng: np.random.Generator) -> Array:
-    """Every distance is reported too long by this share."""
+    """Increase every reported distance by this share."""
     factors: Array = np.array([1.0 + share, 1.0 + share, 1.0])
     return step * factors
 
 
 def wheel_turn_scale(step: Array, share: float, _rng: np.random.Generator) -> Array:
-    """Every turn is reported too large by this share."""
+    """Increase every reported turn by this share."""
     factors: Array = np.array([1.0, 1.0, 1.0 + share])
     return step * factors
 
 
 def wheel_pull_deg_per_m(step: Array, bias_deg: float, _rng: np.random.Generator) -> Array:
-    """A pull to the left, degrees per metre driven."""
+    """Add a heading bias to the left, degrees per metre driven."""
     return _turned(step, math.radians(bias_deg) * math.hypot(step[0], step[1]))
 
 
 def wheel_noise_deg_per_sqrt_m(step: Array, sigma_deg: float, rng: np.random.Generator) -> Array:
-    """The heading walks at random, degrees per square root of a metre."""
+    """Add a random walk of the heading, degrees per square root of a metre."""
     return _turned(step, rng.normal() * math.radians(sigma_deg) * math.sqrt(math.hypot(step[0], step[1])))
 
 
@@ -189,13 +189,13 @@ def _turned(step: Array, turn_rad: float) -> Array:
 
 
 def wheel_slips_per_m(step: Array, rate: float, rng: np.random.Generator) -> Array:
-    """So often per metre driven a step is wrong by some 0.3 m and 15 degrees."""
+    """Add slips of about 0.3 m and 15 degrees to single steps, this many per metre driven."""
     hit, slip = rng.random() < rate * math.hypot(step[0], step[1]), rng.normal(size=3) * _SLIP
     return step + slip if hit else step
 
 
 def views_lost(samples: Samples, share: float, _rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
-    """This share of the scans and frames is lost, at regular intervals: a lower rate."""
+    """Remove this share of the scans and frames at regular intervals, as a lower rate would."""
     number, kept = 0, 1.0 - share
     for sample in samples:
         if isinstance(sample, Observation):
@@ -206,7 +206,7 @@ def views_lost(samples: Samples, share: float, _rng: np.random.Generator, _rig: 
 
 
 def views_late_s(samples: Samples, late_s: float, _rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
-    """Scans and frames are stamped so much later than they were taken, s."""
+    """Delay the stamps of scans and frames by this time, s."""
     held: deque[Observation] = deque()
     for sample in samples:
         while held and held[0].stamp_ns < sample.stamp_ns:
@@ -221,9 +221,9 @@ def views_late_s(samples: Samples, late_s: float, _rng: np.random.Generator, _ri
 def kidnapped_s(
     samples: Samples, times_s: tuple[float, float, float], _rng: np.random.Generator, _rig: Rig
 ) -> Iterator[Sample]:
-    """The robot is picked up at the first time and put down at the second, and the drive ends at the third, s.
+    """Kidnap the robot: [picked up, put down, end of the drive], s from the first stamp.
 
-    What lies between is left out, and the odometry goes on where it was: the wheels felt nothing.
+    Samples in between are removed, and the odometry continues from its last pose: the wheels do not turn.
     """
     up_ns = down_ns = end_ns = -1
     held, onward = IDENTITY, None
@@ -249,7 +249,7 @@ def _each(
     by_chance: bool = False,
     most: float = math.inf,
 ) -> Disturbance:
-    """Of every sample of a kind alone."""
+    """Apply a function to every sample of a kind by itself."""
 
     def apply(samples: Samples, strength: float, rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
         for sample in samples:
@@ -259,12 +259,12 @@ def _each(
 
 
 def _ranges(change: Callable[[Ranges, float, np.random.Generator], Ranges]) -> Callable[..., LaserScan]:
-    """Of a scan's ranges."""
+    """Apply a function to the ranges of every scan."""
     return lambda scan, strength, rng: replace(scan, ranges_m=change(scan.ranges_m, strength, rng))
 
 
 def _wheels(change: Callable[[Array, float, np.random.Generator], Array], *, by_chance: bool = False) -> Disturbance:
-    """Of every step between two odometry messages, in the robot's frame."""
+    """Apply a function to every step between two odometry messages, in the robot's frame."""
 
     def apply(samples: Samples, strength: float, rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
         before: Array | None = None

@@ -1,4 +1,4 @@
-"""A drive to be mapped: a recording or a simulated world, disturbed, and what the map comes to against what is known."""
+"""Mapping a drive for a study: a recording or a simulated world, disturbed, and the errors of its map."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ _KNOWN_M, _KNOWN_RAD = 1.0, math.radians(45.0)  # so close to where it was befor
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """A drive that is still to be mapped; a worker needs the recording at the same path.
+    """A drive to be mapped; a worker needs the recording at the same path.
 
     Attributes:
         source: a simulated world or the path of a recording.
-        config: how it is mapped, as plain values.
-        start_s, end_s: only this part of it.
+        config: configuration of the mapping, as plain values.
+        start_s, end_s: map only this part.
         disturb: disturbances and their strengths.
         seed: of the disturbances.
-        reference, relations: paths of what is known; empty for nothing, or for the stream's own truth.
+        reference, relations: paths of ground truth and relations; empty: none, or the stream's own ground truth.
     """
 
     source: str
@@ -61,7 +61,7 @@ class Drive:
     relations: str = ""
 
     def make(self) -> Frozen:
-        """Map it once and freeze the accepted edges.
+        """Map the drive once and freeze the accepted edges.
 
         Raises:
             HybridMapError: the stream cannot be read or mapped, or gives no edge.
@@ -96,7 +96,7 @@ class Drive:
         return Frozen(graph, reference, of_truth=truth is not None, mapped=mapped)
 
     def _put_down_ns(self, stream: Stream) -> int | None:
-        """Stamp at which a kidnapped robot is put down; None where it never is."""
+        """Stamp at which a kidnapped robot is put down; None if it is not kidnapped."""
         if isinstance(stream, SimulatedStream):
             return None if stream.carry is None else int(stream.groundtruth.stamps_ns[stream.carry.last])
         times_s = (self.disturb or {}).get(KIDNAPPED)
@@ -106,20 +106,20 @@ class Drive:
 
 
 class _Watch:
-    """Looks, after a kidnapping, how far the robot is from where it should be on its own map."""
+    """After a kidnapping, tracks the error of the robot's pose on its own map."""
 
     def __init__(self, mapper: Mapper, truth: Trajectory | None, down_ns: int | None) -> None:
         self._mapper, self._truth, self._down_ns = mapper, truth, down_ns
         self._off_m = list[float]()
 
     def look(self, sample: Sample, updates: Iterable[Update]) -> None:
-        """Take in what a sample made of the map."""
+        """Look at the map after a sample."""
         if self._truth is None or self._down_ns is None or sample.stamp_ns < self._down_ns:
             return
         self._off_m += [self._off_map_m(self._truth, self._down_ns) for update in updates if update.new_node is not None]
 
     def figures(self) -> Figures:
-        """How far off it was, and the way driven until it was in a known place and until it was found; None for never."""
+        """Error after the kidnapping; travel until the robot was in a known place, and until localised; None: never."""
         if self._truth is None or self._down_ns is None or not self._off_m:
             return {}
         stamps = _stamps(self._mapper)
@@ -135,7 +135,7 @@ class _Watch:
         }
 
     def _off_map_m(self, truth: Trajectory, down_ns: int) -> float:
-        """How far the newest node is from where it should be, seen from the node of before that it is nearest to in truth."""
+        """Error of the newest node, relative to the earlier node that is nearest to it in the ground truth."""
         stamps = _stamps(self._mapper)
         nodes, poses = truth.at(stamps), self._mapper.poses()
         before = nodes[: np.searchsorted(stamps, down_ns)]
@@ -145,7 +145,7 @@ class _Watch:
 
 
 def _been_before(nodes: Array, down: int) -> NDArray[np.bool_]:
-    """Which nodes since one, of the true poses (N, 3), lie near one before it and look the same way."""
+    """Which nodes from a given one on, by true poses (N, 3), are near an earlier one with a similar heading."""
     apart = between(nodes[down:, None], nodes[None, :down])
     near = (np.hypot(apart[..., 0], apart[..., 1]) < _KNOWN_M) & (np.abs(apart[..., 2]) < _KNOWN_RAD)
     return np.asarray(near.any(axis=1))
@@ -154,7 +154,7 @@ def _been_before(nodes: Array, down: int) -> NDArray[np.bool_]:
 def _figures(
     mapper: Mapper, track: Track, truth: Trajectory | None, relations: Relations | None, watch: _Watch
 ) -> Mapping[str, Figures]:
-    """Figures of odometry and of every back-end; those that are not finite are None."""
+    """Figures of odometry and of every back-end; None if not finite."""
     found: dict[str, dict[str, float | None]] = {}
     estimates = {name: trajectory_of(track, one.poses) for name, one in mapper.backends.solutions.items() if name != ODOMETRY}
     for name, estimate in ({ODOMETRY: track.odometry} | estimates).items():
@@ -206,7 +206,7 @@ def _of_loops(mapper: Mapper, solution: Solution, truth: Trajectory | None) -> d
 
 
 def _false_kept(mapper: Mapper, solution: Solution, truth: Trajectory) -> int:
-    """Loops far from the truth that keep a weight above a half."""
+    """Number of loops far from the ground truth that keep a weight above one half."""
     known, weights = known_at(truth, _stamps(mapper)), solution.report.weights
     kept = [
         edge
@@ -232,7 +232,7 @@ def _timings(cpu_s: float, duration_s: float, views: int) -> dict[str, float]:
 
 
 def _track(mapper: Mapper, updates: Iterable[Update]) -> Track:
-    """One row a distinct stamp, as a session keeps it; what came before the first node is seen from that one."""
+    """One row per distinct stamp, as in a session; rows before the first node are relative to that node."""
     rows: dict[int, tuple[int, Array, Array]] = {}
     first = mapper.map.node(0).pose_odom
     newest = -1
@@ -251,14 +251,14 @@ def _stamps(mapper: Mapper) -> NDArray[np.int64]:
 
 
 def truth_at(truth: Trajectory, stamps_ns: NDArray[np.int64]) -> Array:
-    """True poses (N, 3) at stamps, NaN where the truth is not known."""
+    """True poses (N, 3) at stamps, NaN where unknown."""
     poses = truth.at(stamps_ns)
     poses[~known_at(truth, stamps_ns)] = np.nan
     return poses
 
 
 def _there(path: str) -> Path:
-    """A path that must exist: a worker without the file says so, and the study tries again elsewhere."""
+    """A path that must exist: a worker without the file reports that, and the study tries another one."""
     if not Path(path).exists():
         raise FileNotFoundError(f"{path}: not on this machine; a recording must lie at the same path on every worker")
     return Path(path)

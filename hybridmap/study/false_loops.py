@@ -1,4 +1,4 @@
-"""What is done to a frozen graph on purpose before a back-end gets it: errors of its odometry, drop-outs, false loops."""
+"""Disturbances of a frozen graph before a back-end gets it: errors of its odometry, drop-outs, false loops."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _RUN = 5  # aliased loops that come one after the other and agree with each othe
 
 
 def with_drift(graph: PoseGraph, drift: DriftConfig, seed: int) -> PoseGraph:
-    """The graph with wrong odometry edges; `initial` moves along with them.
+    """The graph with disturbed odometry edges; `initial` changes with them.
 
-    A step of length s turns by a further bias * s, half of it before the step, and is (1 + scale) s long.
+    A step of length s turns by another bias * s, half of it before the step, and its length becomes (1 + scale) s.
     """
     if drift.idle:
         return graph
@@ -56,9 +56,9 @@ def inject(graph: PoseGraph, share: float, mode: Kind, rng: np.random.Generator)
     Args:
         graph: a graph with true loops, whose measurements and information the false ones copy.
         share: of false loops among all loops afterwards, 0 <= share < 1.
-        mode: `random` joins two random nodes; `aliased` takes a run of neighbouring true loops and moves all of its
-            old ends by one and the same number of nodes, as a second corridor like the first would.
-        rng: the only source of chance.
+        mode: `random` joins two random nodes; `aliased` copies a run of neighbouring true loops with all old nodes shifted
+            by the same number, as two similar corridors would.
+        rng: the only random generator.
 
     Raises:
         GraphError: no loop to copy, or a share outside [0, 1).
@@ -85,15 +85,15 @@ def inject(graph: PoseGraph, share: float, mode: Kind, rng: np.random.Generator)
 
 
 def drop_out(graph: PoseGraph, share: float, rng: np.random.Generator) -> PoseGraph:
-    """Let the wheels fail on some steps; `initial` becomes the chain of what is left.
+    """Disturb some odometry steps; `initial` becomes the resulting chain.
 
-    Each odometry edge that is hit turns by 20 deg more, to either side, and slips 0.5 m in any direction; its information
-    stays as it was: the wheels do not know.
+    Each chosen odometry edge turns by 20 deg more, to either side, and slips 0.5 m in any direction. Its information stays,
+    as the wheels do not notice.
 
     Args:
         graph: with odometry edges.
-        share: of its odometry edges that are hit, 0 <= share <= 1.
-        rng: the only source of chance.
+        share: of its odometry edges to disturb, 0 <= share <= 1.
+        rng: the only random generator.
 
     Raises:
         GraphError: a share outside [0, 1].
@@ -111,7 +111,7 @@ def drop_out(graph: PoseGraph, share: float, rng: np.random.Generator) -> PoseGr
 
 
 def _generator(stream: str, rate: float, seed: int) -> np.random.Generator:
-    """The chance of one error of the odometry at one rate; that of false loops is the seed's own."""
+    """The random generator of one kind of odometry error at one rate; that of false loops is made from the seed alone."""
     return np.random.default_rng([seed, _STREAMS.index(stream), round(1e6 * rate)])
 
 
@@ -124,7 +124,7 @@ def _drifted(deltas: Array, drift: DriftConfig) -> Array:
 
 
 def _moved(graph: PoseGraph, deltas: Array) -> Array:
-    """The graph's initial poses, each step between them changed as the odometry edge of the same two nodes was."""
+    """The graph's initial poses, with each step changed as the odometry edge of the same two nodes."""
     forward = (graph.kinds == EdgeKind.ODOMETRY) & (graph.targets - graph.sources == 1)
     steps = between(graph.initial[:-1], graph.initial[1:])
     before, after = graph.deltas[forward], deltas[forward]

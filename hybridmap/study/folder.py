@@ -1,4 +1,4 @@
-"""The study's folder: results by key, one file each, written in one move, and the tables at the end."""
+"""The folder of a study: one file per result, named by its key and written atomically, and the tables at the end."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ STUDY_FOLDER = Kind("study", _FILES, lambda folder: holds_only(folder, _FILES), 
 
 @dataclass(frozen=True, slots=True)
 class StudyFolder:
-    """Paths and files of one study; results of earlier configurations stay and do no harm.
+    """Paths and files of one study; results of earlier configurations stay without effect.
 
     Attributes:
-        path: the folder itself, what `--out` names.
+        path: the folder, as given by `--out`.
     """
 
     path: Path
 
     def result(self, key: str) -> CellResult | None:
-        """What is known of a cell; None where it is not known, or damaged, as by a loss of power."""
+        """The stored result of a cell; None if there is none, or if it is damaged, as by a loss of power."""
         try:
             return CellResult(**json.loads(self._cell(key).read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError):
             return None
 
     def keep_result(self, result: CellResult) -> None:
-        """Write a result; a kill at any time leaves all of it or nothing."""
+        """Write a result atomically."""
         write_bytes(self._cell(result.key), json.dumps(asdict(result), allow_nan=False).encode())
 
     def frozen(self, key: str) -> bytes | None:
-        """A packed graph; None where there is none yet, or a damaged one."""
+        """A packed graph; None if there is none, or if it is damaged."""
         try:
             data = self._source(key).read_bytes()
             Frozen.unpack(data)
@@ -50,7 +50,7 @@ class StudyFolder:
         return data
 
     def keep_frozen(self, key: str, data: bytes) -> None:
-        """Write a packed graph, all or nothing."""
+        """Write a packed graph atomically."""
         write_bytes(self._source(key), data)
 
     def _cell(self, key: str) -> Path:

@@ -1,4 +1,4 @@
-"""A graph that will not change any more, with what its nodes are compared with and what its drive came to."""
+"""A frozen graph with its reference, and with the figures of the drive that it comes from."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Figures = Mapping[str, float | None]
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """What a drive came to as it was mapped.
+    """The figures of a drive as it was mapped.
 
     Attributes:
-        primary: the back-end that drove.
+        primary: the primary back-end.
         figures: back-end (or `odometry`) -> figures of `measures.MAPPED`.
         timings: figures of `measures.TIMINGS`.
     """
@@ -34,14 +34,14 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class Frozen:
-    """A graph that will not change any more.
+    """A frozen graph with its reference.
 
     Attributes:
-        graph: without false loops or drift; None where there was none to be had.
+        graph: without false loops or drift; None if it could not be made.
         reference: (N, 3) m and rad, NaN where unknown.
-        of_truth: whether the reference is the truth; else the optimum of the clean graph by `gtsam-lm`.
+        of_truth: whether the reference is ground truth; else it is the optimum of the clean graph by `gtsam-lm`.
         failure: why there is no graph; empty otherwise.
-        mapped: of the drive that it comes from; None where it comes from no drive.
+        mapped: of the drive that the graph comes from; None if it comes from no drive.
     """
 
     graph: PoseGraph | None
@@ -64,7 +64,7 @@ class Frozen:
 
     @classmethod
     def unpack(cls, data: bytes) -> Frozen:
-        """Read what `pack` gave.
+        """Read the bytes of `pack`.
 
         Raises:
             ValueError, OSError, KeyError, zipfile.BadZipFile: it is damaged.

@@ -1,4 +1,4 @@
-"""The grid: every cell of a study in its order, with the key that its result is kept under."""
+"""The grid of a study: its cells in order, each with the key of its result."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ Group = tuple[str, str, str, float]
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One line of the table.
+    """One cell: one row of the table.
 
     Attributes:
         source, setting, backend: titles in the study.
         kind: of the false loops; empty at rate 0.
         rate: share of false loops.
-        seed: None where nothing in the cell is left to chance.
+        seed: None if nothing in the cell is random.
         source_key: of the clean graph.
-        key: of the result; two cells that must have the same result have the same key.
+        key: of the result; cells with necessarily equal results share a key.
     """
 
     source: str
@@ -45,16 +45,16 @@ class Cell:
 
     @property
     def group(self) -> Group:
-        """What the cells of all back-ends and seeds have in common that are summed up together."""
+        """The labels shared by the cells of all back-ends and seeds that are summarised together."""
         return self.source, self.setting, self.kind, self.rate
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """All cells of a study, and how to come to their graphs.
+    """All cells of a study, and the tasks that make their graphs.
 
     Attributes:
-        study: what they were laid out from.
+        study: the study.
         cells: in the order of the tables.
         sources: key -> task, for every graph that a cell needs.
     """
@@ -64,14 +64,14 @@ class Grid:
     sources: dict[str, SourceTask]
 
     def groups(self) -> dict[tuple[Group, str], list[Cell]]:
-        """Group and back-end -> its cells, one a seed, in their order."""
+        """Group and back-end -> its cells, one per seed, in order."""
         found: dict[tuple[Group, str], list[Cell]] = {}
         for cell in self.cells:
             found.setdefault((cell.group, cell.backend), []).append(cell)
         return found
 
     def task(self, cell: Cell, frozen: bytes) -> CellTask:
-        """The work of a cell on its packed graph."""
+        """The task of a cell, given its packed graph."""
         setting = next(setting for setting in self.study.settings if setting.name == cell.setting)
         variant = next(variant for variant in self.study.backends if variant.title == cell.backend)
         kind: Kind = "aliased" if cell.kind == "aliased" else "random"
@@ -79,9 +79,9 @@ class Grid:
 
 
 def lay_out(study: StudyConfig) -> Grid:
-    """Lay out the cells: sources, settings, kinds and rates, seeds, back-ends, the last one fastest.
+    """Make the cells: sources, settings, kinds and rates, seeds, back-ends; the last varies fastest.
 
-    Files, sessions and recordings are read, since their content is part of the keys; nothing is mapped.
+    Files, sessions and recordings are read, since their content is part of the keys. Nothing is mapped.
 
     Raises:
         GraphError, StoreError, StreamError: a file or session is missing or damaged.
@@ -103,19 +103,19 @@ def lay_out(study: StudyConfig) -> Grid:
 
 
 def _enter(tasks: dict[str, SourceTask], source: Source, setting: SettingConfig, seed: int) -> str:
-    """Note the task for a graph; its key."""
+    """Register the task of a graph; returns its key."""
     task = source.task(setting, seed)
     tasks[task.key] = task
     return task.key
 
 
 def _false_loops(study: StudyConfig) -> list[tuple[str, float]]:
-    """Kinds and rates; a rate of 0 is of no kind, and there once."""
+    """Kinds and rates; a rate of 0 has no kind and appears once."""
     rates = study.false_loops.rates
     none = [("", 0.0)] if 0.0 in rates else []
     return none + [(kind, rate) for kind in study.false_loops.kinds for rate in rates if rate > 0.0]
 
 
 def _seeds(study: StudyConfig, source: SourceConfig, by_chance: bool) -> Sequence[int | None]:
-    """Every seed where chance plays a part; a single None where every seed would give the same."""
+    """Every seed if the result is random, else a single None."""
     return (source.seeds or study.seeds) if by_chance else (None,)

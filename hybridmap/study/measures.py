@@ -1,4 +1,4 @@
-"""The figures of a study: what each is called, its unit, and what it means."""
+"""The figures of a study: name, unit and meaning."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ MEASURES = {
     "ate_m": ("m", "RMSE of position against the reference after SE(2) alignment, over the nodes"),
     "yaw_deg": ("deg", "RMSE of heading against the reference after that alignment"),
     "within_5_cm": ("1", f"1 where ate_m is at most {NEAR_M} m, else 0"),
-    "chi2_initial": ("1", "referee's chi2 of the poses to begin with, false loops included"),
-    "chi2": ("1", "referee's chi2 at the end, false loops included"),
-    "chi2_own": ("1", "referee's chi2 at the end over the graph's own edges, without the false loops put into it"),
+    "chi2_initial": ("1", "chi2 of the initial poses, false loops included"),
+    "chi2": ("1", "chi2 at the end, false loops included"),
+    "chi2_own": ("1", "chi2 at the end over the graph's own edges, without the false loops put into it"),
     "false_kept": ("1", f"false loops of weight above {KEPT}"),
-    "own_lost": ("1", "of the graph's own loops, those that the back-end holds for false"),
+    "own_lost": ("1", "of the graph's own loops, those rejected as outliers"),
     "own_lost_percent": ("%", "the same in percent of the graph's own loops"),
-    "chi2_odometry": ("1", "share of chi2 that is not of loops; large where true loops were dropped"),
+    "chi2_odometry": ("1", "share of chi2 from edges other than loops; large if true loops were rejected"),
     "unit_variance": SOLUTION["unit_variance/"],
     "iterations": SOLUTION["iterations/"],
 }
@@ -37,7 +37,7 @@ MAPPED = {
     "relation_loop_m": ("m", "mean translational error of the relations over more than 60 s"),
     "nodes": ("1", "nodes of the map"),
     "loops": ("1", "loops in the graph"),
-    "loops_rejected": ("1", "of those, the ones that the back-end gave no weight"),
+    "loops_rejected": ("1", "of those, the ones rejected as outliers by the back-end"),
     "loop_precision": ("1", f"share of the loops kept that are within {WRONG_M} m and {WRONG_DEG:g} deg of the truth"),
     "loop_recall": ("1", "share of the revisits (within 1 m and 30 deg, after 10 s or more) with such a loop within 3 nodes"),
     "false_kept": ("1", f"loops farther from the truth than that, of weight above {KEPT}"),
@@ -48,9 +48,9 @@ MAPPED = {
     "loop_p95_deg": ("deg", "rotational error of the loops, 95 %"),
     "loop_chi2_ratio": ("1", "median normalised squared error of the loops over the expected one; 1: covariances are right"),
     "registration_chi2_ratio": ("1", "the same of the registrations of consecutive nodes"),
-    "kidnapped_m": ("m", "after a kidnapping: how far the pose was off at the first node"),
-    "known_m": ("m", "after a kidnapping: way driven until the robot was where it had been before, looking the same way"),
-    "found_m": ("m", "after a kidnapping: way driven until the pose was right for good"),
+    "kidnapped_m": ("m", "after a kidnapping: error of the pose at the first node"),
+    "known_m": ("m", "after a kidnapping: travel until the robot was at a visited place with a similar heading"),
+    "found_m": ("m", "after a kidnapping: travel until the pose was right and stayed right"),
 }
 """Figures of a drive as it was mapped, by odometry or by a back-end of its configuration."""
 
@@ -66,11 +66,11 @@ FIGURES = (*dict.fromkeys((*MEASURES, *MAPPED, *TIMINGS)),)
 
 
 def measures_of(study: StudyConfig) -> dict[str, tuple[str, str]]:
-    """Figure -> unit and meaning of those that a study's cells can have, in the order of its tables."""
+    """Figure -> unit and meaning, for the figures that the study's cells can have, in the order of its tables."""
     solves = any(variant.way != "mapped" for variant in study.backends)
     return (MEASURES if solves else {}) | (MAPPED if study.maps else {})
 
 
 def unit_of(figure: str) -> str:
-    """The unit of any figure."""
+    """The unit of a figure."""
     return (MEASURES | MAPPED | TIMINGS)[figure][0]

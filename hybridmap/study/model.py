@@ -37,7 +37,7 @@ Way = Literal["solve", "replay", "drive", "mapped"]
 
 
 def _listed(value: Any) -> Any:
-    """A single value stands for a list of one."""
+    """A single value means a list of one."""
     return value if isinstance(value, list | tuple) else (value,)
 
 
@@ -45,12 +45,12 @@ Names = Annotated[tuple[str, ...], BeforeValidator(_listed)]
 
 
 class SyntheticConfig(Section):
-    """A pose graph without sensors: a robot drives round and round; each node sees the one a lap ago. The truth is known."""
+    """A pose graph without sensors: a robot drives in circles, and each node is joined to the node one lap ago."""
 
     nodes: int = Field(default=120, ge=4)
     """Nodes of the drive."""
     per_lap: int = Field(default=40, ge=3)
-    """Nodes a lap; the graph has `nodes - per_lap` loops."""
+    """Nodes per lap; the graph has `nodes - per_lap` loops."""
     step_m: float = Field(default=0.5, gt=0)
     """Distance from node to node, m."""
     translation_m: float = Field(default=0.03, gt=0)
@@ -60,34 +60,34 @@ class SyntheticConfig(Section):
 
 
 class SourceConfig(Section):
-    """Where a graph comes from: exactly one of `simulated`, `recording`, `session`, `graph` and `synthetic`."""
+    """The source of a graph: exactly one of `simulated`, `recording`, `session`, `graph` and `synthetic`."""
 
     name: str | None = None
-    """How the tables call it; default: the world's, folder's or file's name."""
+    """Title in the tables; default: the name of the world, folder or file."""
     simulated: str | None = None
-    """A simulated world, mapped once for each setting and seed; its truth is known."""
+    """A simulated world, mapped once per setting and seed; its ground truth is known."""
     recording: Path | None = None
-    """A recording, mapped once for each setting, and for each seed where a disturbance is left to chance."""
+    """A recording, mapped once per setting, and once per seed if a disturbance is random."""
     config: str | None = None
-    """Of a drive: the mapping configuration, by name or path; default: the world's own, or `laser` for a recording."""
+    """For drives: configuration of the mapping, by name or path; default: the world's own, or `laser` for a recording."""
     overrides: dict[str, Any] = Field(default_factory=dict)
-    """Of a drive: settings on top of it, as sections or dotted keys."""
+    """For drives: settings that override the configuration, as sections or dotted keys."""
     start_s: float | None = None
-    """Of a drive: leave out so many seconds at the beginning."""
+    """For drives: skip this many seconds at the beginning."""
     end_s: float | None = None
-    """Of a drive: end after so many seconds."""
+    """For drives: end after this many seconds."""
     reference: Path | None = None
-    """Of a recording: its true trajectory in the TUM format; default: what the recording itself holds."""
+    """For recordings: ground truth in the TUM format; default: that of the recording, if any."""
     relations: Path | None = None
-    """Of a recording: verified relative poses, `t1 t2 dx dy dyaw` a line."""
+    """For recordings: verified relative poses, lines `t1 t2 dx dy dyaw`."""
     session: Path | None = None
-    """A session folder; its truth is the reference if it has one."""
+    """A session folder; its reference is the ground truth, if it has one."""
     graph: Path | None = None
     """A planar g2o or TORO file."""
     synthetic: SyntheticConfig | None = None
-    """A graph made up from the seed."""
+    """A graph generated from the seed."""
     first_nodes: int | None = Field(default=None, ge=3)
-    """Keep only so many nodes of the graph."""
+    """Keep only this many nodes of the graph."""
     seeds: Seeds | None = None
     """Seeds of this source; default: those of the study."""
 
@@ -100,17 +100,17 @@ class SourceConfig(Section):
 
     @property
     def knows_truth(self) -> bool:
-        """Whether the truth of it is sure to be known."""
+        """Whether ground truth is certainly known."""
         return self.kind in ("simulated", "synthetic")
 
     @property
     def kind(self) -> str:
-        """Which of `KINDS` it is."""
+        """The kind of source, one of `KINDS`."""
         return next(kind for kind in KINDS if getattr(self, kind) is not None)
 
     @property
     def title(self) -> str:
-        """How the tables call it."""
+        """Its title in the tables."""
         if self.name is not None:
             return self.name
         path = self.recording or self.session or self.graph
@@ -118,20 +118,20 @@ class SourceConfig(Section):
 
 
 class DriftConfig(Section):
-    """Errors put on top of a frozen graph's odometry edges; the other edges stay as they are."""
+    """Errors added to the odometry edges of a frozen graph; the other edges stay."""
 
     heading_bias_deg_per_m: float = 0.0
-    """Pull to the left, degrees per metre of each odometry edge."""
+    """Heading bias to the left, degrees per metre of each odometry edge."""
     scale_bias: float = Field(default=0.0, gt=-1)
     """Relative error of each odometry edge's length."""
     noise: float = Field(default=0.0, ge=0)
-    """Further white noise by the seed, in standard deviations of what the edge's information says."""
+    """Additional white noise, random by the seed, in standard deviations of the edge's information."""
     dropouts: float = Field(default=0.0, ge=0, le=1)
-    """Share of the odometry edges, by the seed, that turn by 20 deg more and slip by 0.5 m."""
+    """Share of the odometry edges, random by the seed, that turn by 20 deg more and slip by 0.5 m."""
 
     @property
     def by_chance(self) -> bool:
-        """Whether the seed plays a part."""
+        """Whether it is random."""
         return self.noise > 0.0 or self.dropouts > 0.0
 
     @property
@@ -141,91 +141,93 @@ class DriftConfig(Section):
 
 
 class SettingConfig(Section):
-    """What comes before the back-ends: how it is mapped, and what is made worse."""
+    """Everything before the back-ends: configuration of the mapping, and disturbances."""
 
     name: str
-    """How the tables call it."""
+    """Title in the tables."""
     overrides: dict[str, Any] = Field(default_factory=dict)
-    """For drives: settings on top of the mapping configuration, as sections or dotted keys."""
+    """For drives: settings that override the configuration of the mapping, as sections or dotted keys."""
     vary: dict[str, Annotated[tuple[Any, ...], Field(min_length=1)]] = Field(default_factory=dict)
-    """Dotted key -> values: this entry stands for one setting for each combination, named by its values."""
+    """Dotted key -> values: the entry stands for one setting per combination, named by its values."""
     disturb: dict[str, float | tuple[float, ...]] = Field(default_factory=dict)
     """For drives: disturbance (of `study.disturb.TABLE`) -> its strength; 0 changes nothing."""
     drift: DriftConfig = DriftConfig()
-    """For every source: errors put on the frozen graph's odometry edges."""
+    """For every source: errors added to the frozen graph's odometry edges."""
 
     @property
     def title(self) -> str:
-        """How the tables call it."""
+        """Its title in the tables."""
         return self.name
 
 
 class BackendVariant(Section):
-    """A back-end with its settings and the way in which it gets the graph."""
+    """A back-end with its settings and the way it gets the graph."""
 
     name: str | None = None
-    """How the tables call it; default: the back-end's name."""
+    """Title in the tables; default: the back-end's name."""
     backend: str
     """Name of the back-end."""
     settings: dict[str, Any] = Field(default_factory=dict)
     """Its settings (the section `backends` of a configuration, without `names`), as sections or dotted keys."""
     vary: dict[str, Annotated[tuple[Any, ...], Field(min_length=1)]] = Field(default_factory=dict)
-    """Dotted key -> values: this entry stands for one variant for each combination, named by its values."""
+    """Dotted key -> values: the entry stands for one variant per combination, named by its values."""
     start: Start = "graph"
-    """Poses that it begins with: the graph's own, dead reckoning, the chain of the best consecutive edges, the angular
-    start, or the reference itself. (`gtsam-lm` and its like also try a start of their own when they solve a whole graph.)"""
+    """Initial poses: the graph's own, dead reckoning, the chain of the most certain consecutive edges, rotation averaging, or
+    the reference. (`gtsam-lm` and its like also compute a start of their own when they solve a whole graph.)
+    """
     way: Way = "solve"
-    """The whole graph at once, node by node as while driving, or that with the final solution at the end of the drive.
+    """The whole graph at once, node by node as while driving, or node by node with the final solution at the end of the drive.
     `mapped`: nothing is solved again; the figures are those of the drive itself, by this back-end of its configuration
-    (`primary`: the first one, `odometry`: dead reckoning)."""
+    (`primary`: the first one, `odometry`: dead reckoning).
+    """
 
     @property
     def title(self) -> str:
-        """How the tables call it."""
+        """Its title in the tables."""
         return self.name if self.name is not None else self.backend
 
 
 class FalseLoopsConfig(Section):
-    """False loop closures put into each graph."""
+    """False loop closures added to each graph."""
 
     rates: Annotated[tuple[Rate, ...], Field(min_length=1)] = (0.0,)
     """Share of false loops among all loops."""
     kinds: Annotated[tuple[Literal["random", "aliased"], ...], Field(min_length=1)] = ("random",)
-    """`random` joins two random nodes, `aliased` moves runs of true loops together."""
+    """`random` joins two random nodes; `aliased` shifts runs of true loops together."""
 
 
 class StatisticsConfig(Section):
-    """How the cells are summed up over the seeds."""
+    """Statistics over the seeds."""
 
     confidence: float = Field(default=0.95, gt=0.5, lt=1)
-    """Of the confidence intervals."""
+    """Level of the confidence intervals."""
     method: Literal["t", "bootstrap"] = "t"
     """Student's t, or the bias-corrected and accelerated bootstrap."""
     resamples: int = Field(default=2000, ge=100)
-    """Of the bootstrap."""
+    """Resamples of the bootstrap."""
 
 
 class BarConfig(Section):
-    """What a figure has to keep to, in every group of the study that it is for: give `at_most` or `at_least`."""
+    """A limit for a figure, in every group that it applies to: give `at_most` or `at_least`."""
 
     figure: str
     """A column of `cells.csv` or `timings.csv`."""
     at_most: float | str | None = None
-    """The largest value, or the title of a back-end whose figure on the same drive must not be exceeded."""
+    """The largest allowed value, or the title of a back-end whose figure on the same drive is the limit."""
     at_least: float | None = None
-    """The smallest value."""
+    """The smallest allowed value."""
     statistic: Literal["worst", "median", "mean"] = "worst"
-    """What is held against the bar: the worst, the median or the mean over the seeds."""
+    """Statistic compared with the limit: the worst, the median or the mean over the seeds."""
     sources: Names = ()
-    """Titles of the sources that it is for; default: all."""
+    """Titles of the sources to which the bar applies; default: all."""
     settings: Names = ()
-    """Names of the settings that it is for; default: all."""
+    """Names of the settings to which the bar applies; default: all."""
     backends: Names = ()
-    """Titles of the back-ends that it is for; default: all but dead reckoning."""
+    """Titles of the back-ends to which the bar applies; default: all but dead reckoning."""
     kinds: Names = ()
-    """Kinds of false loops that it is for; default: all."""
+    """Kinds of false loops to which the bar applies; default: all."""
     rates: Annotated[tuple[Rate, ...], BeforeValidator(_listed)] = ()
-    """Rates of false loops that it is for; default: all."""
+    """Rates of false loops to which the bar applies; default: all."""
 
     @property
     def side(self) -> str:
@@ -246,30 +248,30 @@ class StudyConfig(Section):
     name: str = "study"
     """Headline of the page."""
     description: str = ""
-    """What is asked, for the page."""
+    """The question of the study, for the page."""
     seeds: Seeds = (0,)
     """Seeds of the simulator, of added noise and of false loops."""
     sources: Annotated[tuple[SourceConfig, ...], Field(min_length=1)]
-    """Graphs, or where they come from."""
+    """Graphs and drives."""
     settings: Annotated[tuple[SettingConfig, ...], Field(min_length=1)] = (SettingConfig(name="default"),)
-    """What comes before the back-ends."""
+    """Variants of the mapping and of disturbances."""
     backends: Annotated[tuple[BackendVariant, ...], Field(min_length=1)] = MAPPED
     """Back-ends; the first one is the baseline of the paired differences. Default: each drive as it was mapped."""
     false_loops: FalseLoopsConfig = FalseLoopsConfig()
     """False loops."""
     statistics: StatisticsConfig = StatisticsConfig()
-    """Summing up."""
+    """Statistics over the seeds."""
     bars: tuple[BarConfig, ...] = ()
-    """What the figures have to keep to."""
+    """Limits for the figures."""
 
     @property
     def maps(self) -> bool:
-        """Whether a drive is judged as it was mapped."""
+        """Whether a drive is evaluated as it was mapped."""
         return any(variant.way == "mapped" for variant in self.backends)
 
     @classmethod
     def load(cls, source: str | Path, overrides: Mapping[str, Any] | None = None) -> StudyConfig:
-        """Read a study by path, or by name if it comes with the package, with `overrides` (`{"seeds": 3}`) on top.
+        """Read a study by path, or by name if it comes with the package, and apply `overrides` (`{"seeds": 3}`).
 
         Raises:
             ConfigError: no such file, not YAML, an unknown key (named with its path), a value out of range.
@@ -287,7 +289,7 @@ class StudyConfig(Section):
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any], origin: str, folder: Path) -> StudyConfig:
-        """Validate a nested mapping; `origin` names it in errors, relative paths begin in `folder`.
+        """Validate a nested mapping; `origin` names it in errors, and relative paths start in `folder`.
 
         Raises:
             ConfigError: as `load`.
@@ -306,7 +308,7 @@ class StudyConfig(Section):
 
 
 def quoted(title: str) -> str:
-    """A title as it stands within a sentence: in quotes where it is of several words."""
+    """A title for use in a sentence: in quotes if it has several words."""
     return f"“{title}”" if re.search(r"[\s,;]", title) else title
 
 
@@ -318,7 +320,7 @@ def named_studies() -> dict[str, Path]:
 
 
 def backend_settings(variant: BackendVariant) -> BackendsConfig:
-    """The whole section that a variant's back-end is made with.
+    """The whole section of settings for a variant's back-end.
 
     Raises:
         ConfigError: an unknown key or a value out of range.
@@ -327,7 +329,7 @@ def backend_settings(variant: BackendVariant) -> BackendsConfig:
     for dotted, value in variant.settings.items():
         merge(tree, nested(dotted, value))
     if "names" in tree:
-        raise ConfigError(f"backends: {variant.title}: settings.names: say `backend: NAME` instead")
+        raise ConfigError(f"backends: {variant.title}: settings.names: use `backend: NAME` instead")
     try:
         return BackendsConfig.model_validate(tree)
     except ValidationError as error:
@@ -342,7 +344,7 @@ def nested(dotted: str, value: Any) -> dict[str, Any]:
 
 
 def merge(base: dict[str, Any], top: Mapping[str, Any]) -> None:
-    """Put `top` onto `base`, section by section."""
+    """Merge `top` into `base`, section by section."""
     for key, value in top.items():
         if isinstance(value, Mapping) and isinstance(base.get(key), dict):
             merge(base[key], value)
@@ -361,7 +363,7 @@ def _find(source: str | Path) -> Path:
 
 
 def _spelt_out(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Short forms made long: a back-end or source may be just its name."""
+    """Expand short forms: a back-end or source may be just its name."""
     out = dict(tree)
     for key, field in (("backends", "backend"), ("sources", "simulated")):
         if isinstance(out.get(key), Sequence) and not isinstance(out[key], str):

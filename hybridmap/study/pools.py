@@ -1,6 +1,6 @@
-"""Who does the work: this process, or processes of this machine.
+"""Pools of workers: this process, or several processes on this machine.
 
-A pool yields outcomes as they come; what is made of them must not depend on their order.
+A pool yields outcomes in any order; nothing made of them may depend on the order.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUM
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """A task without an outcome: a mistake of ours, or too many workers died of it. The next run tries it again."""
+    """A task without an outcome: it raised because of a bug, or too many workers died. The next run tries it again."""
 
     message: str
 
     @classmethod
     def by(cls, error: BaseException) -> Lost:
-        """What to say of a task that raised."""
+        """The outcome of a task that raised."""
         return cls(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
 
 
 class Pool(Protocol):
-    """Does tasks."""
+    """Runs tasks."""
 
     def run(self, work: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[tuple[int, Outcome | Lost]]:
-        """Yield (number of the task, outcome) in any order, each once; `work` can be imported by its name."""
+        """Yield (number of the task, outcome) in any order, each once; `work` must be importable by its name."""
 
 
 class ThisProcess:
-    """One task after the other, here."""
+    """Runs one task after the other in this process."""
 
     def run(self, work: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[tuple[int, Outcome | Lost]]:
         """See `Pool.run`."""
@@ -54,16 +54,16 @@ class ThisProcess:
 
 
 class LocalProcesses:
-    """Processes of this machine, each of one thread; one that dies is replaced, and its task given to another."""
+    """Processes on this machine with one thread each. If one dies it is replaced, and another gets its task."""
 
     def __init__(self, count: int) -> None:
-        """So many at once."""
+        """Use at most this many processes."""
         self._count = count
         self._workers: list[_Worker] = []
 
     @property
     def pids(self) -> tuple[int, ...]:
-        """Of the workers at present."""
+        """Process ids of the current workers."""
         return tuple(worker.pid for worker in self._workers)
 
     def run(self, work: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[tuple[int, Outcome | Lost]]:
@@ -92,13 +92,13 @@ class LocalProcesses:
             self._workers = []
 
     def _ready(self) -> list[_Worker]:
-        """Those with an answer, or dead; waits for the first."""
+        """Workers with an outcome, or dead ones; waits for the first."""
         busy = {worker.connection: worker for worker in self._workers if worker.index is not None}
         return [busy[connection] for connection in wait(list(busy))]  # type: ignore[index]  # they are what was given
 
 
 class _Worker:
-    """A process, and the number of the task that it has."""
+    """A process, and the number of its task."""
 
     def __init__(self, work: Callable[[Any], Any]) -> None:
         context = multiprocessing.get_context("spawn")
@@ -119,7 +119,7 @@ class _Worker:
             self.connection.send(task)
 
     def take(self) -> tuple[int, tuple[Any] | None]:
-        """The task's number with its outcome, or with None where the process died."""
+        """The task's number with its outcome, or with None if the process died."""
         assert self.index is not None
         index, self.index = self.index, None
         try:
@@ -135,7 +135,7 @@ class _Worker:
 
 
 def _serve(connection: Connection, work: Callable[[Any], Any]) -> None:
-    """What a worker does until its parent closes the line, or dies."""
+    """The loop of a worker: it ends when its parent closes the connection or dies."""
     threading.Thread(target=_die_with_parent, daemon=True).start()
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
         while True:

@@ -1,4 +1,4 @@
-"""What computes: versions and source text, so that results of different code are never taken for one another."""
+"""Versions and source text of the running code, so that results of different code are never mixed."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ _JUDGING = ("study/disturb.py", "study/drive.py")
 
 
 def digest(tree: Mapping[str, Any]) -> str:
-    """SHA-256 of plain values, whatever the order of their keys; 64 hexadecimal digits."""
+    """SHA-256 of plain values, independent of the order of keys; 64 hexadecimal digits."""
     text = json.dumps(tree, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 @cache
 def solving() -> str:
-    """Digest of all that turns a graph into figures: our code, the libraries' versions, the machine's kind."""
+    """Digest of everything that turns a graph into figures: our code, versions of libraries, the kind of machine."""
     return digest({"code": digest_of_code(solving_only=True), **_surroundings()})
 
 
 @cache
 def mapping() -> str:
-    """The same of all that turns a drive into a graph and its figures."""
+    """Digest of everything that turns a drive into a graph and its figures."""
     return digest({"code": digest_of_code(solving_only=False), **_surroundings()})
 
 
@@ -67,7 +67,7 @@ def _version(library: str) -> str:
 
 
 def digest_of_code(*, solving_only: bool) -> str:
-    """SHA-256 of our source text: of what turns a graph into figures only, or also of what turns a drive into a graph."""
+    """SHA-256 of our source text: of the part that turns a graph into figures, or also of the part that maps a drive."""
     package = Path(str(resources.files("hybridmap")))
     total = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):

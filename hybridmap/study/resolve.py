@@ -1,4 +1,4 @@
-"""From the words of a study to the study: paths, variants, and what its types cannot see."""
+"""Check and complete a study: paths, variants, and conditions that its types cannot express."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ _Entry = TypeVar("_Entry", BackendVariant, SettingConfig)
 
 
 def resolved(study: StudyConfig, origin: str, folder: Path) -> StudyConfig:
-    """The study with absolute paths and every variant spelt out, checked.
+    """The checked study, with absolute paths and every variant expanded.
 
     Args:
         study: as it was written.
         origin: where it comes from, for errors.
-        folder: where relative paths begin.
+        folder: where relative paths start.
 
     Raises:
-        ConfigError: a name that there is not or that is given twice, or a setting that cannot act.
+        ConfigError: an unknown or repeated name, or a setting without effect.
     """
     sources = tuple(_located(source, origin, folder) for source in study.sources)
     variants = tuple(single for entry in study.backends for single in _expanded(entry, "settings", "backends", origin))
@@ -51,7 +51,7 @@ def resolved(study: StudyConfig, origin: str, folder: Path) -> StudyConfig:
 
 
 def _located(source: SourceConfig, origin: str, folder: Path) -> SourceConfig:
-    """The source with absolute paths; `$NAME` in a path is the environment's."""
+    """The source with absolute paths; `$NAME` in a path is an environment variable."""
     given = [kind for kind in KINDS if getattr(source, kind) is not None]
     if len(given) != 1:
         found = " and ".join(given) or "none"
@@ -71,7 +71,7 @@ def _absolute(path: Path, origin: str, folder: Path) -> Path:
 
 
 def _expanded(entry: _Entry, field: str, origin_key: str, origin: str) -> list[_Entry]:
-    """One entry for each combination of `vary`, whose values go into `field`."""
+    """One entry per combination of `vary`, whose values go into `field`."""
     if clash := sorted(set(entry.vary) & set(getattr(entry, field))):
         raise ConfigError(f"{origin}: {origin_key}: {entry.title}: {clash[0]} is in both {field} and vary")
     entries = [entry.model_copy(update={"vary": {}})]

@@ -1,4 +1,4 @@
-"""A study from its grid to its results: graphs first, then cells, each kept as soon as it is known."""
+"""Run a study: first the graphs, then the cells; each result is stored as soon as it is known."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ CRASHED = "crashed"
 
 @dataclass(frozen=True, slots=True)
 class Outcomes:
-    """What a run knows at its end.
+    """The results at the end of a run.
 
     Attributes:
         results: key -> result, for every cell of the grid.
-        computed: cells that were computed in this run; the others were known.
+        computed: number of cells that this run computed; the others were stored.
     """
 
     results: dict[str, CellResult]
@@ -37,14 +37,14 @@ class Outcomes:
 
 
 def run(grid: Grid, folder: StudyFolder, pool: Pool, progress: Progress | None = None) -> Outcomes:
-    """Compute what the folder does not know yet; the folder is held as `STUDY_FOLDER`.
+    """Compute what is missing in the folder, which is locked as `STUDY_FOLDER`.
 
-    Killed at any time, it goes on from there the next time; the results are the same bit for bit.
+    An interrupted run continues the next time; the results are the same bit for bit.
 
     Args:
         grid: the cells.
-        folder: where results are kept.
-        pool: who does the work.
+        folder: where results are stored.
+        pool: runs the tasks.
         progress: called with cells done and their total, after each cell.
 
     Raises:
@@ -79,7 +79,7 @@ def run(grid: Grid, folder: StudyFolder, pool: Pool, progress: Progress | None =
 
 
 def _graphs(tasks: Sequence[SourceTask], folder: StudyFolder, pool: Pool) -> Iterator[tuple[str, bytes | Lost]]:
-    """(key, packed graph) for each task: kept from an earlier run, or made now and kept."""
+    """(key, packed graph) for each task: stored by an earlier run, or made now and stored."""
     missing = []
     for task in tasks:
         data = folder.frozen(task.key)
@@ -98,7 +98,7 @@ def _graphs(tasks: Sequence[SourceTask], folder: StudyFolder, pool: Pool) -> Ite
 
 
 def _kept(key: str, outcome: CellResult | Lost, folder: StudyFolder) -> CellResult:
-    """The result, which the folder knows from now on; a lost one is not kept."""
+    """Store and return a result; a lost one is not stored."""
     if isinstance(outcome, Lost):
         return _crashed(key, outcome)
     _require_same_code(outcome.code)

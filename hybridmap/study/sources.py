@@ -1,4 +1,4 @@
-"""From a source to a frozen graph with a reference. A kind of source is a function in `KINDS`."""
+"""Turn a source into a frozen graph with a reference. Each kind of source is a class in `KINDS`."""
 
 from __future__ import annotations
 
@@ -29,13 +29,12 @@ _BLOCK = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class SourceTask:
-    """How to come to a frozen graph with a reference.
+    """A task that makes a frozen graph with a reference.
 
     Attributes:
-        key: digest of all that determines the graph and its reference.
-        make: comes to the graph, with its truth where that is known, or raises a `HybridMapError`; it may be sent to
-            another machine.
-        first_nodes: keep only so many of its nodes.
+        key: digest of everything that determines the graph and its reference.
+        maker: makes the graph.
+        first_nodes: keep only this many of its nodes.
     """
 
     key: str
@@ -53,20 +52,14 @@ class SourceResult:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A source of a study, opened: what is read from files is read once.
-
-    Attributes:
-        task: the task for its graph at a setting and seed. It raises a ConfigError where the configuration of a drive cannot
-            be used.
-        by_chance: whether another seed gives another graph at a setting.
-    """
+    """An opened source of a study: files are read once."""
 
     task: Callable[[SettingConfig, int], SourceTask]
     by_chance: Callable[[SettingConfig], bool]
 
 
 def prepare(task: SourceTask) -> SourceResult:
-    """Do what a task says: make the graph, and find its reference. A typed error is a frozen failure."""
+    """Run a task: make the graph, and find its reference. A typed error becomes a frozen failure."""
     try:
         frozen = _with_reference(_cut(task.make(), task.first_nodes))
     except HybridMapError as error:
@@ -143,7 +136,7 @@ def _content(path: Path) -> str:
     """Digest of a file, or of every file in a folder.
 
     Raises:
-        StreamError: it is not there.
+        StreamError: it does not exist.
     """
     if not path.exists():
         raise StreamError(f"{path}: no such file or folder")
@@ -180,7 +173,7 @@ def _read_session(path: Path | None) -> Frozen:
 
 
 def laps(config: SyntheticConfig, seed: int) -> Frozen:
-    """A drive round and round with white noise on every measurement; node k sees node k - per_lap again."""
+    """A drive in circles with white noise on every measurement; node k is joined to node k - per_lap."""
     step = np.array([config.step_m, 0.0, 2.0 * np.pi / config.per_lap])
     truth = np.zeros((config.nodes, 3))
     for k in range(1, config.nodes):
@@ -214,7 +207,7 @@ def _cut(frozen: Frozen, first_nodes: int | None) -> Frozen:
 
 
 def _with_reference(frozen: Frozen) -> Frozen:
-    """Where no truth is known: the optimum of the clean graph, if there is one to be found."""
+    """Without ground truth, use the optimum of the clean graph as reference, if it can be computed."""
     if frozen.of_truth or frozen.graph is None:
         return frozen
     solution = create(LEAST_SQUARES).solve(frozen.graph)

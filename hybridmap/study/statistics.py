@@ -1,4 +1,4 @@
-"""Sums over the seeds, and paired differences to the first back-end, each with a confidence interval."""
+"""Summaries over the seeds, and paired differences to the first back-end, each with a confidence interval."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Interval:
 
     Attributes:
         value, low, high: the mean and its limits; NaN without any value.
-        count: values.
+        count: number of values.
         confidence: of the interval.
     """
 
@@ -48,7 +48,7 @@ class Interval:
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether there is an interval and all of it is on one side of zero."""
+        """Whether there is an interval and it does not contain zero."""
         return self.low > 0.0 or self.high < 0.0
 
 
@@ -57,14 +57,13 @@ class Summary:
     """One measure of one back-end over the seeds of one group (source, setting, kind and rate of false loops).
 
     Attributes:
-        cell: the first cell of the group; its labels are those of all but for the seed.
-        measure: what is summed up.
-        cells, solved: in the group, and those of them that have the figure; the others are not part of the sums.
+        source, setting, kind, rate, backend, measure, unit: what is summarised.
+        cells, solved: number of cells in the group, and of those with the figure; the others are left out.
         median, mean: over the seeds.
         baseline: the first back-end.
-        difference: mean over the seeds of this back-end's figure minus the baseline's, where both have one; None for
-            the baseline itself.
-        better: share of these seeds in which this back-end's figure is the lower one; NaN without any.
+        difference: mean over the seeds of this back-end's figure minus the baseline's, if both have one; None for the
+            baseline itself.
+        better: share of these seeds in which this back-end's figure is lower; NaN without any.
     """
 
     cell: Cell
@@ -79,7 +78,7 @@ class Summary:
 
     @property
     def unit(self) -> str:
-        """Of the measure."""
+        """Unit of the measure."""
         return unit_of(self.measure)
 
 
@@ -94,9 +93,9 @@ def summarise(grid: Grid, results: Mapping[str, CellResult]) -> list[Summary]:
 
 
 def mean_of(values: Array, config: StatisticsConfig) -> Interval:
-    """The mean of (N,) values with its confidence interval, by Student's t or the BCa bootstrap; no draw is left to chance.
+    """The mean of (N,) values with its confidence interval, by Student's t or the BCa bootstrap; the result is deterministic.
 
-    With fewer values than `LEAST` there is no interval; enough values that are all alike have one of no width.
+    With fewer values than `LEAST` there is no interval; enough equal values give an interval of zero width.
     """
     count = len(values)
     mean = float(np.mean(values)) if count else math.nan
@@ -119,7 +118,7 @@ def _student(values: Array, config: StatisticsConfig) -> tuple[float, float]:
 
 
 def _bootstrap(values: Array, config: StatisticsConfig) -> tuple[float, float]:
-    """Bias-corrected and accelerated; percentiles where a sample is too degenerate for that."""
+    """Bias-corrected and accelerated; plain percentiles if the sample is too degenerate."""
     from scipy.stats import bootstrap
 
     for method in ("BCa", "percentile"):

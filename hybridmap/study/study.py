@@ -1,4 +1,4 @@
-"""A whole study in one call: lay out, compute what is missing, write tables and figures."""
+"""Run a whole study: make the grid, compute what is missing, write tables and figures."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ class Study:
     """A finished study.
 
     Attributes:
-        folder: where it lies.
+        folder: its folder.
         grid: its cells.
         results: key -> result.
-        summaries: sums over the seeds, a group, back-end and measure each.
-        verdicts: every bar, group by group.
-        computed: cells that this run computed; the others were known.
-        head: the keys of `metrics.json` beside its list.
+        summaries: over the seeds, one per group, back-end and measure.
+        verdicts: of every bar and group.
+        computed: number of cells that this run computed; the others were stored.
+        head: the keys of `metrics.json` besides its list.
         metrics: the figures.
     """
 
@@ -53,19 +53,19 @@ class Study:
 
     @property
     def missed(self) -> list[Verdict]:
-        """Bars that are not kept."""
+        """Bars that are missed."""
         return [verdict for verdict in self.verdicts if not verdict.passed]
 
 
 def run_study(study: StudyConfig, out: Path, pool: Pool, progress: Progress | None = None) -> Study:
-    """Run or go on with a study; what an earlier run in the same folder knows is not computed again.
+    """Run or continue a study; results stored by an earlier run in the same folder are not computed again.
 
     The folder gets `study.yaml`, `cells.csv`, `timings.csv`, `summary.csv`, `bars.csv` and `metrics.json`.
 
     Raises:
         OutputError: the folder cannot be used, or another run is writing there.
         StudyError: the workers cannot be used.
-        GraphError, StoreError, StreamError, ConfigError: a source cannot be used; nothing has been written then.
+        GraphError, StoreError, StreamError, ConfigError: a source cannot be used; nothing is written then.
     """
     folder = StudyFolder(out)
     with held(out, STUDY_FOLDER):

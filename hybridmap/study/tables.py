@@ -1,4 +1,4 @@
-"""The tables: every cell, what it cost, and the sums over the seeds. The same results give the same bytes."""
+"""The tables: every cell, its time, and the summaries over the seeds. The same results give the same bytes."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ BAR_COLUMNS = (
 
 
 def cells_csv(cells: Sequence[Cell], results: Mapping[str, CellResult], measures: Iterable[str]) -> str:
-    """A line a cell in the order of the grid; numbers with all their digits, nothing where there is no figure."""
+    """One line per cell in the order of the grid; numbers with all digits, empty for a missing figure."""
     names = tuple(dict.fromkeys((*measures, *_COUNTS)))
     columns = (*_LABELS, "status", *names, "message", "key")
     return _text(columns, (_cell_row(cell, results[cell.key], names) for cell in cells))
 
 
 def timings_csv(cells: Sequence[Cell], results: Mapping[str, CellResult]) -> str:
-    """Process time of each cell, when it was computed; apart, since no two runs agree on it."""
+    """Process time of each cell; in a file of its own, as it differs between runs."""
     rows = ((cell, results[cell.key].timings) for cell in cells)
     return _text(TIMING_COLUMNS, ((*_labels(cell), *(shown(spent.get(n)) for n in TIMINGS), cell.key) for cell, spent in rows))
 
 
 def bars_csv(verdicts: Sequence[Verdict]) -> str:
-    """A line a bar and group; the value of each seed in the last column, a dash where there is none."""
+    """One line per bar and group; the last column has the value of each seed, with a dash if missing."""
     return _text(BAR_COLUMNS, (_bar_row(one) for one in verdicts))
 
 
 def shown(value: float | None) -> str:
-    """A number with all its digits, whole ones without a point; nothing for None."""
+    """A number with all digits, without a decimal point if whole; empty for None."""
     if value is None:
         return ""
     return str(int(value)) if float(value).is_integer() and abs(value) < 2**53 else repr(float(value))
@@ -80,7 +80,7 @@ def _text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def summary_csv(summaries: Sequence[Summary]) -> str:
-    """A line a group, back-end and measure."""
+    """One line per group, back-end and measure."""
     return _text(SUMMARY_COLUMNS, (_summary_row(one) for one in summaries))
 
 

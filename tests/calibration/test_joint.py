@@ -71,7 +71,7 @@ def test_a_map_that_drops_its_loops_calibrates_nothing(bent):
     four = graph.with_edges(np.union1d(np.flatnonzero(~graph.is_loop), loops))
     deltas = four.deltas.copy()
     deltas[np.flatnonzero(four.is_loop)[:2]] += [0.0, 2.0, 0.0]
-    with pytest.raises(EvaluationError, match=r"found [0-2] of 4 loop closures that hold on the map, expected 3 or more"):
+    with pytest.raises(EvaluationError, match=r"found [0-2] of 4 loop closures that agree with the map, expected 3 or more"):
         joint.solve(replace(four, deltas=deltas), motion, stamps, CONFIG)
 
 
@@ -89,7 +89,7 @@ def test_what_the_drive_leaves_open_is_the_prior_and_not_reported():
     assert estimate.measured.tolist() == [False, True, True, False]
     assert (estimate.gains, estimate.delay_s) == (Gains(1.0, 1.01, 0.01), 0.0)
     open_ = np.diag(joint.PRIOR**2 * [0.01, 0.01, 0.9, 0.01])
-    with pytest.raises(EvaluationError, match="tell neither turn gain nor heading bias"):
+    with pytest.raises(EvaluationError, match="determine neither turn gain nor heading bias"):
         joint.told_by_the_drive(Estimate(Gains(1.02, 1.01, 0.01), 0.05, open_, 4.0, 20.0, 80.0, 1.0, 0.0))
 
 

@@ -47,7 +47,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> SessionFolder:
     folder.write_metrics(
         {"graph_hash": "abc123", "primary_backend": "gtsam-lm", "backends": ["gtsam-lm"], "remarks": ["3 frames <lost>"]},
         [
-            Metric("nodes", 60.0, "1", "experiences"),
+            Metric("nodes", 60.0, "1", "nodes of the map"),
             Metric("ate_rmse/odometry", 0.4321, "m", "absolute trajectory error"),
             Metric("ate_rmse/gtsam-lm", 0.01, "m", "absolute trajectory error", bar=0.2, passed=True),
         ],

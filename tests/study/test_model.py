@@ -53,7 +53,7 @@ def test_the_resolved_study_reads_back_to_an_equal_one(tmp_path, monkeypatch):
         ({"backends": [{"backend": "gtsam-lm", "thata": 1}]}, "unknown key 'backends.0.thata'"),
         ({"backends": [{"backend": "gtsam-lm", "settings": {"relaxation": {"thata": 1}}}]}, "unknown key 'relaxation.thata'"),
         ({"backends": [{"backend": "gtsam-lm", "settings": {"relaxation.theta": 7}}]}, "relaxation.theta: .*found 7"),
-        ({"backends": [{"backend": "gtsam-lm", "settings": {"names": ["odometry"]}}]}, "say `backend: NAME`"),
+        ({"backends": [{"backend": "gtsam-lm", "settings": {"names": ["odometry"]}}]}, "use `backend: NAME`"),
         ({"backends": ["gtsam-ml"]}, "unknown back-end 'gtsam-ml'; there are odometry"),
         ({"backends": ["gtsam-lm", "gtsam-lm"]}, "backends: 'gtsam-lm' is there twice"),
         ({"backends": []}, "backends: "),
