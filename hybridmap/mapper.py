@@ -1,4 +1,4 @@
-"""The whole algorithm on one page: self-motion drives the cells, views close loops, both make the map, back-ends correct it."""
+"""The whole algorithm on one page: the cells integrate self-motion, views close loops, back-ends correct the map."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class Mapper:
         return self._position.update(reason + self._calibrate(), node, edges)
 
     def finish(self) -> list[Update]:
-        """End of the drive, phase by phase: propose loops again, solve for good, look again, refine the trajectory."""
+        """End of the drive: re-propose loops, solve, verify loops without weight again, register frames between nodes."""
         updates = [self.step(ready) for ready in self._synchroniser.flush()]
         self._position.pose_odom = self.cells.pose_odom_robot
         if len(self.map):
@@ -137,7 +137,7 @@ class Mapper:
 
     @property
     def pose_map_odom(self) -> Array:
-        """(3,) the correction `map -> odom` (REP-105) for the odometry as it came in."""
+        """(3,) the correction `map -> odom` (REP-105) for the odometry as received."""
         return compose(self.pose_map_robot, inverse(self._position.pose_odom_given))
 
     def poses(self, backend: str | None = None) -> Array:
@@ -208,7 +208,7 @@ class Mapper:
             return self.vision.observe(ready.observation, self._position.moved if len(self.map) else IDENTITY)
 
     def _make_node(self, view: View | None) -> tuple[int, list[int]]:
-        """Make an experience and join it to the node that the robot was at; from now on the robot is at the new one."""
+        """Make a node, join it to the one that the robot was at, and attach the robot to it."""
         at, code = self._position, self.integrator.place_code
         initial = compose(self.map.initial[at.at_node], at.moved) if len(self.map) else at.pose_odom
         node = self.map.add_node(

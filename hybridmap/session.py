@@ -214,7 +214,7 @@ def _gain_changes(mapper: Mapper) -> list[GainChange]:
 
 
 def _lost(mapper: Mapper) -> list[str]:
-    """That the drive ended without it being known where the robot was, if it did."""
+    """A remark if the robot was not localised at the end."""
     if mapper.lost_since is None:
         return []
     rest = "lies where the odometry has it; the robot may have been kidnapped: its views there fit none before"
@@ -222,14 +222,14 @@ def _lost(mapper: Mapper) -> list[str]:
 
 
 def _doubts(mapper: Mapper) -> list[str]:
-    """What the loops that the primary back-end rejected say against its map."""
+    """A remark if rejected loops put the primary back-end's map in doubt."""
     solution = mapper.backends.solutions.get(mapper.backends.primary)
     doubt = solution.report.doubt if solution is not None else ""
     return [f"{mapper.backends.primary}: {doubt}"] if doubt else []
 
 
 def _weak(name: str, report: SolveReport) -> list[Metric]:
-    """Edges of motion that a back-end with a kernel on them holds for drop-outs of the wheels."""
+    """Figures of the edges of motion that a back-end's kernel down-weights."""
     if not report.weak_edges:
         return []
     return [

@@ -81,9 +81,9 @@ def known_at(trajectory: Trajectory, stamps_ns: NDArray[np.int64], max_gap_s: fl
 
 @dataclass(frozen=True, slots=True)
 class Anchors:
-    """Where the robot was at some stamps, measured on the final map: seen from the node before and from the node after.
+    """Poses at some stamps, measured on the final map: seen from the node before and from the node after.
 
-    The two say the same on the map on which they were measured; on another back-end's map they are blended.
+    Both give the same pose on that map; on the map of another back-end they are blended.
 
     Attributes:
         stamps_ns: (S,) int64, increasing.

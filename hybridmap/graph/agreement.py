@@ -1,7 +1,7 @@
-"""Whether loops agree with each other through the chain, and the largest set of loops that do.
+"""Whether loops agree through the chain, and the largest set of loops that do.
 
-Two loops, the way between their older ends and the way between their newer ends form a ring. If all four are right, the ring
-closes within its uncertainty. Mangelson et al., "Pairwise Consistent Measurement Set Maximization for Robust Multi-robot Map
+Two loops and the chain between their older and between their newer ends form a ring. If all four are right, the ring closes
+within its covariance. Mangelson et al., "Pairwise Consistent Measurement Set Maximization for Robust Multi-robot Map
 Merging" (2018), keep the largest set of loops that are consistent in pairs.
 """
 
@@ -27,7 +27,7 @@ def chi2_quantile(probability: float) -> float:
 
 
 QUANTILE = 0.99
-"""Share of the pairs of true loops that agree, where the covariances are right."""
+"""Share of pairs of true loops that agree, given right covariances."""
 BOUND = chi2_quantile(QUANTILE)
 """Squared Mahalanobis distance up to which two loops agree."""
 
@@ -69,7 +69,7 @@ class Loops:
 
 @dataclass(frozen=True, slots=True)
 class Ring:
-    """By how much rings fail to close.
+    """Errors of rings.
 
     Attributes:
         error: (P, 3) twist (m, m, rad) in the frame of the newer node of the second loop.
@@ -90,7 +90,7 @@ class Ring:
 
 
 def ring(first: Loops, second: Loops, ways: Ways) -> Ring:
-    """Close rings (P,): by the first loop and on to the newer end of the second, against the second loop itself.
+    """Errors of rings (P,): the first loop and the newer chain, against the older chain and the second loop.
 
     The four parts count as independent, although the ways between older and between newer ends may overlap.
     """
@@ -130,7 +130,7 @@ def largest_consistent_set(
 ) -> NDArray[np.bool_]:
     """A set (L,) of large weight whose members all agree with each other; not always the largest.
 
-    Again and again the member is added whose agreeing candidates, itself among them, have the largest weight (the greedy step
+    Greedy: the next member is the one whose agreeing candidates, itself among them, have the largest weight (as a step
     of Pattabiraman et al., "Fast Algorithms for the Maximum Clique Problem on Massive Graphs", 2015).
 
     Args:

@@ -17,12 +17,12 @@ from hybridmap.trajectory import Trajectory
 
 @dataclass(frozen=True, slots=True)
 class Kidnapping:
-    """A break of the chain after which the robot was found elsewhere.
+    """A break of the chain after which the robot was localised elsewhere.
 
     Attributes:
         before, after: the last node before it and the first one after.
-        found_at: the newest node when it was found.
-        moved_m: how far it was found from where the odometry had it.
+        found_at: the newest node when it was localised.
+        moved_m: distance of the new pose from that by odometry.
         search_m: way driven from `after` to `found_at`.
     """
 
@@ -86,7 +86,7 @@ class Unobserved:
     """Stretches between consecutive nodes that odometry alone holds, in one direction or in all.
 
     Attributes:
-        sliding_m: length of those where registration knew one direction no better than odometry did.
+        sliding_m: length of those where registration is no more certain than odometry in one direction.
         blind_m: length of those without any registration.
         travel_m: length of the whole way.
         direction_rad: the free direction in the map, an axis in [-pi/2, pi/2), mean over the sliding stretches by length.
@@ -159,7 +159,7 @@ def _by_target(experiences: ExperienceMap, kind: EdgeKind) -> dict[int, list[Edg
 
 
 def _free_direction(registrations: list[Edge], odometry: list[Edge]) -> float | None:
-    """Direction (rad, in the node's frame) in which the best registration knows no more than odometry; None if it does."""
+    """Direction (rad, in the node's frame) in which the best registration is no more certain than odometry, if any."""
     nearest = max(registrations, key=lambda edge: edge.source)
     assert nearest.relative is not None
     sigma_m, direction = loosest_direction(nearest.relative.covariance)

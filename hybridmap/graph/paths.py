@@ -1,4 +1,4 @@
-"""Ways through a graph: what hangs together, poses along the chain, and the covariances of both chain and shortest paths."""
+"""Paths through a graph: connectivity, poses along the chain, and covariances along chain and shortest paths."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ class _Links:
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """The way from node to node, and how uncertain it has become.
+    """The chain of consecutive nodes, with its covariance.
 
     Attributes:
         poses: (N, 3) m and rad.
-        covariance: (N, 3, 3) of the way from node 0 to each, as a perturbation in the frame in which the poses are. It only
-            grows: the difference of two is that of the way between them.
-        breaks: (B,) nodes that no edge of motion joins to the one before; there the poses go on, but nothing is known.
+        covariance: (N, 3, 3) of each pose from node 0 on, a perturbation in the frame of the poses; the difference of two
+            is that of the chain between them.
+        breaks: (B,) nodes without an edge of motion to the one before; across them the covariance is unknown.
     """
 
     poses: Array
@@ -73,7 +73,7 @@ class Chain:
     breaks: NDArray[np.int64]
 
     def ways(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> RelativePose:
-        """The way between nodes (P,) and nodes (P,), as `agreement.Ways`."""
+        """Nodes (P,) seen from nodes (P,), as `agreement.Ways`."""
         back = adjoint(inverse(self.poses[second]))
         sign = np.where(second >= first, 1.0, -1.0)[:, None, None]
         covariance = back @ (sign * (self.covariance[second] - self.covariance[first])) @ back.transpose(0, 2, 1)
@@ -86,7 +86,7 @@ def chain_of(graph: PoseGraph, poses: Array | None = None) -> Chain:
 
     Args:
         graph: the measurements.
-        poses: (N, 3) along which the chain lies; None: as its edges have it, with node 0 at the origin.
+        poses: (N, 3) of the chain; None: by its edges, with node 0 at the origin.
     """
     links = _links(graph.with_edges(graph.is_motion))
     steps = np.flatnonzero(links.high == links.low + 1)
@@ -102,11 +102,10 @@ def chain_of(graph: PoseGraph, poses: Array | None = None) -> Chain:
 
 
 def covariances_from(graph: PoseGraph) -> Callable[[int], Array]:
-    """Covariances of every node relative to one, for each node that is asked for, computed once; what they share, at the first.
+    """Covariances of every node relative to one; computed once a node, what they share at the first call.
 
-    Edges that join the same two nodes count together: a registration that is loose along a corridor and the odometry beside
-    it, which knows no heading, hold each other. Paths are shortest in the trace of the position covariance; along a path
-    the covariances, taken as independent, are carried to the end by adjoints (as `geometry.compose_relative` does for two).
+    Edges of the same two nodes are fused. Paths are shortest in the trace of the position covariance; along a path covariances,
+    taken as independent, are propagated by adjoints (as `geometry.compose_relative`).
 
     Returns:
         From a node to (N, 3, 3) m^2 and rad^2, right perturbation in each node's own frame: zero for the node itself, infinite
@@ -174,7 +173,7 @@ def _shortest_tree(links: _Links, n: int, node: int) -> tuple[NDArray[np.int64],
 
 
 def _away_from_parent(links: _Links, child: NDArray[np.int64], edge: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Pose and covariance of each child in its parent's frame; links that lead the other way are turned round."""
+    """Pose and covariance of each child in its parent's frame; links of the other direction are inverted."""
     delta, covariance = links.delta[edge].copy(), links.covariance[edge]
     turned = links.low[edge] == child
     carry = adjoint(delta[turned])

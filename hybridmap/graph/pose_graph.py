@@ -1,4 +1,4 @@
-"""The pose graph as growing columns, and what is new and what is gone between two states of it."""
+"""The pose graph as growing columns, and the difference of two states of it."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class PoseGraph:
 
     @property
     def is_motion(self) -> NDArray[np.bool_]:
-        """(E,) which edges say how the robot itself moved: odometry and registrations to nodes just before."""
+        """(E,) which edges measure motion: odometry, and registrations to the nodes just before."""
         return np.asarray(self.kinds < EdgeKind.LOOP)
 
     def only(self, *kinds: EdgeKind) -> PoseGraph:
@@ -132,7 +132,7 @@ class PoseGraph:
             self._judge()
 
     def _plainly_sound(self) -> bool:
-        """A quick look, as every update of a drive takes it: true for edges without strong correlations that can be solved."""
+        """A quick test for each update: true for valid edges without strong correlations."""
         if self.n_nodes == 0 or self.n_edges == 0:
             return False
         flat = self.information.reshape(-1, 9)
@@ -236,7 +236,7 @@ def difference(old: PoseGraph | None, new: PoseGraph) -> Change:
 
 
 def _common_head(old: NDArray[np.int64], new: NDArray[np.int64]) -> int:
-    """How many numbers two lists have in common before they first differ."""
+    """Length of the common beginning of two lists."""
     both = min(len(old), len(new))
     differ = old[:both] != new[:both]
     return int(differ.argmax()) if differ.any() else both

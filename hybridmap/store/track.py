@@ -45,9 +45,8 @@ class Track:
 def trajectory_of(track: Track, poses: Array) -> Trajectory:
     """Poses of the robot at every stamp of the track, given those of the nodes.
 
-    The pose is known where a node was made and at the anchors. On the way from one such knot to the next the pose carried
-    on from the first and the pose carried back from the next are blended along the SE(2) geodesic by the share of the way
-    done, so that what odometry and the solution disagree about is spread over that way and the trajectory is continuous.
+    Poses are known at nodes and anchors. Between two of these, the pose propagated from the first and that propagated back
+    from the second are blended along the SE(2) geodesic by the share of the way, so that the trajectory is continuous.
 
     Args:
         track: where the robot was, seen from nodes.

@@ -46,7 +46,7 @@ def create_front_end(config: VisionConfig, rig: Rig, seed: int, clock: StageCloc
         config: settings of the visual side.
         rig: sensors of the source.
         seed: for RANSAC.
-        clock: is given the stage `search` by an RGB-D front-end.
+        clock: gets the stage `search` of an RGB-D front-end.
 
     Raises:
         ConfigError: there is no front-end of this name.

@@ -17,7 +17,7 @@ Indices = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
 BLOCK = 4096
-"""Rows of a block; a full block is followed by another one, nothing is ever copied or moved."""
+"""Rows of a block; a full block is followed by another one, without copies."""
 HALF_RANGE = 4.0
 """Values beyond +- this are clipped: standard deviations of a z-normalised profile, means of a mean-normalised one."""
 
@@ -94,7 +94,7 @@ class ProfileIndex:
         weights: (bands,) of the bands, summing to 1.
         width: columns of a profile.
         max_shift: largest shift tried, columns.
-        circular: the profiles go full circle: every shift is tried, and columns that leave on one side come in on the other.
+        circular: the profiles go full circle: every shift is tried, and columns wrap around.
     """
 
     def __init__(self, weights: NDArray[np.float64], width: int, max_shift: int, circular: bool = False) -> None:

@@ -23,7 +23,7 @@ MODERATE_THRESHOLD: dict[Mode, float] = {"literal": 1.0, "ratio": 0.4, "signed":
 RELATIVE: tuple[Mode, ...] = ("literal", "ratio", "signed")
 """Readings of G that compare with a mean."""
 FEWEST = 5
-"""The search gives at least so many, whatever was asked for; G, with a shift of its own for each band, ranks them."""
+"""Least number of candidates of the search; G, with a shift for each band, ranks them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,12 +45,12 @@ _NOTHING = Match(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.
 
 
 class ProfileStore:
-    """Profiles by number, with their differences to a query over all shifts. Grows by blocks: nothing is ever copied.
+    """Profiles by number, with their differences to a query over all shifts. Grows by blocks, without copies.
 
     Args:
         max_shift: largest shift tried, columns.
-        circular: the profiles go full circle, as those of a laser that sees all around: every shift is tried, none loses
-            columns, and a place is known again from whichever side it is entered.
+        circular: the profiles go full circle: every shift is tried, with full overlap, so that a place is recognised at any
+            heading.
     """
 
     def __init__(self, max_shift: int, circular: bool = False) -> None:
@@ -99,8 +99,8 @@ class ProfileStore:
 def shifted_differences(query: Floats, stored: Floats, shifts: Indices, circular: bool = False) -> Floats:
     """g(c, Ij, Ik) = 1/(b - |c|) sum_{i=1..b-|c|} | Ij[i + max(c,0)] - Ik[i - min(c,0)] |  (eq. 12).
 
-    All shifts go through one L1 distance: the shifted query is padded with zeros, and what the padding adds (the sum of
-    |Ik| outside the overlap) is taken off again.
+    One L1 distance serves all shifts: the shifted query is padded with zeros, and the sum of |Ik| outside the overlap is
+    subtracted.
 
     Args:
         query: (bands, width), Ij.
@@ -192,7 +192,7 @@ class Matcher:
         mu_r, mu_d: weights of intensity and depth.
         max_shift: largest shift tried, columns.
         g_bar: see `combine`.
-        sequence: views in a row that must match (SeqSLAM's idea: neighbours of a true match match too); 1: each by itself.
+        sequence: views in a row that must match (as in SeqSLAM); 1: single views.
         circular: the profiles go full circle, see `ProfileStore`.
     """
 
@@ -306,12 +306,12 @@ def _mean_along(
 
 @dataclass(frozen=True, slots=True)
 class Recognition:
-    """Which template a frame shows.
+    """The template of a frame.
 
     Attributes:
         template: its number.
         founded: the frame founded it.
-        difference: mean absolute difference to the best template that was there before; inf for the first one.
+        difference: mean absolute difference to the best older template; inf for the first one.
     """
 
     template: int
@@ -323,11 +323,11 @@ THRESHOLD = 0.5
 """A view is new when its profile differs by more than this from every template (mean absolute difference of z-normalised
 profiles): two views of one place a step apart differ by less."""
 STABLE_FRAMES = 3
-"""A new view founds a template when it has been new in this many consecutive frames: a blurred frame founds none."""
+"""A view founds a template once it is new in so many consecutive frames: a blurred frame founds none."""
 
 
 class ViewTemplates:
-    """View templates V: one is founded when the view has been new in several consecutive frames."""
+    """View templates V; a new one needs a new view in several consecutive frames."""
 
     def __init__(self, max_shift: int, mu_r: float, mu_d: float) -> None:
         self._matcher = Matcher("plain", mu_r, mu_d, max_shift)
@@ -337,7 +337,7 @@ class ViewTemplates:
         return len(self._matcher.store)
 
     def recognise(self, profile: Profile) -> Recognition:
-        """Find the template of a profile, or found one; until a new view is stable it goes by the nearest template."""
+        """The template of a profile, or a new one; the nearest template until a new view is stable."""
         if len(self) == 0:
             return Recognition(self._matcher.add(profile), True, float("inf"))
         match = self._matcher.best(profile, 1)

@@ -65,14 +65,14 @@ class Support:
         near = [h for h in self._beside(new) if h.proposal.status in (Status.PENDING, Status.ACCEPTED)]
         loops = Loops.measured([(h.source, h.target, h.relative) for h in (new, *near)])
         agreeing = [near[i] for i in np.flatnonzero(agrees(loops, 0, np.arange(1, len(near) + 1), belief.ways)).tolist()]
-        friends = [h for h in agreeing if h.proposal.status is Status.PENDING]
+        waiting = [h for h in agreeing if h.proposal.status is Status.PENDING]
         asked = checks.of_support(len(agreeing))
         self._of_source[new.source].append(new)
         self._pending.append(new)
         self._filed.add((new.source, new.target))
         if not passed(asked):
             return [new.proposal]
-        changed = [new, *friends]
+        changed = [new, *waiting]
         for h in changed:
             h.proposal = h.proposal.settled(*(asked if h is new else checks.of_support(1)))
         return [h.proposal for h in changed]
