@@ -1,4 +1,4 @@
-"""Estimates against the truth: trajectories, verified relations, loop closures, whole sessions."""
+"""Errors of estimates against ground truth: trajectories, verified relations, loop closures, whole sessions."""
 
 from hybridmap.evaluate.edge_errors import ClosureErrors, ClosureLimits, EdgeErrors, closure_errors, edge_errors
 from hybridmap.evaluate.relations import RelationErrors, Relations, read_relations, relation_errors

@@ -1,4 +1,4 @@
-"""Which poses of an estimate can be compared with a reference, and how far along the way they are."""
+"""Match the poses of an estimate with a reference, and measure travel."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class PosePairs:
         stamps_ns: (P,) int64.
         estimate: (P, 3) m and rad, in the estimate's map frame.
         reference: (P, 3) m and rad, in the reference's frame.
-        total: number of poses of the estimate, used or not.
+        total: number of all poses of the estimate, matched or not.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -52,7 +52,7 @@ def associate(estimate: Trajectory, reference: Trajectory, max_gap_s: float = MA
 
 
 def travel(poses: Array) -> Array:
-    """Path length (P,) at each pose, m. Steps enter once they exceed 5 cm together, so that jitter is no travel."""
+    """Path length (P,) up to each pose, m. Steps count once their sum exceeds 5 cm, so that jitter does not."""
     total, length = [], 0.0
     positions = poses[:, :2].tolist()
     anchor = positions[0]

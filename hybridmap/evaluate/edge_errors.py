@@ -1,4 +1,4 @@
-"""The edges of a map against the truth: precision and recall of loops, errors of every kind, and whether covariances fit."""
+"""The edges of a map against ground truth: precision and recall of loops, errors by kind, and calibration of covariances."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from hybridmap.trajectory import NS_PER_S, Trajectory, known_at
 
 @dataclass(frozen=True, slots=True)
 class ClosureLimits:
-    """When a loop edge is right, and what counts as a revisit.
+    """When a loop edge is correct, and what counts as a revisit.
 
     Attributes:
-        right_m, right_deg: a loop edge whose measurement is this close to the truth is right.
-        revisit_m, revisit_deg: a node this close to an older one revisits its place ...
-        revisit_gap_s: ... if the older one was made at least this long before.
-        window_nodes: a revisit is found if a right loop edge starts within so many nodes of it.
+        right_m, right_deg: a loop edge is correct if its measurement is this close to the truth.
+        revisit_m, revisit_deg: a node is a revisit if it is this close to an older one ...
+        revisit_gap_s: ... that was made at least this long before.
+        window_nodes: a revisit is found if a correct loop edge starts within this many nodes of it.
     """
 
     right_m: float = 1.0
@@ -35,14 +35,14 @@ class ClosureLimits:
 
 @dataclass(frozen=True, slots=True)
 class ClosureErrors:
-    """How good a set of loop edges is.
+    """Quality of a set of loop edges.
 
     Attributes:
-        precision: share of the judged edges that are right; NaN without any.
-        recall: share of the revisits that got a right edge; NaN without any revisit.
-        judged, right: number of loop edges between nodes whose truth is known, and of the right ones.
-        revisits, found: number of nodes that revisit a place, and of those that got a right edge.
-        trans_median_m, trans_p95_m, rot_median_deg, rot_p95_deg: errors of the right edges; NaN without any.
+        precision: share of the judged edges that are correct; NaN without any.
+        recall: share of the revisits with a correct edge; NaN without any revisit.
+        judged, right: number of loop edges between nodes with known truth, and of the correct ones.
+        revisits, found: number of revisits, and of those with a correct edge.
+        trans_median_m, trans_p95_m, rot_median_deg, rot_p95_deg: errors of the correct edges; NaN without any.
     """
 
     precision: float
@@ -66,13 +66,14 @@ def closure_errors(
     rejected: Collection[int] = (),
     limits: ClosureLimits = DEFAULT_LIMITS,
 ) -> ClosureErrors:
-    """Judge the accepted loop edges of a map.
+    """Evaluate the accepted loop edges of a map.
 
     Args:
         experiences: the map.
         truth: true poses of `base_link`, in any frame.
-        rejected: numbers of loop edges that a back-end threw out; they do not count as closures.
-        limits: when an edge is right and a node a revisit.
+        rejected: numbers of loop edges that a back-end rejected; they do not count as closures.
+        limits: when an edge is correct, and when a node is a revisit.
+        max_gap_s: longest gap over which the truth is interpolated.
     """
     stamps, poses, known = _true_nodes(experiences, truth)
     edges = [e for n, e in _judged(experiences, EdgeKind.LOOP, known).items() if n not in rejected]
@@ -103,7 +104,7 @@ def _edge_errors(edges: list[Edge], poses: Array) -> tuple[Array, Array]:
 
 
 def _revisits(stamps: NDArray[np.int64], poses: Array, known: NDArray[np.bool_], limits: ClosureLimits) -> NDArray[np.int64]:
-    """Nodes that come back to a place seen from about the same side."""
+    """Nodes at a visited place with a similar heading."""
     found = []
     for node in np.flatnonzero(known):
         older = known & (stamps < stamps[node] - limits.revisit_gap_s * NS_PER_S)
@@ -115,7 +116,7 @@ def _revisits(stamps: NDArray[np.int64], poses: Array, known: NDArray[np.bool_],
 
 
 def _near_any(nodes: NDArray[np.int64], targets: NDArray[np.int64], window: int) -> NDArray[np.bool_]:
-    """Which nodes have a target no more than `window` numbers away."""
+    """Which nodes have a target within `window` node numbers."""
     if len(targets) == 0:
         return np.zeros(len(nodes), dtype=np.bool_)
     return np.asarray(np.abs(nodes[:, None] - np.unique(targets)[None, :]).min(axis=1, initial=window + 1) <= window)
@@ -137,12 +138,12 @@ class EdgeErrors:
     """The accepted edges of one kind.
 
     Attributes:
-        count: edges between nodes whose truth is known.
+        count: edges between nodes with known truth.
         trans_median_m, trans_p95_m, rot_median_deg, rot_p95_deg: their errors; NaN without any edge.
-        chi2_ratio: median of the normalised squared errors over what it should be: 1 for calibrated covariances, less where
-            they are too large, more where they are too small.
-        wrong: edges more than a metre from the truth.
-        wrong_kept: of those, the ones that a back-end gave a weight of more than a half.
+        chi2_ratio: median normalised squared error over its expected value: 1 for correct covariances, less if they are too
+            large, more if they are too small.
+        wrong: edges with an error of more than a metre.
+        wrong_kept: of those, the ones with a weight above one half in a back-end.
     """
 
     count: int
@@ -156,19 +157,20 @@ class EdgeErrors:
 
     @property
     def wrong_share(self) -> float:
-        """Share of the edges that are wrong; NaN without any edge."""
+        """Share of the edges with an error of more than a metre; NaN without any edge."""
         return self.wrong / self.count if self.count else float("nan")
 
 
 def edge_errors(
     experiences: ExperienceMap, truth: Trajectory, weights: Mapping[int, float] | None = None
 ) -> dict[EdgeKind, EdgeErrors]:
-    """Judge the accepted edges of a map, kind by kind.
+    """Evaluate the accepted edges of a map, kind by kind.
 
     Args:
         experiences: the map.
         truth: true poses of `base_link`, in any frame.
-        weights: edge number -> weight that a robust back-end gave it; what is missing counts as 1.
+        weights: edge number -> weight in a robust back-end; a missing edge counts as 1.
+        max_gap_s: longest gap over which the truth is interpolated.
     """
     _, poses, known = _true_nodes(experiences, truth)
     return edge_errors_on(experiences, poses, known, weights)
@@ -177,7 +179,7 @@ def edge_errors(
 def edge_errors_on(
     experiences: ExperienceMap, poses: Array, known: NDArray[np.bool_] | None = None, weights: Mapping[int, float] | None = None
 ) -> dict[EdgeKind, EdgeErrors]:
-    """The same, given the true pose (N, 3) of each node and which of them are known (default: all)."""
+    """Evaluate the accepted edges, given the true pose (N, 3) of each node and which of them are known (default: all)."""
     known = np.ones(len(poses), dtype=np.bool_) if known is None else known
     out = {}
     for kind in (EdgeKind.ODOMETRY, EdgeKind.REGISTRATION, EdgeKind.LOOP):

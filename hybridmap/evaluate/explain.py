@@ -1,4 +1,4 @@
-"""Why the map is as it is at one node or at one instant, from the map file alone."""
+"""Explain the decisions at one node or one time of a session, from the map file alone."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _STAMPS_UP_TO_S = 9e9  # beyond it nanoseconds do not fit into 64 bits
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """One edge that was considered, and what came of it.
+    """One edge that was considered, with its outcome.
 
     Attributes:
         number: of the edge in the map file.
-        edge: itself, with the record of the decision.
-        weights: back-end -> weight of an accepted loop there (0: it has none).
-        inconsistent: the back-ends that gave it none because it contradicts the other loops.
-        error: (m, deg) of its measurement against the truth, where that is known.
+        edge: the edge, with the record of the decision.
+        weights: back-end -> weight of an accepted loop (0: rejected).
+        inconsistent: the back-ends that rejected it as inconsistent with the other loops.
+        error: (m, deg) of its measurement against ground truth, if known.
     """
 
     number: int
@@ -74,23 +74,23 @@ class Decision:
 
 @dataclass(frozen=True, slots=True)
 class NodeStory:
-    """What happened at one node.
+    """The decisions at one node.
 
     Attributes:
         node: its number.
         stamp_ns: of its frame.
         time_s: since the first stamp of the recording, s.
         travel_m: path length so far.
-        moved: (m, deg) since the node before, None for the first.
-        nearest: the older node that sees most nearly the same on the final map, and how far it is off: (node, m, deg).
-        template, founded: its view template, and whether no earlier node has it.
+        moved: (m, deg) since the previous node, None for the first.
+        nearest: the older node with the nearest pose on the final map: (node, m, deg).
+        template, founded: its view template, and whether the node created it.
         poses: name -> (3,) final pose by every back-end, `odometry` first.
-        gate: which older nodes were compared with it, None where not stored.
-        ranked: (n, 3) the best of them by their views: node, G, shift in columns.
+        gate: the gate that chose the older nodes to compare with, None if not stored.
+        ranked: (n, 3) the best older nodes by their views: node, G, shift in columns.
         chain: odometry and registration edges that end here.
-        loops: closures that were considered when it was made, or proposed of it at the end.
-        no_loops: where there are none, why; empty where that is not known.
-        later: closures that later nodes considered with it.
+        loops: loop closures considered when the node was made, or proposed for it at the end.
+        no_loops: why there are none; empty if unknown.
+        later: loop closures that later nodes considered with this one.
     """
 
     node: int
@@ -133,16 +133,16 @@ class NodeStory:
 
 @dataclass(frozen=True, slots=True)
 class FrameStory:
-    """What happened at one instant.
+    """The decisions at one time.
 
     Attributes:
-        stamp_ns, time_s: of the instant that the map file has, nearest to what was asked for.
-        at_node: the node that the robot had made last.
-        moved: (m, deg) since it.
-        made: a node was made at this instant.
+        stamp_ns, time_s: of the nearest time in the map file.
+        at_node: the last node made until then.
+        moved: (m, deg) since that node.
+        made: whether a node was made at this time.
         reason: why a node was made, or why not.
-        next_node, next_time_s: the node made next, None at the end.
-        poses: name -> (3,) where the robot believed to be at the time, `odometry` first.
+        next_node, next_time_s: the next node, None at the end.
+        poses: name -> (3,) the robot's pose as estimated at the time, `odometry` first.
     """
 
     stamp_ns: int
@@ -172,7 +172,7 @@ class FrameStory:
 
 
 class Explainer:
-    """Answers questions about one session; open it as a context manager.
+    """Answers questions about one session. It is a context manager.
 
     Args:
         folder: the session folder.
@@ -200,11 +200,11 @@ class Explainer:
 
     @property
     def primary(self) -> str:
-        """The back-end that is judged."""
+        """The primary back-end."""
         return self._store.primary
 
     def node(self, number: int) -> NodeStory:
-        """What happened at a node.
+        """The decisions at a node.
 
         Raises:
             EvaluationError: it does not exist.
@@ -237,7 +237,7 @@ class Explainer:
         )
 
     def frame(self, time_s: float) -> FrameStory:
-        """What happened at an instant: seconds since the start, or (beyond 1e6) a stamp.
+        """The decisions at a time: seconds since the start, or (beyond 1e6) a stamp.
 
         Raises:
             EvaluationError: the recording does not cover it.
@@ -274,7 +274,7 @@ class Explainer:
         )
 
     def _is_of(self, number: int, stamp_ns: int) -> bool:
-        """Whether a node was made at an instant."""
+        """Whether a node was made at a time."""
         return abs(self._map.node(number).stamp_ns - stamp_ns) <= _AT_NODE_NS
 
     def _why_a_node(self, number: int) -> str:
@@ -330,7 +330,7 @@ class Explainer:
         return ""
 
     def _nearest(self, number: int) -> tuple[int, float, float] | None:
-        """By distance and turn together (1 rad counts as 1 m), of the nodes old enough to be loops."""
+        """The nearest node by distance and turn together (1 rad counts as 1 m), among those old enough to be loops."""
         age = _setting(self._settings, "vision.rgbd.closing.min_age_s")
         young_ns = round((age if isinstance(age, int | float) else 10.0) * NS_PER_S)
         stamps = np.array([node.stamp_ns for node in self._map.nodes[:number]], dtype=np.int64)
@@ -364,7 +364,7 @@ class Explainer:
 
 
 def _nearest_frame(stamps_ns: NDArray[np.int64], time_s: float) -> int | None:
-    """Which stamp is the nearest one; None where the recording does not reach so far, and for NaN."""
+    """The index of the nearest stamp; None outside the recording, and for NaN."""
     if not abs(time_s) <= _STAMPS_UP_TO_S:
         return None
     since_ns = 0 if time_s >= _STAMPS_FROM_S else int(stamps_ns[0])

@@ -1,7 +1,7 @@
-"""How well the views of a session tell its places apart: from the profiles that it stored.
+"""How well the stored profiles of a session tell its places apart.
 
-Two nodes show *the same* place when they lie within `same_m` and `same_deg` of each other, *different* ones when they lie
-beyond `other_m` or `other_deg`; pairs between the two are not judged. Only nodes at least `gap_s` older count.
+Two nodes show *the same* place if they are within `same_m` and `same_deg` of each other, *different* ones if they are
+beyond `other_m` or `other_deg`; other pairs are not used. Only nodes at least `gap_s` older count.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MOST_QUERIES = 400
 
 @dataclass(frozen=True, slots=True)
 class CandidateLimits:
-    """When two nodes show the same place, and when different ones; see the head of the module."""
+    """When two nodes show the same place, and when different ones; see the docstring of the module."""
 
     same_m: float = 1.0
     same_deg: float = 30.0
@@ -43,15 +43,15 @@ class CandidateLimits:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One way of scoring.
+    """One way of computing the score G.
 
     Attributes:
         mode: the reading of G.
         mu_r, mu_d: weights of intensity and depth.
         max_shift: largest shift tried, columns.
         g_bar: see `vision.templates.combine`.
-        sequence: views in a row that must match.
-        circular: the profiles go full circle.
+        sequence: consecutive views that must match.
+        circular: whether the profiles cover 360 degrees.
     """
 
     mode: Mode
@@ -65,14 +65,14 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class CandidateErrors:
-    """How well one reading tells places apart.
+    """How well one reading of G tells places apart.
 
     Attributes:
-        pair_auc: share of (same, different) pairs of pairs that are in the right order; 0.5 by chance, below it inverted.
-        top1: share of the revisits whose best match, of all older nodes, is the same place.
-        average_precision: area under precision over recall as the threshold on the best match is loosened.
+        pair_auc: probability that a pair of the same place scores better than one of different places; 0.5 by chance.
+        top1: share of the revisits whose best match among all older nodes is the same place.
+        average_precision: area under the precision-recall curve of the best matches.
         recall_full_precision: largest recall of the revisits at a threshold without any false match.
-        queries, revisits, pairs: views compared, those of them that come back to a place, and pairs judged.
+        queries, revisits, pairs: number of compared views, of those that are revisits, and of judged pairs.
     """
 
     pair_auc: float
@@ -86,11 +86,11 @@ class CandidateErrors:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """Which pairs of nodes are the same place: rows are the queries, columns all nodes.
+    """Which pairs of nodes show the same place: rows are the queries, columns all nodes.
 
     Attributes:
         queries: (Q,) node numbers, ascending.
-        same, different: (Q, N); False where a pair is not judged.
+        same, different: (Q, N); both False if a pair is not judged.
     """
 
     queries: Indices
@@ -109,7 +109,7 @@ def judge_pairs(
     limits: CandidateLimits = DEFAULT_LIMITS,
     max_gap_s: float = MAX_GAP_S,
 ) -> Truth:
-    """Say of the nodes made at some stamps (N,) which show the same place and which do not."""
+    """Determine which nodes made at given stamps (N,) show the same place."""
     known = known_at(truth, stamps_ns, max_gap_s)
     poses: Array = truth.at(stamps_ns) if known.any() else np.zeros((len(stamps_ns), 3))
     candidates = np.flatnonzero(known & (stamps_ns - stamps_ns[0] >= limits.gap_s * NS_PER_S))
@@ -151,7 +151,7 @@ def score_matrix(profiles: Sequence[Profile], queries: Indices, reading: Reading
 
 
 def candidate_errors(scores: Array, truth: Truth) -> CandidateErrors:
-    """Judge scores (Q, N), smaller for a better match."""
+    """Evaluate scores (Q, N), smaller for a better match."""
     same, different = scores[truth.same], scores[truth.different]
     pool = np.where(truth.same | truth.different, scores, np.inf)
     asked = np.flatnonzero(np.isfinite(pool).any(axis=1))
@@ -176,7 +176,7 @@ def _with_predecessors(queries: Indices, sequence: int) -> Indices:
 
 
 def _sequence(rows: Array, row_of: dict[int, int], number: int, reading: Reading) -> Array:
-    """Scores (N,) of one view with those before it."""
+    """Scores (N,) of one view, averaged with those before it."""
     scores: Array = rows[row_of[number]]
     if reading.sequence == 1:
         return scores
@@ -190,7 +190,7 @@ def _sequence(rows: Array, row_of: dict[int, int], number: int, reading: Reading
 
 
 def _auc(same: Array, different: Array) -> float:
-    """Chance that a pair of the same place scores less than one of different places; ties count half."""
+    """Probability that a pair of the same place scores less than one of different places; ties count half."""
     if len(same) == 0 or len(different) == 0:
         return float("nan")
     ordered = np.sort(different)
@@ -223,11 +223,11 @@ class ViewSettings:
 
 
 def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
-    """Judge the candidates of a session's own mode of matching.
+    """Evaluate the candidates of a session, with its own mode of matching.
 
     Args:
         folder: the session folder.
-        reference: true trajectory in the TUM format; without it the session's own.
+        reference: ground truth in the TUM format; default: the session's own.
 
     Returns:
         `pair_auc/<mode>`, `candidate_top1/<mode>`, `candidate_ap/<mode>`, `candidate_recall_full_precision/<mode>`.
@@ -235,7 +235,7 @@ def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
     Raises:
         StoreError: no session there.
         StreamError: the reference is damaged.
-        EvaluationError: no truth, or no profiles.
+        EvaluationError: no ground truth, or no profiles.
     """
     truth = truth_of(folder, reference)
     with MapStore.open(folder) as store:
@@ -273,7 +273,7 @@ def candidate_metrics(mode: str, errors: CandidateErrors) -> list[Metric]:
 
 
 def truth_of(folder: Path, reference: Path | None) -> Trajectory:
-    """The reference given, or the session's own.
+    """The given reference, or the session's own.
 
     Raises:
         EvaluationError: there is neither.
@@ -286,7 +286,7 @@ def truth_of(folder: Path, reference: Path | None) -> Trajectory:
 
 
 def view_settings(store: MapStore) -> ViewSettings:
-    """The settings that a session's profiles were made with; what an older session did not know has its default."""
+    """The settings of a session's profiles; settings that are missing in an older session have their defaults."""
     tree: dict[str, Any] = without_gone(store.config_tree).get("vision") or {}
     rgbd = tree.get("rgbd") or {}
     return ViewSettings(
@@ -303,6 +303,6 @@ def node_stamps(store: MapStore) -> np.ndarray[Any, np.dtype[np.int64]]:
 
 
 def stored_profiles(store: MapStore) -> list[Profile]:
-    """The profiles that a session stored, one a node; empty if it stored none."""
+    """The stored profiles of a session, one per node; empty if there are none."""
     profiles = [store.keyframe(node).get("profile") for node in range(len(store.map()))]
     return [profile for profile in profiles if profile is not None]

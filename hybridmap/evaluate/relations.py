@@ -1,4 +1,4 @@
-"""Relation errors: how far a trajectory is from relative poses that people have verified.
+"""Relation errors: errors of a trajectory against relative poses that were verified by people.
 
 R. Kuemmerle et al., "On measuring the accuracy of SLAM algorithms", Autonomous Robots 27, 2009, its equations 1 and 2:
 the mean over relations of the translational and of the rotational part of `delta_estimated (-) delta_true`.
@@ -41,11 +41,11 @@ class Relations:
 
 @dataclass(frozen=True, slots=True)
 class ErrorStatistics:
-    """Mean and (population) standard deviation of the errors; NaN where no relation could be used.
+    """Mean and (population) standard deviation of the errors; NaN if no relation could be used.
 
     Attributes:
         trans_mean_m, trans_std_m, rot_mean_deg, rot_std_deg: of the used relations.
-        used, total: relations whose two times the trajectory covers, and all.
+        used, total: number of relations whose two times the trajectory covers, and of all.
     """
 
     trans_mean_m: float
@@ -58,7 +58,7 @@ class ErrorStatistics:
 
 @dataclass(frozen=True, slots=True)
 class RelationErrors:
-    """Relation errors over all relations and over those that close a loop of more than 60 s."""
+    """Relation errors over all relations, and over those that span more than 60 s."""
 
     all: ErrorStatistics
     loops: ErrorStatistics
@@ -93,7 +93,7 @@ def read_relations(path: Path) -> Relations:
 
 
 def relations_of(path: Path, trajectory: Trajectory) -> Relations:
-    """Read relations that a trajectory can be held against.
+    """Read relations for a trajectory.
 
     Raises:
         EvaluationError: as `read_relations`, or the trajectory covers none of them.
@@ -109,7 +109,7 @@ def relations_of(path: Path, trajectory: Trajectory) -> Relations:
 
 
 def relation_errors(trajectory: Trajectory, relations: Relations) -> RelationErrors:
-    """Compare a trajectory with verified relations at the times that it covers."""
+    """Compare a trajectory with verified relations, as far as it covers them."""
     first, second = relations.stamps_ns[:, 0], relations.stamps_ns[:, 1]
     known = known_at(trajectory, first) & known_at(trajectory, second)
     loop = relations.is_loop

@@ -1,4 +1,4 @@
-"""Every figure of a session against a reference trajectory and against verified relations."""
+"""All error figures of a session against a reference trajectory and verified relations."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ log = logging.getLogger(__name__)
 def evaluate_session(
     folder: Path, reference: Path | None = None, relations: Path | None = None, *, loops: bool = False
 ) -> list[Metric]:
-    """Evaluate odometry and every back-end of a session, final and online, and put the figures into its `metrics.json`.
+    """Evaluate odometry and every back-end of a session, final and online; store the figures in its `metrics.json`.
 
-    Where that cannot be written a warning says so.
+    If the file cannot be written, a warning is logged.
 
     Args:
         folder: the session folder.
-        reference: true trajectory in the TUM format; without it the session's own, if there is one.
-        relations: verified relative poses, `t1 t2 dx dy dyaw` a line.
-        loops: judge the candidates as well, see `evaluate_loops`.
+        reference: ground truth in the TUM format; default: the session's own, if any.
+        relations: verified relative poses, lines `t1 t2 dx dy dyaw`.
+        loops: evaluate the candidates as well, see `evaluate_loops`.
 
     Returns:
-        Figures named `<measure>/<back-end>`; NaN where the data do not give one.
+        Figures named `<measure>/<back-end>`; NaN if the data do not allow one.
 
     Raises:
         StoreError: no session there.
         StreamError: the reference is damaged.
-        EvaluationError: nothing to compare with, nothing in common, or no views to judge candidates by.
+        EvaluationError: nothing to compare with, no common stamps, or no views for the candidates.
     """
     session = SessionFolder(folder)
     session.require()
@@ -72,8 +72,8 @@ def evaluate_session(
 def session_trajectories(session: SessionFolder, store: MapStore) -> dict[str, Trajectory]:
     """Name -> estimate of a session: `odometry`, then each back-end's final and `_online`.
 
-    Taken from `trajectory/`; what a killed run could not write there comes from the map file. The poses while the robot was
-    kidnapped, as far as the map knows, are left out.
+    Read from `trajectory/`, or, after a killed run, from the map file. Poses while the robot was kidnapped are left out, as
+    far as the map knows.
     """
     written = session.trajectories()
     estimates = {ODOMETRY: written[ODOMETRY] if ODOMETRY in written else store.track().odometry}
@@ -147,7 +147,7 @@ def against_truth(estimate: str, trajectory: Trajectory, truth: Trajectory) -> l
 
 
 def against_relations(estimate: str, trajectory: Trajectory, relations: Relations) -> list[Metric]:
-    """Relation errors of one estimate, over all and over those of more than 60 s, named `<measure>/<estimate>`."""
+    """Relation errors of one estimate, over all relations and over those of more than 60 s, named `<measure>/<estimate>`."""
     suffix, backend, when = _names(estimate)
     errors = relation_errors(trajectory, relations)
     if not suffix and backend == ODOMETRY and errors.all.used < 0.5 * errors.all.total:
@@ -201,12 +201,12 @@ def _edge_metrics(kind: str, errors: EdgeErrors) -> list[Metric]:
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """What is known of some solutions.
+    """Errors of some solutions.
 
     Attributes:
-        metrics: `<measure>/<title>`, as `evaluate` names them; empty where there is nothing to compare with.
-        truth: the true way, m and rad, moved onto the solution of the lowest ATE: a piece (P, 3) before, between and after
-            the kidnappings that the map knows of; none where it is not known.
+        metrics: `<measure>/<title>`, named as by `evaluate`; empty if there is nothing to compare with.
+        truth: the true path, m and rad, aligned to the solution with the lowest ATE: pieces (P, 3) between the known
+            kidnappings; empty if unknown.
     """
 
     metrics: tuple[Metric, ...]
@@ -216,17 +216,17 @@ class Judged:
 def judge_solutions(
     folder: Path, solutions: Mapping[str, Array], reference: Path | None = None, relations: Path | None = None
 ) -> Judged:
-    """Judge poses of a session's nodes, over the whole recording.
+    """Evaluate poses of a session's nodes over the whole recording.
 
     Args:
         folder: the session.
         solutions: title -> poses (N, 3), m and rad; `odometry` stands for dead reckoning at every stamp.
-        reference: true trajectory in the TUM format; without it the session's own, if there is one.
-        relations: verified relative poses, `t1 t2 dx dy dyaw` a line.
+        reference: ground truth in the TUM format; default: the session's own, if any.
+        relations: verified relative poses, lines `t1 t2 dx dy dyaw`.
 
     Raises:
         StoreError: no session there.
-        StreamError, EvaluationError: the reference or the relations are damaged or have nothing in common with it.
+        StreamError, EvaluationError: the reference or the relations are damaged, or have no time in common with it.
     """
     own = SessionFolder(folder).groundtruth
     truth_file = reference or (own if own.is_file() else None)

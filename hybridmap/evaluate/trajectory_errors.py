@@ -26,8 +26,8 @@ class AbsoluteError:
 
     Attributes:
         rmse_m, mean_m, median_m, max_m: of the distances.
-        pose_reference_estimate: (3,) the alignment: the estimate's map frame seen from the reference's.
-        used, total: poses of the estimate that were compared, and all of them.
+        pose_reference_estimate: (3,) the alignment: pose of the estimate's map frame in the reference's.
+        used, total: number of compared poses of the estimate, and of all.
     """
 
     rmse_m: float
@@ -57,7 +57,7 @@ class RelativeError:
 
 
 def absolute_error(estimate: Trajectory, reference: Trajectory) -> AbsoluteError:
-    """ATE: align the estimate to the reference by one SE(2) transform and measure what is left.
+    """ATE: the distances that remain after the estimate is aligned to the reference by one SE(2) transform.
 
     Raises:
         EvaluationError: too few stamps in common.
@@ -82,7 +82,7 @@ def absolute_error_of(pairs: PosePairs) -> AbsoluteError:
 
 
 def relative_error(estimate: Trajectory, reference: Trajectory, delta: float, unit: Literal["m", "s"]) -> RelativeError:
-    """RPE: compare the motion over every piece of `delta` metres of the reference's way, or of `delta` seconds.
+    """RPE: error of the relative pose over every piece of `delta` metres of the reference's path, or of `delta` seconds.
 
     Raises:
         EvaluationError: too few stamps in common.
@@ -107,10 +107,10 @@ def relative_error_of(pairs: PosePairs, delta: float, unit: Literal["m", "s"]) -
 
 
 def drift_percent(pairs: PosePairs) -> float:
-    """Mean translational error in % of travel over pieces of 5, 10, 20, ... 160 m (the whole way where that is shorter).
+    """Mean translational error in % of travel over pieces of 5, 10, 20, ... 160 m (the whole path if that is shorter).
 
     Returns:
-        NaN where the reference does not move.
+        NaN if the reference does not move.
     """
     along = travel(pairs.reference)
     lengths = [length for length in _DRIFT_LENGTHS_M if length <= along[-1]] or [float(along[-1])]

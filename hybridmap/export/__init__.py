@@ -1,4 +1,4 @@
-"""Sessions for other tools: trajectories, graphs, clouds, grids; here the formats, in `formats` what writes them."""
+"""Export of sessions: trajectories, graphs, clouds, grids. The formats are listed here; `formats` writes them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ class Format:
 
     Attributes:
         writer: `module:function` below this package; it writes one file and returns figures about it.
-        suffix: what its file is usually called.
+        suffix: usual suffix of the file.
         description: one line for people.
-        companion: suffix of a second file that lies beside the first, if there is one.
-        by_suffix: Open3D reads the file back only under its suffix.
+        companion: suffix of a second file in the same folder, if there is one.
+        by_suffix: whether Open3D needs this suffix to read the file.
     """
 
     writer: str

@@ -1,4 +1,4 @@
-"""What an exporter gets, and the one function that writes any format whole or not at all."""
+"""The input of an exporter, and the function that writes any format atomically."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class ExportOptions:
-    """How fine an export is.
+    """Options of an export.
 
     Attributes:
-        resolution_m: side of a cell of the occupancy grid.
-        voxel_m: side of the cubes that a cloud is thinned to.
-        max_depth_m: depth beyond this is left out.
+        resolution_m: cell size of the occupancy grid.
+        voxel_m: voxel size of point clouds.
+        max_depth_m: larger depth is left out.
         obstacle_low_m, obstacle_high_m: depth points between these heights above the floor are obstacles of the grid.
     """
 
@@ -43,7 +43,7 @@ class ExportOptions:
 
 
 class SessionView:
-    """A session as one back-end sees it."""
+    """A session with the poses of one back-end."""
 
     def __init__(self, store: MapStore, backend: str, options: ExportOptions) -> None:
         self.store = store
@@ -64,7 +64,7 @@ class SessionView:
 
     @cached_property
     def solution(self) -> Solution:
-        """The back-end's result: the session's, else solved now from the graph in the map file."""
+        """The back-end's result: that of the session, else solved now from the graph in the map file."""
         stored = self.store.solutions().get(self.backend)
         if stored is not None:
             return stored
@@ -74,7 +74,7 @@ class SessionView:
 
     @cached_property
     def rejected(self) -> frozenset[int]:
-        """Numbers of the loop edges that the back-end gave no weight."""
+        """Numbers of the loop edges that the back-end rejected."""
         return frozenset() if self.backend == ODOMETRY else frozenset(self.solution.report.rejected_edge_ids)
 
     @cached_property
@@ -85,9 +85,9 @@ class SessionView:
 
 
 def open_view(folder: Path, backend: str | None, options: ExportOptions) -> SessionView:
-    """Open a session as a back-end sees it; without a name, as the primary one does. Close its `store` after use.
+    """Open a session with the poses of one back-end (default: the primary one). Close its `store` after use.
 
-    A back-end that was not part of the run (or whose run was killed) gets the graph as the map file has it.
+    A back-end that was not part of the run, or whose run was killed, solves the graph in the map file.
 
     Raises:
         StoreError: no session there.
@@ -114,7 +114,7 @@ Writer = Callable[[SessionView, Path], list[Metric]]
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """What was written: the files, whose poses they carry, and figures about them."""
+    """The written files, the back-end of their poses, and figures about them."""
 
     files: tuple[Path, ...]
     backend: str
@@ -136,14 +136,14 @@ def export_session(
         folder: the session folder.
         format_name: one of `FORMATS`.
         out: the file to write; `grid` writes a `.yaml` and a `.pgm` of that name.
-        backend: whose poses; the primary's by default.
-        overwrite: replace files that are there.
-        options: how fine.
+        backend: whose poses; default: the primary's.
+        overwrite: replace existing files.
+        options: resolution and limits.
 
     Raises:
         StoreError: no session there.
-        ExportError: unknown format or back-end, or nothing of the kind in the session.
-        OutputError: a file in the way, or one that cannot be written.
+        ExportError: unknown format or back-end, or no data of the kind in the session.
+        OutputError: a file exists, or cannot be written.
     """
     if format_name not in FORMATS:
         raise ExportError(f"unknown format {format_name!r}; expected one of: {', '.join(FORMATS)}")

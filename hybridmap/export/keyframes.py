@@ -1,4 +1,4 @@
-"""What the keyframes saw, merged at the poses of a back-end: a point cloud, and the occupancy grid that `map_server` reads.
+"""Point clouds and occupancy grids (for `map_server`), merged from the keyframes at the poses of a back-end.
 
 The grid has log-odds as in S. Thrun, W. Burgard, D. Fox, "Probabilistic Robotics", 2005, section 9.2; its files are as
 documented by `map_server` (trinary mode).
@@ -115,7 +115,7 @@ def build_grid(view: SessionView) -> OccupancyGrid:
 
 
 def _cast(log_odds: NDArray[np.float32], fan: _Fan, low: NDArray[np.int64], resolution: float) -> None:
-    """Add one keyframe: cells that a return falls into gain, cells that beams pass lose."""
+    """Add one keyframe: cells with a return gain, cells that a beam passes lose."""
     import cv2
 
     origin = fan.origin / resolution - low
@@ -172,7 +172,7 @@ def _fan(seen: Seen, options: ExportOptions) -> _Fan:
 
 
 def write_cloud(view: SessionView, path: Path) -> list[Metric]:
-    """Thin the points of all keyframes to one a voxel and write PLY or PCD, by the suffix.
+    """Reduce the points of all keyframes to one per voxel and write PLY or PCD, by the suffix.
 
     Raises:
         ExportError: the session's keyframes hold no point.
@@ -186,7 +186,7 @@ def write_cloud(view: SessionView, path: Path) -> list[Metric]:
 
 
 def merged_cloud(view: SessionView) -> Any:
-    """The thinned cloud in `map` as an `open3d.geometry.PointCloud`.
+    """The reduced cloud in `map` as an `open3d.geometry.PointCloud`.
 
     Raises:
         ExportError: as `write_cloud`.

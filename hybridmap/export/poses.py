@@ -37,7 +37,7 @@ def write_g2o_graph(view: SessionView, path: Path) -> list[Metric]:
 def write_lineset(view: SessionView, path: Path) -> list[Metric]:
     """Nodes as points in the plane z = 0, accepted edges as lines: odometry grey, registration green, loops red.
 
-    A loop that the back-end gave no weight is yellow.
+    A loop that the back-end rejected is yellow.
     """
     import open3d as o3d
 
@@ -105,7 +105,7 @@ def write_tum_trajectory(view: SessionView, path: Path) -> list[Metric]:
 
 
 def write_kitti_trajectory(view: SessionView, path: Path) -> list[Metric]:
-    """The upper 3x4 of `T_map_base`, row by row, a line a stamp (the stamps are those of the `tum` export); z points up."""
+    """The upper 3x4 of `T_map_base`, row by row, one line per stamp (the stamps of the `tum` export); z points up."""
     poses = view.trajectory.poses
     cos, sin, zero, one = np.cos(poses[:, 2]), np.sin(poses[:, 2]), np.zeros(len(poses)), np.ones(len(poses))
     rows = np.stack([cos, -sin, zero, poses[:, 0], sin, cos, zero, poses[:, 1], zero, zero, one, zero], axis=1)

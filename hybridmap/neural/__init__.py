@@ -1,4 +1,4 @@
-"""The spatial cells: head direction -> band -> grid -> place -> place attractor; self-motion in, pose and place code out."""
+"""Path integration cells: head direction -> band -> grid -> place -> place attractor; output are pose and place code."""
 
 from hybridmap.neural.path_integrator import PathIntegrator
 

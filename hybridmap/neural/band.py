@@ -17,11 +17,11 @@ SQUARE_ORIENTATIONS_DEG = (0.0, 45.0, 90.0)
 
 
 class BandMotion(NamedTuple):
-    """What the band rings tell the grid sheets in a step, decoded from their rates before and after it.
+    """Output of the band rings for the grid sheets in one step, decoded from their rates.
 
     Attributes:
-        advance: (M, 3) how far each ring moved, cycles in [-0.5, 0.5].
-        phasors: (M, 3) unit phasors of where it is now.
+        advance: (M, 3) motion of each ring in the step, cycles in [-0.5, 0.5].
+        phasors: (M, 3) unit phasors of the rings after the step.
     """
 
     advance: NDArray[np.floating]
@@ -103,7 +103,7 @@ class BandRings:
         return self._rates(np.exp(2j * np.pi * phases.reshape(-1, 1)).astype(self._complex).view(self._weights.dtype))
 
     def step(self, displacement_m: NDArray[np.float64]) -> BandMotion:
-        """Move every ring by a displacement (2,) in the world, m; says what the rings tell the sheets."""
+        """Move every ring by a displacement (2,) in the world, m; returns the output for the sheets."""
         before = self.phasors()
         self._displacement[:2] = displacement_m
         self._displacement.dot(self._turn, out=self._turn_pairs)

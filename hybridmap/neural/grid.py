@@ -107,7 +107,7 @@ class GridModules:
         """Make the sheets and let them settle.
 
         Raises:
-            ConfigError: with these gains no stationary pattern forms; says what happens instead.
+            ConfigError: with these gains no stationary pattern forms; the message names the instability.
         """
         self.modes = LowModes(side, fourier_modes, modules, dtype)
         self._dtype = np.dtype(dtype)
@@ -135,7 +135,7 @@ class GridModules:
 
     @activity.setter
     def activity(self, rates: NDArray[np.floating]) -> None:
-        """Overwrite the rates (M, N, N): the sheets then stand where the new activity says."""
+        """Rates (M, N, N): the whole state, as a view that may be written to or replaced."""
         self._stack = np.ascontiguousarray(rates.swapaxes(0, 1), dtype=self._dtype)
 
     def _settle(self, modules: int) -> None:
@@ -221,11 +221,11 @@ _AGREEMENT_CYCLES = 0.06
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """A position that the modules agree on.
+    """A decoded position.
 
     Attributes:
         position_m: (2,) in the integrator's frame, m.
-        misfit_cycles: RMS of what the phases of all bands still disagree by, cycles; 0.29 means no agreement at all.
+        misfit_cycles: RMS disagreement of the phases of all bands, cycles; 0.29 means no agreement at all.
     """
 
     position_m: Array
@@ -238,10 +238,10 @@ class Decoded:
 
 
 class PhaseDecoder:
-    """Least squares on the phases of all bands of all modules, with the wraps resolved from where to start.
+    """Least squares on the phases of all bands of all modules; the wraps are resolved from a start position.
 
-    One module repeats after its spacing; the phases of all modules together repeat only far beyond the largest. A start says
-    which repetition is meant, and enters nowhere else: anywhere inside its basin the answer is the same.
+    One module repeats after its spacing; the phases of all modules together repeat only far beyond the largest spacing. The
+    start selects the repetition and has no other effect: the result is the same for every start in its basin.
     """
 
     def __init__(self, wave_vectors: NDArray[np.float64], box_m: float = DECODE_BOX_M) -> None:
@@ -255,13 +255,13 @@ class PhaseDecoder:
     def decode(self, phases_cycles: NDArray[np.float64], last_m: Array, starts_m: Callable[[], Array]) -> Decoded:
         """Decode phases (M, 3), cycles.
 
-        Tried in this order, until the modules agree: from `last_m`; from the first of `starts_m`; the position on which the
-        modules agree best in the box around that; from all of `starts_m`. Where nothing agrees, the best of the box is given.
+        Starts are tried in order until the modules agree: `last_m`; the first of `starts_m`; the position of best
+        agreement in the box around that; all of `starts_m`. If the modules never agree, the best of the box is returned.
 
         Args:
             phases_cycles: (M, 3) phases of the sheets' first modes.
-            last_m: (2,) where the robot was decoded last.
-            starts_m: gives further starts (S, 2), the likeliest first; called only where `last_m` fails.
+            last_m: (2,) last decoded position.
+            starts_m: returns further starts (S, 2), the likeliest first; called only if `last_m` fails.
         """
         phases = phases_cycles.reshape(-1)
         found = self._refine(phases, last_m)

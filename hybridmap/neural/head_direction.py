@@ -1,4 +1,4 @@
-"""Head-direction ring: m cells whose population vector is the only record of the heading."""
+"""Head-direction ring: m cells whose population vector is the only state of the heading."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class HeadDirectionRing:
         return c / norm, s / norm
 
     def heading_of(self, activity: NDArray[np.floating]) -> float:
-        """Return the heading that an activity (m,) stands for, rad in [-pi, pi]."""
+        """The heading of an activity (m,), rad in [-pi, pi]."""
         c, s = (self._readout @ activity).tolist()
         return math.atan2(s, c)
 
     def rates_at(self, heading_rad: float) -> NDArray[np.floating]:
-        """Return the activity (m,) that stands for a heading, rad."""
+        """The activity (m,) at a heading, rad."""
         vector = np.array([math.cos(heading_rad), math.sin(heading_rad), 1.0])
         return np.asarray(vector.astype(self._tuning.dtype).dot(self._tuning))
 

@@ -1,4 +1,4 @@
-"""The path integrator: self-motion in, pose and place code out, nothing but network activity between."""
+"""The path integrator: from self-motion to pose and place code, by network activity alone."""
 
 from __future__ import annotations
 
@@ -48,14 +48,13 @@ _WRAPS = np.array(sorted(((x, y) for x in range(-8, 9) for y in range(-8, 9)), k
 class PathIntegrator:
     """Head direction -> band -> grid -> place -> place attractor.
 
-    The pose is read from the head-direction ring and from the phases of all grid sheets together. No number integrates
-    position beside the network. What the read-out needs besides is which repetition of the code is meant. The last decoded
-    position and the place attractor's bump say where to start; where the modules do not agree there, the box around it is
-    scanned, and then the attractor's other wraps (8 each way). The start picks a repetition and enters nowhere else: other
-    activity means another pose.
+    The pose is decoded from the head-direction ring and the phases of all grid sheets together; no other state integrates the
+    position. The code repeats, so decoding needs a start: the last decoded position and the place attractor's bump. If the
+    modules do not agree there, the box around it is scanned, and then the attractor's other wraps (8 each way). The start
+    selects a repetition and has no other effect: other activity means another pose.
 
     Attributes:
-        gains: calibration of the steps to come; may be changed on the way.
+        gains: calibration of the next steps; may be changed at any time.
     """
 
     def __init__(self, config: NeuralConfig, rng: np.random.Generator | None = None, dtype: DTypeLike = np.float64) -> None:
@@ -146,7 +145,7 @@ class PathIntegrator:
         return decoded
 
     def module_errors(self, position_m: ArrayLike) -> Array:
-        """Distance (M,) between what each module's sheet says and a true position (2,), in units of its spacing."""
+        """Distance (M,) between each module's decoded position and a true position (2,), in units of its spacing."""
         waves = self.bands.wave_vectors[:, [0, 2], :]
         offset = self.grid.phases() - waves @ np.asarray(position_m, dtype=np.float64)[:2]
         offset -= np.round(offset)
@@ -154,10 +153,10 @@ class PathIntegrator:
         return np.asarray(np.linalg.norm(metres, axis=1) / self.spacings_m)
 
     def snapshot(self) -> Snapshot:
-        """Return what a node stores so that `restore` puts the network back where it is now (some 8 kB).
+        """The state that a node stores, so that `restore` returns the network to it (some 8 kB).
 
         Keys: `heading` (m,), `band_phases` (M, 3), `grid_phases` (M, 2), `attractor` (N, N), and `near_m` (2,): the
-        decoded position, which says which repetition of the code is meant.
+        decoded position, which selects the repetition of the code.
         """
         near = self.decode().position_m
         return {
@@ -297,13 +296,13 @@ def _grid(config: NeuralConfig, dtype: DTypeLike) -> GridModules:
 
 
 class Reanchoring:
-    """Recalibrates the path integrator to matched nodes (paper eq. 16) and keeps `odom` continuous all the same.
+    """Re-anchoring: sets the path integrator to matched nodes (paper eq. 16), and keeps `odom` continuous.
 
-    The cells jump to the matched node's activity, so that a place known from before has its old place code again. What they
-    jump by is taken out of the pose in `odom` (REP-105), so that odometry edges stay odometry.
+    The cells jump to the matched node's activity, so that a visited place has its old place code again. The jump is subtracted
+    from the pose in `odom` (REP-105), so that odometry edges stay odometry.
 
     Attributes:
-        weight: how far the cells are pulled, 0..1; with 0 they are left alone.
+        weight: how far the cells are pulled, 0..1; 0 leaves them alone.
     """
 
     def __init__(self, integrator: PathIntegrator, weight: float) -> None:
@@ -319,17 +318,17 @@ class Reanchoring:
         return pose if self._pose_odom_cells is None else compose(self._pose_odom_cells, pose)
 
     def remember(self, node: int) -> None:
-        """Keep the cells' activity at a new node: of every node if they are to go back to it, else of the last alone."""
+        """Store the cells' activity at a new node; with weight 0 only the last node's is kept."""
         if self.weight == 0.0:
             self._activity_at_node.clear()
         self._activity_at_node[node] = self._integrator.snapshot()
 
     def activity_at(self, node: int) -> Snapshot:
-        """What was remembered at a node."""
+        """The stored activity of a node."""
         return self._activity_at_node[node]
 
     def recalibrate(self, node: int, delta_node_robot: Array) -> None:
-        """Pull the cells to the activity of a matched node, moved by the pose (3,) of the robot seen from it."""
+        """Pull the cells to the activity of a matched node, shifted by the pose (3,) of the robot in the node's frame."""
         if self.weight == 0.0:
             return
         before = self.pose_odom_robot

@@ -1,4 +1,4 @@
-"""Place cells: recruited from the grid, and the sheet of cells that settles on one of them."""
+"""Place cells recruited from the grid cells, and the place attractor."""
 
 from __future__ import annotations
 

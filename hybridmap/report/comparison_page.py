@@ -34,18 +34,18 @@ _WORST = 6  # edges a row
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """What was compared.
+    """The content of the page.
 
     Attributes:
         title: headline.
-        start: what the graph's own poses are, from which batch solutions begin.
+        start: what the graph's initial poses are, in words.
         head: facts about the graph, shown as `key: value`.
         graph: the graph.
         rows: the back-ends.
-        cells: the table: a line of column titles, then one line a row of `rows`.
+        cells: the table: column titles, then one list of cells per row of `rows`.
         settings: of the back-ends.
-        truth: pieces (P, 3) of the true way in the frame of the maps, m and rad; none where it is not known.
-        kidnapped: where the robot was kidnapped, so that no line is drawn there.
+        truth: pieces (P, 3) of the true path in the frame of the maps, m and rad; empty if unknown.
+        carried: where the robot was kidnapped; no line is drawn there.
     """
 
     title: str
@@ -60,7 +60,7 @@ class Compared:
 
 
 def write_comparison(place: Held, compared: Compared) -> Path:
-    """Write `maps.png` and `comparison.html` into a folder that is held as `COMPARISON`; returns the page.
+    """Write `maps.png` and `comparison.html` into a folder that is locked as `COMPARISON`; returns the page.
 
     Raises:
         OutputError: it cannot be written to.
@@ -97,7 +97,7 @@ def write_comparison(place: Held, compared: Compared) -> Path:
 
 
 def worst_edges(graph: PoseGraph, row: Row) -> list[str]:
-    """The edges that a solution kept and that cost it most, the worst first: number, ends, kind, squared residual."""
+    """The inlier edges of a solution with the largest squared residuals, worst first: number, ends, kind, squared residual."""
     assert row.solution is not None
     squared = squared_norms(graph, row.solution.poses)
     squared[np.isin(graph.edge_ids, row.solution.report.rejected_edge_ids)] = -1.0
@@ -118,14 +118,14 @@ _BAR_IN = 0.34  # height of a back-end's bar of weights
 
 
 def solved(rows: Sequence[Row]) -> dict[str, Array]:
-    """Title -> poses (N, 3) of the rows that have a map: one that diverged has its start only."""
+    """Title -> poses (N, 3) of the rows that have a map; a back-end that diverged has only its initial poses."""
     return {row.title: row.solution.poses for row in rows if row.has_map and row.solution is not None}
 
 
 def overlay(rows: Sequence[Row], truth: Sequence[Array], kidnapped: Sequence[Kidnapping]) -> str:
-    """The chain of nodes of every row in one frame, over the pieces (P, 3) of the truth where it is known; a `data:` URI.
+    """The chain of nodes of every row in one frame, over the pieces (P, 3) of the truth if known; a `data:` URI.
 
-    Empty where no row has a map.
+    Empty if no row has a map.
     """
     maps = solved(rows)
     if not maps:
@@ -153,8 +153,8 @@ def panels(graph: PoseGraph, rows: Sequence[Row], start: str, kidnapped: Sequenc
     Args:
         graph: the edges.
         rows: the maps.
-        start: what the graph's own poses are.
-        kidnapped: where no line is drawn, as the robot did not drive there.
+        start: what the graph's initial poses are, in words.
+        carried: where the robot was kidnapped; no line is drawn there.
     """
     maps = solved(rows)
     if not any(np.allclose(poses, graph.initial) for poses in maps.values()):
@@ -176,7 +176,7 @@ def panels(graph: PoseGraph, rows: Sequence[Row], start: str, kidnapped: Sequenc
 
 
 def convergence(rows: Sequence[Row]) -> str:
-    """Batch: chi2 over iterations; incremental: unit variance over nodes; a `data:` URI, empty where nothing was traced."""
+    """Batch: chi2 over iterations; incremental: unit variance over nodes. A `data:` URI, empty without curves."""
     traced = [row for row in rows if row.has_map and row.curve is not None and row.backend != ODOMETRY]
     ways = [way for way in Way if any(row.way is way for row in traced)]
     if not ways:
@@ -195,7 +195,7 @@ def convergence(rows: Sequence[Row]) -> str:
 
 
 def weights(graph: PoseGraph, rows: Sequence[Row]) -> str:
-    """Weight of every loop in the order of the log, a bar a row that weighs or rejects loops; a `data:` URI or empty."""
+    """Weight of every loop by its number, for each row with weights or rejected loops; a `data:` URI or empty."""
     ids = graph.edge_ids[graph.is_loop].tolist()
     bars: dict[str, list[float]] = {}
     for row in rows:
@@ -218,9 +218,9 @@ def weights(graph: PoseGraph, rows: Sequence[Row]) -> str:
 
 
 def residuals(graph: PoseGraph, rows: Sequence[Row]) -> str:
-    """Share of edges (%) whose squared Mahalanobis residual is below a value, a line a row; a `data:` URI.
+    """Share of edges (%) with a squared Mahalanobis residual below a value, one line per row; a `data:` URI.
 
-    Empty where no row has a map.
+    Empty if no row has a map.
     """
     if not solved(rows):
         return ""
@@ -239,9 +239,9 @@ def residuals(graph: PoseGraph, rows: Sequence[Row]) -> str:
 
 
 def _looks(rows: Sequence[Row]) -> Mapping[str, dict[str, Any]]:
-    """Title -> how its line is drawn: a colour a back-end, dashes for the incremental way.
+    """Title -> style of its line: one colour per back-end, dashes for the incremental way.
 
-    Each is thinner than those before and on top of them, so that of lines which coincide the last is seen with a rim of others.
+    Each line is thinner than the previous ones and drawn above them, so that coinciding lines stay visible.
     """
     colors = (style.PRIMARY, *style.OTHERS)
     names = [name for name in dict.fromkeys(row.backend for row in rows) if name != ODOMETRY]
@@ -270,7 +270,7 @@ def _box(maps: Sequence[Array]) -> tuple[Array, Array]:
 
 
 def draw_map(axes: Any, graph: PoseGraph, poses: Array, rejected: tuple[int, ...]) -> None:
-    """Draw the edges of one map: the rejected ones, by edge id, lie under the loops, and these under the chain."""
+    """Draw the edges of one map: rejected loops (by edge id) below the other loops, and these below the chain."""
     lost, loops = np.isin(graph.edge_ids, np.array(rejected, dtype=np.int64)), graph.is_loop
     _draw_edges(axes, graph, poses, lost, color=_REJECTED, linewidths=0.4, alpha=0.6, zorder=1.1)
     _draw_edges(axes, graph, poses, loops & ~lost, color=_LOOP, linewidths=0.6, zorder=1.2)

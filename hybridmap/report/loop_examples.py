@@ -1,4 +1,4 @@
-"""Example loop closures: what both nodes saw, both scanlines, and how the two views fit by the measured relative pose."""
+"""Example loop closures: the data of both nodes, both scanlines, and both views overlaid by the measured relative pose."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ _NEW, _OLD = style.PRIMARY, style.ODOMETRY
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """One closure as the page shows it.
+    """One loop closure of the page.
 
     Attributes:
-        title: which nodes, and the verdict.
+        title: its nodes, and the verdict.
         accepted: whether it is in the graph.
         reason: why.
         facts: (name, value with unit) rows.
-        photos: colour pictures of the newer and the older node as `data:` URIs; empty without a camera.
-        overlay: what both saw from above, one laid over the other; None where there is nothing to lay.
-        profiles: both scanline profiles; None where there are none.
+        photos: colour images of the newer and the older node as `data:` URIs; empty without a camera.
+        overlay: both views from above, one over the other; None without points.
+        profiles: both scanline profiles; None without profiles.
     """
 
     title: str
@@ -54,12 +54,12 @@ class Example:
 
 
 def examples(scene: SessionScene, store: MapStore, points_of: Mapping[int, Array]) -> list[Example]:
-    """Some accepted closures, spread over the drive, and the refused one that would have bent the map most.
+    """Some accepted loops, spread over the drive, and the rejected loop that would have bent the map most.
 
     Args:
         scene: the session.
         store: its keyframes.
-        points_of: node -> what it saw, (M, 2) in `base_link`, m.
+        points_of: node -> its points, (M, 2) in `base_link`, m.
     """
     fates = loops_by_fate(scene)
     accepted = fates["loops accepted"] or fates["accepted, no weight in the primary back-end"]
@@ -76,7 +76,7 @@ def spread(edges: Sequence[Edge], count: int) -> list[Edge]:
 
 
 def _telling(scene: SessionScene, edges: Sequence[Edge], least: int) -> list[Edge]:
-    """Edges by newer node; where there are enough, only those that were measured, lie far apart in time, look the same way."""
+    """Edges by newer node; if there are enough, only measured ones far apart in time with a similar heading."""
     stamps_s = np.array([node.stamp_ns for node in scene.experiences.nodes]) / NS_PER_S
     tests = (
         lambda e: e.relative is not None,
@@ -91,7 +91,7 @@ def _telling(scene: SessionScene, edges: Sequence[Edge], least: int) -> list[Edg
 
 
 def _contradiction_m(scene: SessionScene, edge: Edge) -> float:
-    """How far the measured pose is from where the final map has the node, m; less than nothing where none was measured."""
+    """Distance between the measured pose and the node on the final map, m; negative without a measurement."""
     if edge.relative is None:
         return -1.0
     off = between(edge.relative.delta, between(scene.nodes[edge.source], scene.nodes[edge.target]))
@@ -135,7 +135,7 @@ def _facts(scene: SessionScene, edge: Edge) -> tuple[tuple[str, str], ...]:
 
 
 def _seen_around(scene: SessionScene, node: int, points_of: Mapping[int, Array]) -> Array:
-    """What a node and its neighbours along the drive saw, (M, 2) in the frame of the node, m."""
+    """Points of a node and its neighbours along the drive, (M, 2) in the frame of the node, m."""
     nodes = range(max(0, node - _NEIGHBOURS), min(len(scene.nodes), node + _NEIGHBOURS + 1))
     delta = between(scene.nodes[node], scene.nodes)
     seen = [transform_points(delta[k], points_of[k]) for k in nodes if k in points_of]
@@ -170,7 +170,7 @@ def _overlay(scene: SessionScene, edge: Edge, points_of: Mapping[int, Array]) ->
 
 
 def overlay_title(edge: Edge) -> str:
-    """How the two views came to lie over each other."""
+    """How the two views were aligned, in words."""
     return f"laid over each other {'as the map has them' if edge.relative is None else 'by the measured pose'}"
 
 
@@ -246,7 +246,7 @@ _WORDS: dict[str, tuple[str, str]] = {
 
 
 def in_words(edge: Edge) -> list[tuple[str, str]]:
-    """(words, value with unit) of each figure of an edge, those that decided first; one without words goes by its own name."""
+    """(words, value with unit) of each figure of an edge, decisive ones first; a figure without words has its own name."""
     figures = {check.figure: check.value for check in edge.checks} | dict(edge.figures)
     figures |= {"shift": edge.shift} if edge.shift else {}
     rows = []

@@ -1,4 +1,4 @@
-"""What a keyframe shows from above, and many of them as one picture of the building."""
+"""The points of keyframes seen from above, and a picture of the building made of them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Raster:
     """A picture of the building from above.
 
     Attributes:
-        grey: (H, W) in [0, 1], 0 where nothing was seen; row 0 is the lowest y.
+        grey: (H, W) in [0, 1], 0 without points; row 0 is the lowest y.
         extent: left, right, bottom, top, m.
     """
 
@@ -36,7 +36,7 @@ class Raster:
 
 
 def outline(keyframe: Mapping[str, NDArray[Any]], rig: Rig) -> Array:
-    """Points (M, 2) of what a node saw, in `base_link`, m; empty where it saw nothing that can be drawn."""
+    """Points (M, 2) of a node, in `base_link`, m; empty if there is nothing to draw."""
     seen = see(keyframe, rig, _MAX_DEPTH_M)
     if seen is None:
         return np.zeros((0, 2))
@@ -47,7 +47,7 @@ def outline(keyframe: Mapping[str, NDArray[Any]], rig: Rig) -> Array:
 
 
 def outlines(store: MapStore, count: int) -> dict[int, Array]:
-    """Node -> points in `base_link`, for `count` nodes, or for evenly spaced ones where there are very many."""
+    """Node -> points in `base_link`, for `count` nodes, or for evenly spaced nodes if there are very many."""
     rig = store.rig
     step = max(1, -(-count // _MAX_KEYFRAMES))
     found = {node: outline(store.keyframe(node), rig) for node in range(0, count, step)}
@@ -55,7 +55,7 @@ def outlines(store: MapStore, count: int) -> dict[int, Array]:
 
 
 def raster(points_of: Mapping[int, Array], poses: Array) -> Raster | None:
-    """Draw the points of every node at its pose (N, 3); None where there is none."""
+    """Draw the points of every node at its pose (N, 3); None without points."""
     placed = [transform_points(poses[node], points) for node, points in points_of.items() if node < len(poses)]
     if not placed:
         return None

@@ -1,4 +1,4 @@
-"""What every page is filled with: figures as tables and in words, and the templates of this folder."""
+"""Tables and templates that all pages share."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FIRST = ("ate", "relation")
 
 @dataclass(frozen=True, slots=True)
 class TableRow:
-    """One line: a measure, its unit and meaning, and a cell for each column (empty where there is no figure)."""
+    """One row: a measure, its unit and meaning, and one cell per column (empty without a figure)."""
 
     measure: str
     unit: str
@@ -25,9 +25,9 @@ class TableRow:
 
 
 def by_backend(metrics: Sequence[Metric], backends: Sequence[str]) -> list[TableRow]:
-    """A row a measure that at least one of the back-ends has, a cell a back-end.
+    """One row per measure, one cell per back-end.
 
-    Errors come first, the rest as it came; the words are those of the last back-end that has the measure.
+    Errors come first, then the others in their order; the description is that of the last back-end with the measure.
     """
     measures: dict[str, dict[str, Metric]] = {}
     for metric in metrics:
@@ -52,13 +52,13 @@ def of_session(metrics: Sequence[Metric], backends: Sequence[str]) -> list[Table
 
 
 def shown(metric: Metric) -> str:
-    """The value with four digits that matter, and whether it keeps to its bar."""
+    """The value with four significant digits, and whether it keeps its bar."""
     verdict = "" if metric.passed is None else " ✓" if metric.passed else " ✗"
     return number(metric.value) + verdict
 
 
 def number(value: float) -> str:
-    """Four significant digits, whole numbers as such; a dash where there is none."""
+    """Four significant digits, integers in full; a dash for a missing value."""
     if not math.isfinite(value):
         return "–"
     if value == round(value) and abs(value) < 1e7:
@@ -67,7 +67,7 @@ def number(value: float) -> str:
 
 
 def interval(found: Interval) -> str:
-    """A mean with its interval, of as many decimals as the interval bears out and at most six; where there is none, why."""
+    """A mean with its interval, with as many decimals as the interval justifies, at most six; without one, why."""
     if not found.count:
         return number(found.value)
     if not found.known:
@@ -80,7 +80,7 @@ def interval(found: Interval) -> str:
 
 
 def length(value_m: float) -> tuple[str, str]:
-    """A length as people say it: (digits, unit), below a metre in cm."""
+    """A length for people: (digits, unit), below a metre in cm."""
     if not math.isfinite(value_m):
         return "–", "m"
     value, name = (100.0 * value_m, "cm") if abs(value_m) < 1.0 else (value_m, "m")
@@ -88,7 +88,7 @@ def length(value_m: float) -> tuple[str, str]:
 
 
 def duration(value_s: float) -> tuple[str, str]:
-    """A time as people say it: (digits, unit), beyond two minutes in minutes."""
+    """A time for people: (digits, unit), beyond two minutes in minutes."""
     return (f"{value_s:.0f}", "s") if not value_s > 120.0 else (f"{value_s / 60.0:.1f}", "min")
 
 
@@ -101,12 +101,12 @@ _MARK = '<meta name="generator" content="hybridmap '  # in the head of the pages
 
 
 def is_page(path: Path) -> bool:
-    """Whether a file is a page that was made here, and that no session or study folder holds."""
+    """Whether a file is a page made by hybridmap that is not part of a session or study folder."""
     return path.is_file() and _MARK in path.read_text(encoding="utf-8", errors="replace")
 
 
 def rendered(template: str, **content: Any) -> str:
-    """The text of a page: a template by its file name, filled; text is escaped, and a name that is missing is an error."""
+    """The text of a page: a template, by its file name, filled in. Text is escaped, and a missing name is an error."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(

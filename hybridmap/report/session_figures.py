@@ -24,7 +24,7 @@ _MANY = 200
 
 
 def trajectories_figure(scene: SessionScene, building: Raster | None) -> str:
-    """Every back-end's trajectory over the truth and over what the primary back-end's map shows; a `data:` URI."""
+    """Every back-end's trajectory over the ground truth and the primary back-end's map; a `data:` URI."""
     shown = [scene.estimates[name].poses for name in scene.backends if name in scene.estimates]
     shown += [scene.truth.poses] if scene.truth is not None else []
     with style.figure(*_size(np.concatenate(shown)[:, :2], building)) as picture:
@@ -49,13 +49,13 @@ def draw_trajectories(axes: Any, scene: SessionScene, building: Raster | None) -
 
 
 def _draw_ways(axes: Any, trajectory: Trajectory, scene: SessionScene, *, label: str, **looks: Any) -> None:
-    """What was driven of a trajectory: no line leads through the air."""
+    """Draw a trajectory; no line is drawn where the robot was kidnapped."""
     for i, piece in enumerate(pieces(trajectory, scene.experiences)):
         axes.plot(*style.thinned(piece.poses)[:, :2].T, label="" if i else label, **looks)
 
 
 def graph_figure(scene: SessionScene, building: Raster | None) -> str:
-    """Nodes at the primary back-end's poses, chain, kidnappings, and loops by their fate; a `data:` URI."""
+    """Nodes at the primary back-end's poses, chain, kidnappings, and loops by their status; a `data:` URI."""
     with style.figure(*_size(scene.nodes[:, :2], building)) as picture:
         axes = picture.add_subplot()
         style.draw_building(axes, building, darkness=0.35)
@@ -91,7 +91,7 @@ _FATES: dict[str, dict[str, Any]] = {
 
 
 def _draw_legend(picture: Any) -> None:
-    """Lines of the legend can be seen, however thin and pale they are in the picture."""
+    """A legend with visible lines, however thin and pale they are in the picture."""
     legend = picture.legend(loc="outside upper left", ncols=3, markerscale=2.5)
     for line in legend.get_lines():
         line.set_alpha(1.0)
@@ -107,7 +107,7 @@ def chain_and_kidnappings(scene: SessionScene) -> tuple[list[Edge], list[Edge]]:
 
 
 def loops_by_fate(scene: SessionScene) -> dict[str, list[Edge]]:
-    """Every loop that was considered, by what became of it, in the order of the legend."""
+    """Every loop that was considered, by its status, in the order of the legend."""
     report = scene.reports.get(scene.primary)
     unweighted = set(report.rejected_edge_ids) if report is not None else set()
     found: dict[str, list[Edge]] = {fate: [] for fate in _FATES}
@@ -159,9 +159,9 @@ class ErrorSeries:
 
 
 def error_series(scene: SessionScene) -> dict[str, ErrorSeries]:
-    """Name -> error: of every back-end's final trajectory and of the primary's online one, against the truth.
+    """Name -> error against ground truth: of every back-end's final trajectory and of the primary's online one.
 
-    Without a truth: of odometry and of what each back-end believed at the time, against the primary's final trajectory.
+    Without ground truth: of odometry and of each back-end's online trajectory, against the primary's final trajectory.
     """
     start_ns = scene.estimates[ODOMETRY].stamps_ns[0]
     if scene.truth is not None:
@@ -181,7 +181,7 @@ def error_series(scene: SessionScene) -> dict[str, ErrorSeries]:
 
 
 def error_figure(scene: SessionScene) -> str | None:
-    """Position and heading error over time, with a mark at every accepted loop; a `data:` URI, None without anything."""
+    """Position and heading error over time, with a mark at every accepted loop; a `data:` URI, None without errors."""
     series = error_series(scene)
     if not series:
         return None
@@ -235,7 +235,7 @@ def over_intervals(errors: ErrorSeries, count: int) -> ErrorSeries:
 
 
 def gaps(time_s: Array) -> Array:
-    """Middles (G,), s, of the times in which no error is taken, as where the robot was kidnapped or the truth was lost."""
+    """Middles (G,), s, of times without errors, such as a kidnapping or a gap of the ground truth."""
     spacing = np.diff(time_s)
     if not len(spacing):
         return spacing
@@ -244,7 +244,7 @@ def gaps(time_s: Array) -> Array:
 
 
 def with_gaps(errors: ErrorSeries, gaps_s: Array) -> ErrorSeries:
-    """The series with NaN at some times, where its lines end and begin anew."""
+    """The series with NaN at given times, where its lines are interrupted."""
     at = np.searchsorted(errors.time_s, gaps_s)
     position, heading = (np.insert(values, at, np.nan) for values in (errors.position_m, errors.heading_deg))
     return ErrorSeries(np.insert(errors.time_s, at, gaps_s), position, heading)
@@ -264,7 +264,7 @@ def _mark_loops(scene: SessionScene, axes: Any) -> None:
 
 
 def correction_figure(correction: Correction, points_of: Mapping[int, Array], kidnapped: Sequence[Kidnapping]) -> str:
-    """Two panels on the same axes: nodes and what they saw, before and after; a `data:` URI. The way ends at a kidnapping."""
+    """Two panels on the same axes: nodes and their points, before and after; a `data:` URI. No line crosses a kidnapping."""
     both = np.concatenate([correction.before, correction.after])[:, :2]
     low, high = both.min(axis=0) - 1.5, both.max(axis=0) + 1.5
     with style.figure(*style.fitted_size(high - low, panels=2)) as picture:
@@ -290,7 +290,7 @@ def _panel(
 
 
 def _draw_shifts(axes: Any, correction: Correction) -> None:
-    """How far each node was moved."""
+    """Draw how far each node was moved."""
     from matplotlib.collections import LineCollection
 
     shifts = np.stack([correction.before[:, :2], correction.after[:, :2]], axis=1)

@@ -1,4 +1,4 @@
-"""The page itself: gather, draw, fill the template."""
+"""The page of a session."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Tile:
 
 
 def write_report(folder: SessionFolder) -> Path:
-    """Write `report.html` of a session: one page that needs nothing beside it, no network and no script.
+    """Write `report.html` of a session: one self-contained page without network access or scripts.
 
     Raises:
         StoreError: there is no session, or its map or figures are damaged.
@@ -77,7 +77,7 @@ def _content(scene: SessionScene, store: MapStore) -> dict[str, Any]:
 
 
 def tiles(scene: SessionScene) -> list[Tile]:
-    """What one wants to know first: how good, how far, how many loops, how costly."""
+    """The main figures: accuracy, travel, loops and computing time."""
     named = {metric.name: metric for metric in scene.metrics}
     wanted = [
         (f"ate_rmse/{ODOMETRY}", "ATE of odometry"),
@@ -105,6 +105,6 @@ def _tile(metric: Metric, label: str) -> Tile:
 
 
 def _remarks(scene: SessionScene) -> list[str]:
-    """What went wrong or was left out on the way."""
+    """Warnings and omissions of the run."""
     failed = [f"{name} failed: {why}" for name, why in dict(scene.head.get("failed_backends", {})).items()]
     return failed + [str(remark) for remark in scene.head.get("remarks", [])]

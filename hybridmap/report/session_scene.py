@@ -1,4 +1,4 @@
-"""What the page shows, gathered from a session folder and brought into one frame."""
+"""The content of a session's page, read from the session folder and transformed into one frame."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Correction:
 
     Attributes:
         stamp_ns: when.
-        shift_m: how far the node that moved most was moved.
-        before, after: (K, 3) poses of the nodes that there were, in the page's frame.
+        shift_m: largest shift of a node.
+        before, after: (K, 3) poses of the nodes at the time, in the page's frame.
     """
 
     stamp_ns: int
@@ -35,20 +35,20 @@ class Correction:
 
 @dataclass(frozen=True, slots=True)
 class SessionScene:
-    """Everything drawn, in the page's frame: that of the ground truth where there is one, else `map`.
+    """Everything that is drawn, in the page's frame: that of the ground truth if known, else `map`.
 
     Attributes:
         source: what was mapped.
-        primary: the back-end that is judged.
+        primary: the primary back-end.
         backends: `odometry`, then every back-end that followed the drive or has a solution, the primary first.
         truth: true trajectory, if known.
         estimates: name -> trajectory, each aligned to the truth by itself; also `<backend>_online`.
         pairs: name -> estimate and truth at common stamps, both in the page's frame; empty without a truth.
         nodes: (N, 3) poses of the nodes by the primary back-end.
         experiences: nodes and edges.
-        reports: name -> how the back-end's solution came about.
+        reports: name -> report of the back-end's solution.
         correction: the largest one, if any.
-        head, metrics: what `metrics.json` holds.
+        head, metrics: the content of `metrics.json`.
         config_yaml: the resolved configuration.
     """
 
@@ -68,7 +68,7 @@ class SessionScene:
 
 
 def load_scene(folder: SessionFolder, store: MapStore) -> SessionScene:
-    """Gather a session.
+    """Read a session.
 
     Raises:
         StoreError: the map or the figures are damaged.

@@ -1,4 +1,4 @@
-"""The pictures of a study's page: each figure of merit over what was varied, and the paired differences."""
+"""The pictures of a study's page: each figure over the varied quantity, and the paired differences."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ Figure = Callable[[CellResult], float | None]
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Cells that share a pair of axes.
+    """Cells drawn on the same axes.
 
     Attributes:
         title: what they have in common.
-        ticks: names of the positions along the axis of what is varied.
+        ticks: names of the positions along the axis of the varied quantity.
         cells: (position, back-end, result).
     """
 
@@ -45,11 +45,11 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How a study is spread over panels.
+    """The panels of a study.
 
     Attributes:
         panels: in the order of the grid.
-        along: what the positions are: `false loops`, `setting` or `back-end`; the last one has a row each, not a line.
+        along: the varied quantity: `false loops`, `setting` or `back-end`; for the last one, each has a row instead of a line.
     """
 
     panels: tuple[Panel, ...]
@@ -57,7 +57,7 @@ class Layout:
 
 
 def layout(study: Study) -> Layout:
-    """Over the rates if there are several, else over the settings, else over the back-ends alone."""
+    """Panels over the rates if there are several, else over the settings, else over the back-ends."""
     config = study.grid.study
     rates = sorted(config.false_loops.rates)
     titles = [variant.title for variant in config.backends]
@@ -73,7 +73,7 @@ def layout(study: Study) -> Layout:
 
 
 def _over_rates(study: Study, rates: Sequence[float]) -> tuple[Panel, ...]:
-    """A panel a source, setting and kind; the cells without false loops are of every kind."""
+    """One panel per source, setting and kind; cells without false loops belong to every kind."""
     entries = [
         (_joined(cell.source, _setting(study, cell), f"{kind} false loops"), _percent(cell.rate), cell, result)
         for cell, result in study.rows
@@ -92,15 +92,15 @@ def _gathered(entries: Sequence[tuple[str, str, Cell, CellResult]], ticks: Seque
 
 
 def having(plan: Layout, figure: Figure) -> Layout:
-    """Without the panels in which no cell has the figure."""
+    """The panels in which some cell has the figure."""
     kept = (panel for panel in plan.panels if any(figure(result) is not None for _, _, result in panel.cells))
     return replace(plan, panels=tuple(kept))
 
 
 def merit_figure(study: Study, plan: Layout, label: str, figure: Figure, *, logarithmic: bool) -> str:
-    """One figure of merit, an error or a share in percent: dots are cells, lines and bars their medians; a `data:` URI.
+    """One figure, an error or a share in percent: dots are cells, lines and bars their medians; a `data:` URI.
 
-    Panels in which no cell has it are left out; empty where none has.
+    Panels without the figure are left out; empty if none has it.
     """
     shown = having(plan, figure).panels[:MOST_PANELS]
     if not shown:
@@ -130,7 +130,7 @@ def merit_figure(study: Study, plan: Layout, label: str, figure: Figure, *, loga
 
 
 def paired_groups(summaries: Sequence[Summary], measure: str) -> dict[str, list[Summary]]:
-    """Group -> the differences of an error to the baseline that are of several seeds; only groups that have some."""
+    """Group -> the differences of an error to the baseline over several seeds; groups without any are left out."""
     groups: dict[str, list[Summary]] = {}
     for one in summaries:
         if one.measure == measure and one.difference is not None and one.difference.count > 1:
@@ -139,9 +139,9 @@ def paired_groups(summaries: Sequence[Summary], measure: str) -> dict[str, list[
 
 
 def difference_figure(groups: Mapping[str, Sequence[Summary]]) -> str:
-    """Mean paired difference of an error to the baseline with its interval, a panel a group; a `data:` URI, empty without any.
+    """Mean paired difference of an error to the baseline with its interval, one panel per group; a `data:` URI or empty.
 
-    A difference without an interval is a dot alone.
+    A difference without an interval is a single dot.
     """
     if not groups:
         return ""
@@ -180,7 +180,7 @@ def _draw_interval(axes: Any, row: int, one: Summary) -> None:
 
 
 def _draw_lines(axes: Any, panel: Panel, figure: Figure, looks: dict[str, dict[str, Any]]) -> None:
-    """A line a back-end through its medians, each cell a dot."""
+    """One line per back-end through its medians, and a dot per cell."""
     backends = list(dict.fromkeys(backend for _, backend, _ in panel.cells))
     for rank, backend in enumerate(backends):
         offset = 0.24 * ((rank + 0.5) / len(backends) - 0.5)
@@ -196,7 +196,7 @@ def _draw_lines(axes: Any, panel: Panel, figure: Figure, looks: dict[str, dict[s
 
 
 def _draw_rows(axes: Any, panel: Panel, figure: Figure, looks: dict[str, dict[str, Any]]) -> None:
-    """A row a back-end, each cell a dot, the median a bar."""
+    """One row per back-end, a dot per cell, and a bar at the median."""
     for position, backend in enumerate(panel.ticks):
         values = _values(panel, position, backend, figure)
         axes.plot(values, [position] * len(values), ".", color=looks[backend]["color"], markersize=5.0, alpha=0.6)
@@ -227,7 +227,7 @@ def _axes(count: int, panel_height_in: float) -> Iterator[tuple[Any, list[Any]]]
 
 
 def _without(panel: Panel, position: int, backend: str, figure: Figure) -> str:
-    """How many cells have no such figure, and their statuses."""
+    """The number of cells without the figure, and their statuses."""
     cells = [result for at, name, result in panel.cells if (at, name) == (position, backend)]
     statuses = [result.status for result in cells if figure(result) is None]
     return ", ".join(f"{statuses.count(status)} of {len(cells)} {status}" for status in sorted(set(statuses)))

@@ -39,7 +39,7 @@ _SUMMED = (
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One back-end of a group: texts for the table, and whether its difference to the baseline is beyond chance."""
+    """One back-end of a group: cells of the table, and whether its difference to the baseline is significant."""
 
     backend: str
     solved: str
@@ -68,7 +68,7 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """A line of the table of bars: texts."""
+    """A row of the table of bars: its cells."""
 
     what: str
     where: str
@@ -80,7 +80,7 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """Cells that did not come to a good end and say the same."""
+    """Cells without a solution that share a message."""
 
     status: str
     where: str
@@ -90,7 +90,7 @@ class Remark:
 
 
 def write_study_page(study: Study) -> Path:
-    """Write `report.html` of a study: one page that needs nothing beside it; the same results give the same page.
+    """Write `report.html` of a study: one self-contained page; the same results give the same page.
 
     Raises:
         OutputError: it cannot be written.
@@ -166,12 +166,12 @@ def _tiles(study: Study) -> list[tuple[str, str]]:
 
 
 def _reference(study: Study) -> bool:
-    """Whether every source knows the truth."""
+    """Whether ground truth is known for every source."""
     return all(source.knows_truth for source in study.grid.study.sources)
 
 
 def error_of(study: Study) -> str:
-    """The figure that a study's errors are told by: ATE, or that of relations where nothing else is known."""
+    """The error figure of a study: ATE, or relation errors if only those are known."""
     return next((name for name in _ERRORS if any(result.figures.get(name) is not None for _, result in study.rows)), _ERRORS[0])
 
 
@@ -216,7 +216,7 @@ def _share(result: CellResult, part: str, whole: str) -> float | None:
 
 
 def groups_of(study: Study) -> list[Group]:
-    """Every group; a line a back-end that has a map there."""
+    """Every group, with one line per back-end that has a map."""
     measure, others = error_of(study), _others(study)
     found: dict[str, dict[str, dict[str, Summary]]] = {}
     for one in study.summaries:

@@ -1,4 +1,4 @@
-"""Furniture, each piece a list of surfaces standing at (x, y) and facing `yaw_deg`."""
+"""Furniture: each piece is a list of surfaces at (x, y), facing `yaw_deg`."""
 
 from __future__ import annotations
 

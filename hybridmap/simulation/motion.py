@@ -1,4 +1,4 @@
-"""How the robot moves: it pursues way points, may be carried elsewhere, and its wheels measure that with errors."""
+"""Motion of the simulated robot: it follows way points, may be kidnapped, and its wheels measure the motion with errors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LOOK_AHEAD_M = 0.45
 
 @dataclass(frozen=True, slots=True)
 class DriveLimits:
-    """What the drive may do: m/s, rad/s, m/s^2, rad/s^2."""
+    """Limits of the drive: m/s, rad/s, m/s^2, rad/s^2."""
 
     speed_m_s: float
     turn_rate_rad_s: float
@@ -93,7 +93,7 @@ def _follow(state: _State, leg: Array, limits: DriveLimits, dt_s: float) -> list
 
 
 def _turn(state: _State, heading_rad: float, limits: DriveLimits, dt_s: float) -> list[tuple[float, float, float]]:
-    """Turn on the spot to a heading, the shorter way round (left where both are equal)."""
+    """Turn on the spot to a heading, the shorter way (left if both are equal)."""
     poses = []
     left = float(wrap_angle(heading_rad - state.yaw + 1e-3)) - 1e-3
     left = left + 2.0 * math.pi if left < -math.pi + 0.01 else left
@@ -136,13 +136,13 @@ _EVERY = 15
 
 @dataclass(frozen=True, slots=True)
 class CarriedDrive:
-    """When the robot is carried, and how far.
+    """A drive with a kidnapping.
 
     Attributes:
-        first, last: steps of the drive between which it is in the air; the last is the first one on the floor again.
-        distance_m: straight distance that it is carried, m.
-        truth: (N, 3) true poses with the carry in them.
-        felt: (N, 3) poses of a robot that did only what the wheels felt: it stands still while it is carried.
+        first, last: steps at which the robot is picked up and put down.
+        distance_m: straight distance of the kidnapping, m.
+        truth: (N, 3) true poses, including the kidnapping.
+        felt: (N, 3) poses according to the wheels: the robot stands still while it is carried.
     """
 
     first: int
@@ -153,10 +153,10 @@ class CarriedDrive:
 
 
 def carry(drive: Array, distance_m: float, step_s: float) -> CarriedDrive:
-    """Cut a piece out of a drive: from where the robot is picked up to where it goes on, in a place that it knows.
+    """Kidnap the robot: cut a piece out of a drive, from the pick-up to a later place that was visited before.
 
-    It is picked up past the middle of the drive, as early as there is a known place so far away, farther on along the
-    drive; where the world is smaller, as far away as there is one.
+    The robot is picked up after the middle of the drive, at the first step with a visited place at this distance, farther
+    along the drive. In a smaller world the most distant visited place is used.
 
     Args:
         drive: (N, 3) true poses, m and rad.
@@ -164,7 +164,7 @@ def carry(drive: Array, distance_m: float, step_s: float) -> CarriedDrive:
         step_s: time between two poses, s.
 
     Raises:
-        ConfigError: the drive comes to no place twice.
+        ConfigError: the drive visits no place twice.
     """
     onward = _onward(drive)
     known = np.array([_seen_before(drive, int(end), len(drive) // 2) for end in onward])
@@ -187,7 +187,7 @@ def carry(drive: Array, distance_m: float, step_s: float) -> CarriedDrive:
 
 
 def _onward(drive: Array) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """Steps past the middle of the drive; at least a tenth of it is left to drive after the last."""
+    """Steps after the middle of the drive; at least a tenth of the drive remains after the last."""
     return np.arange(len(drive) // 2, len(drive) - len(drive) // 10, _EVERY)
 
 
@@ -247,5 +247,5 @@ def wheel_odometry(true_poses: Array, errors: WheelErrorConfig, rng: np.random.G
 
 
 def as_transmitted(yaw_rad: Array) -> Array:
-    """Headings (N,) as they come back from the quaternions in which messages and files carry them."""
+    """Headings (N,) after conversion to the quaternions of messages and files, and back."""
     return yaw_from_quaternion(*quaternion_from_yaw(wrap_angle(yaw_rad)).T)

@@ -46,7 +46,7 @@ def any_color(rng: Rng, low: int = 20, high: int = 235) -> Color:
 
 
 def material(draw: Callable[Concatenate[Rng, Shape, float, P], Image]) -> Callable[P, Paint]:
-    """From a function that draws to one that takes its options alone and gives the paint."""
+    """Decorator: from a function that draws to one that takes only its options and returns the paint."""
 
     @wraps(draw)
     def with_options(*args: P.args, **options: P.kwargs) -> Paint:
@@ -57,7 +57,7 @@ def material(draw: Callable[Concatenate[Rng, Shape, float, P], Image]) -> Callab
 
 @material
 def plain(_rng: Rng, shape: Shape, _px_per_m: float, color: Color) -> Image:
-    """One colour and nothing else: the featureless wall."""
+    """A single colour: a featureless wall."""
     return np.full((*shape, 3), color, dtype=np.uint8)
 
 

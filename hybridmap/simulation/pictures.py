@@ -25,7 +25,7 @@ def _text_lines(rng: Rng, image: Image, box: tuple[int, int, int, int], line_px:
 
 
 def _photo(rng: Rng, shape: Shape) -> Image:
-    """A picture of nothing in particular: colour clouds under some shapes."""
+    """An abstract picture: colour clouds under some shapes."""
     height, width = shape
     channels = [128 + 70 * smooth_noise(rng, shape, max(2.0, 0.3 * width)) for _ in range(3)]
     image = np.ascontiguousarray(np.clip(np.stack(channels, axis=-1), 0, 255).astype(np.uint8))

@@ -1,4 +1,4 @@
-"""A world made ready for ray casting: triangles, one picture of all textures with the light baked in, and what rays meet."""
+"""A world prepared for ray casting: triangles, and one texture atlas with the light baked in."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from hybridmap.simulation.surfaces import Facet, World
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """What rays met; every array has the rays' leading shape.
+    """Results of ray casting; every array has the rays' leading shape.
 
     Attributes:
-        hit: whether there was anything.
+        hit: whether the ray hit a surface.
         length: float32, in units of the ray's direction vector.
-        surface: int32 index of the surface (0 where nothing was hit).
+        surface: int32 index of the surface (0 without a hit).
         across: float32 texture coordinate 0..1 along the surface.
         down: float32 texture coordinate 0..1 from its upper edge.
     """
@@ -217,7 +217,7 @@ class LightMap:
 
 
 def bake(surfaces: Sequence[Facet], caster: Caster) -> list[LightMap]:
-    """Light on every surface; those that glow are at full brightness. A world without lamps is lit evenly."""
+    """Light on every surface; light sources have full brightness. A world without lamps is lit evenly."""
     lamps = [s for s in surfaces if s.glow > 0.0]
     if not lamps:
         return [LightMap(np.ones((1, 1), dtype=np.float32)) for _ in surfaces]
@@ -252,7 +252,7 @@ def _grid_points(surface: Facet, shape: tuple[int, int]) -> Array:
 
 
 def _openness(points: Array, normals: Array, caster: Caster) -> Array:
-    """Ambient light (N,): mean over cosine-weighted directions, less where the next thing is close."""
+    """Ambient light (N,): mean over cosine-weighted directions, less if surfaces are close."""
     turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(_RAYS)
     radius = np.sqrt((np.arange(_RAYS) + 0.5) / _RAYS)
     local = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1.0 - radius**2)])
@@ -268,7 +268,7 @@ def _openness(points: Array, normals: Array, caster: Caster) -> Array:
 
 
 def _lamp_light(points: Array, normals: Array, lamps: Sequence[Facet], caster: Caster) -> Array:
-    """Light (N,) from the middle of each lamp within reach, unless something is between."""
+    """Light (N,) from the middle of each lamp within reach that is not blocked."""
     middles = np.array([lamp.corner + 0.5 * (lamp.along + lamp.up) + 0.05 * _normal(lamp) for lamp in lamps])
     facing = np.array([_normal(lamp) for lamp in lamps])
     power = np.array([lamp.glow * np.linalg.norm(lamp.along) * np.linalg.norm(lamp.up) for lamp in lamps])

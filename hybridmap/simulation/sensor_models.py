@@ -51,7 +51,7 @@ def camera_of(config: CameraConfig) -> Camera:
 
 @dataclass(frozen=True, slots=True)
 class _Exposure:
-    """Slow change of brightness: a sum of sines drawn once, so that any frame can be rendered by itself."""
+    """Slow change of brightness: a sum of sines drawn once, so that any frame can be rendered independently."""
 
     amplitude: float
     frequencies_hz: Array
@@ -78,11 +78,11 @@ class CameraModel:
         self._exposure = _Exposure(noise * EXPOSURE_CHANGE, rng.uniform(0.02, 0.25, 4), rng.uniform(0, 2 * np.pi, 4))
 
     def frame(self, stamp_ns: int, time_s: float, pose_world_base: Array, rng: np.random.Generator) -> RgbdFrame:
-        """What the camera sees from a pose.
+        """The camera's frame at a pose.
 
         Args:
-            stamp_ns: stamp that the frame is given, ns.
-            time_s: time since the drive began, s; the exposure follows it.
+            stamp_ns: stamp of the frame, ns.
+            time_s: time since the drive began, s; the exposure depends on it.
             pose_world_base: (3,) true pose, m and rad.
             rng: of this frame alone.
         """
@@ -123,7 +123,7 @@ class CameraModel:
         return (millimetres / _MM_PER_M).astype(np.float32)
 
     def _noise(self, shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float32]:
-        """Noise (H, W) of unit deviation, alike in neighbouring pixels because they share most of a matching window."""
+        """Noise (H, W) of unit deviation, correlated between neighbouring pixels as they share most of a matching window."""
         white = rng.standard_normal(shape, dtype=np.float32)
         width = DEPTH_NOISE_WIDTH_PX
         if width <= 0.0:
@@ -133,13 +133,13 @@ class CameraModel:
         return np.asarray(cv2.sepFilter2D(white, -1, kernel, kernel), dtype=np.float32)
 
     def _shadow(self, z: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bool_]:
-        """Pixels beside a jump in depth, where the projected pattern does not reach or is torn."""
+        """Pixels next to a depth discontinuity, which the projected pattern does not reach."""
         low = cv2.erode(z, np.ones((3, 3), np.uint8))
         torn = (z - low) > _EDGE_JUMP * z
         return np.asarray(torn & (rng.random(z.shape, dtype=np.float32) < 0.75))
 
     def _patches(self, shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.bool_]:
-        """Blobs without depth, as dark or shiny spots give."""
+        """Blobs without depth, as on dark or shiny spots."""
         share = self._level * HOLE_FRACTION
         if share <= 0.0:
             return np.zeros(shape, dtype=np.bool_)
@@ -178,7 +178,7 @@ class LaserModel:
         self.laser = laser_of(config)
 
     def scan(self, stamp_ns: int, pose_world_base: Array, rng: np.random.Generator) -> LaserScan:
-        """What the laser measures from a pose (3,), m and rad, with the noise of `rng`."""
+        """The scan at a pose (3,), m and rad, with the noise of `rng`."""
         x, y, yaw = pose_world_base
         angle = self.laser.bearings_rad + yaw
         rays = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The simulated stream: a world, a drive through it, and what wheels, camera and laser make of it."""
+"""The simulated stream: a drive through a world, with the data of wheels, camera and laser."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ _WHEELS, _CAMERA, _LASER = range(3)
 class SimulatedStream:
     """A drive through a simulated world.
 
-    The drive and the world are the same for every seed; the seed draws the errors of the sensors. Whatever is yielded has
-    been rounded to what bags and folders hold, so that a recording of the stream reads back to the same bits.
+    The drive and the world are the same for every seed; the seed determines the errors of the sensors. Samples are rounded to
+    the precision of bags and folders, so a recording of the stream reads back to the same bits.
     """
 
     def __init__(self, config: SimulationConfig, seed: int) -> None:
@@ -44,7 +44,7 @@ class SimulatedStream:
             seed: of the sensors' errors.
 
         Raises:
-            ConfigError: there is no such world, or no known place in it to carry the robot to.
+            ConfigError: there is no such world, or no visited place in it to which the robot could be kidnapped.
         """
         self._config = config
         self._seed = seed
@@ -87,17 +87,17 @@ class SimulatedStream:
 
     @property
     def odometry(self) -> Trajectory:
-        """What the wheels report: poses of `base_link` in `odom`."""
+        """Wheel odometry: poses of `base_link` in `odom`."""
         return self._odometry
 
     @property
     def carry(self) -> CarriedDrive | None:
-        """When the robot is carried, and how far; None where it never is."""
+        """The drive with its kidnapping; None without one."""
         return self._carry
 
     @property
     def expected_observations(self) -> int:
-        """Frames and scans to come."""
+        """Number of frames and scans."""
         return sum(len(stamps) for stamps in (self._frame_stamps, self._scan_stamps))
 
     @property

@@ -1,4 +1,4 @@
-"""What a simulated world is made of: painted rectangles, and the boxes, panels and partitions put together from them."""
+"""Building blocks of a simulated world: painted rectangles, and boxes, panels and partitions made of them."""
 
 from __future__ import annotations
 
@@ -151,13 +151,13 @@ def partition(
     height_m: float = 2.6,
     thickness_m: float = 0.12,
 ) -> list[Facet]:
-    """A straight wall with door openings; above an opening it goes on.
+    """A straight wall with door openings; above an opening the wall continues.
 
     Args:
         start: (2,) m.
         end: (2,) m.
         paint: of its faces.
-        openings: begin and end of each, metres from `start`, in order.
+        openings: start and end of each, metres from `start`, in order.
         height_m: of the ceiling.
         thickness_m: of the wall.
     """

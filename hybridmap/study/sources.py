@@ -1,4 +1,4 @@
-"""Turn a source into a frozen graph with a reference. Each kind of source is a class in `KINDS`."""
+"""Turn a source into a frozen graph with a reference. Each kind of source is a function in `KINDS`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class SourceTask:
 
     Attributes:
         key: digest of everything that determines the graph and its reference.
-        maker: makes the graph.
+        make: makes the graph, with ground truth if known, or raises a `HybridMapError`; it may be sent to another machine.
         first_nodes: keep only this many of its nodes.
     """
 
@@ -52,7 +52,12 @@ class SourceResult:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """An opened source of a study: files are read once."""
+    """An opened source of a study: files are read once.
+
+    Attributes:
+        task: the task for its graph at a setting and seed. Raises a ConfigError if the configuration of a drive is invalid.
+        by_chance: whether the graph depends on the seed at a setting.
+    """
 
     task: Callable[[SettingConfig, int], SourceTask]
     by_chance: Callable[[SettingConfig], bool]

@@ -1,4 +1,4 @@
-"""The spatial cells against physiology and against exact integration: what `hybridmap verify` runs."""
+"""The verification of the cells against physiology and exact integration, run by `hybridmap verify`."""
 
 from hybridmap.verification.rows import rows_of
 from hybridmap.verification.verification import CellVerification, Scale, verify_cells

@@ -1,4 +1,4 @@
-"""Drives of the verification: increments for the network, and the exact path that they make."""
+"""Drives of the verification: increments for the network, and the exact path."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def corridor(rng: np.random.Generator, hz: float, length_m: float = 16.8) -> Exa
 
 
 def raster(side_m: float, pitch_m: float, angle_rad: float, *, upright: bool = False) -> ExactDrive:
-    """Drive along the lines of a square arena around the origin, to and fro, one step a pixel.
+    """Drive back and forth along the lines of a square arena around the origin, one step per pixel.
 
     The first step leads to the corner. Pixel (i, j) of a map is at `pixel_order`; `upright` drives along y instead of x.
     """

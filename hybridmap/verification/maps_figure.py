@@ -1,4 +1,4 @@
-"""The maps of the verification's page: stripes, grid cells and place cells as a physiologist shows them."""
+"""Rate maps on the verification's page: stripes, grid cells and place cells."""
 
 from __future__ import annotations
 

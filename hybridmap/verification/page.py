@@ -1,4 +1,4 @@
-"""The verification's folder, `metrics.json` and one self-contained page, and the curves on the page."""
+"""The verification's output: `metrics.json` and one self-contained page with figures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TEMPLATE = "verify.html.j2"
 
 
 def write_verification(place: Held, head: dict[str, Any], rows: Sequence[Metric], result: CellVerification) -> Path:
-    """Write `metrics.json` and `verify.html` into a folder that is held as `VERIFICATION`; returns the page.
+    """Write `metrics.json` and `verify.html` into a folder that is locked as `VERIFICATION`; returns the page.
 
     Raises:
         OutputError: it cannot be written to.
@@ -38,7 +38,7 @@ def write_verification(place: Held, head: dict[str, Any], rows: Sequence[Metric]
 
 
 def _scale_of(result: CellVerification) -> dict[str, str]:
-    """Sizes and numbers of what the captions speak of."""
+    """Sizes and numbers for the captions."""
     lattice, place = result.lattice, result.place
     noisy = next(iter(result.noise.values()))
     return {
@@ -144,7 +144,7 @@ def module_figure(drives: Sequence[PathErrors], spacings_m: Any) -> str:
 
 
 def noise_figure(result: CellVerification) -> str:
-    """RMS position and heading error over distance for every noise, and where half of the drives are; a `data:` URI."""
+    """RMS position and heading error over distance for every noise, with quartiles over the drives; a `data:` URI."""
     with style.figure(style.PAGE_WIDTH_IN, 3.4) as picture:
         position, heading = picture.subplots(1, 2)
         for colour, (share, drives) in zip(_NOISE_COLOURS[1:], result.noise.items(), strict=False):
@@ -163,7 +163,7 @@ def noise_figure(result: CellVerification) -> str:
 
 
 def shadow_figure(overwriting: Overwriting) -> str:
-    """What the pose shows of a shift written into cells while the robot drives on; a `data:` URI."""
+    """Response of the pose to a shift of the cells' activity while the robot drives on; a `data:` URI."""
     names: dict[Cells, str] = {"both": "rings and sheets", "rings": "rings alone", "sheets": "sheets alone"}
     colours: dict[Cells, str] = {"both": "#000000", "rings": style.PRIMARY, "sheets": style.ODOMETRY}
     with style.figure(style.PAGE_WIDTH_IN, 2.8) as picture:

@@ -1,4 +1,4 @@
-"""The path integrator against exact integration of the same input, read from its activity only."""
+"""The path integrator against exact integration of the same input, decoded from its activity only."""
 
 from __future__ import annotations
 

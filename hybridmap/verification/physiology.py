@@ -1,4 +1,4 @@
-"""What physiologists measure on rate maps: gridness, stripes, single fields."""
+"""Measures of rate maps used in physiology: gridness, stripes, single fields."""
 
 from __future__ import annotations
 

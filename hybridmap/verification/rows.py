@@ -1,4 +1,4 @@
-"""The table of the verification: one figure a row, with its bar."""
+"""The table of the verification: one figure per row, with its bar."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _AT_MOST, _AT_LEAST = "at most", "at least"
 
 
 def rows_of(result: CellVerification) -> list[Metric]:
-    """Every row of the table, `verify/<row>`; those with a bar say whether they keep to it."""
+    """Every row of the table, `verify/<row>`; rows with a bar state whether they keep it."""
     parts: Sequence[Callable[[CellVerification], list[Metric]]] = (
         head_direction_rows,
         band_rows,
@@ -123,7 +123,7 @@ def position_rows(result: CellVerification) -> list[Metric]:
 
 
 def shadow_rows(result: CellVerification) -> list[Metric]:
-    """Whether an overwritten activity moves the pose by exactly that, and which cells hold the position."""
+    """Whether overwriting the activity moves the pose by exactly that shift, and which cells hold the position."""
     at_once = "spacings by which the pose misses a shift written into the sheets"
     on = f"the same with rings and sheets shifted together, largest over {STEPS_ON} steps of driving on"
     rows = [
@@ -154,7 +154,7 @@ def place_rows(result: CellVerification) -> list[Metric]:
 
 
 def recurrence_rows(result: CellVerification) -> list[Metric]:
-    """What settled recurrent competition on the attractor's sheet adds, whichever way it comes out."""
+    """The effect of settled recurrent competition on the attractor's sheet."""
     rows, place = [], result.place
     for learnt, cells in _LEARNT.items():
         for stage, how in (("input", "without competition"), ("settled", "after settled competition")):
@@ -168,7 +168,7 @@ def recurrence_rows(result: CellVerification) -> list[Metric]:
 
 
 def recurrence_verdict(place: PlaceResult) -> str:
-    """In words: what recurrence adds."""
+    """The effect of recurrence, in words."""
     sentences = []
     for learnt, cells in _LEARNT.items():
         before, after = (100.0 * place.sheet[learnt, stage].single for stage in ("input", "settled"))
@@ -199,7 +199,7 @@ def standstill_rows(result: CellVerification) -> list[Metric]:
 
 
 def noise_rows(result: CellVerification) -> list[Metric]:
-    """Where noisy neurons lead."""
+    """The effect of neuron noise."""
     rows = []
     for share, drives in result.noise.items():
         curve = noise_curve(drives)
@@ -236,6 +236,6 @@ def noise_curve(drives: Sequence[PathErrors], what: Literal["position_m", "headi
 
 
 def kernel_rows(result: CellVerification) -> list[Metric]:
-    """Whether the printed kernel's instability is noticed and named."""
+    """Whether the printed kernel's instability is detected and named."""
     named = float("do not settle" in result.printed_kernel)
     return [_row("printed_kernel_refused", named, "1", "the instability of the printed kernel is named", 1.0, _AT_LEAST)]

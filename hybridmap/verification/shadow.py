@@ -1,4 +1,4 @@
-"""Whether anything but activity holds the position: cells are overwritten, and the pose has to follow."""
+"""Test that activity alone holds the position: cells are overwritten, and the pose must follow."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _SHIFT_SPACINGS = 0.25
 
 @dataclass(frozen=True, slots=True)
 class Overwriting:
-    """What the pose shows of a shift that is written into cells.
+    """Response of the pose to a shift of the cells' activity.
 
     Attributes:
-        at_once: (draws,) by how much the pose misses a shift written into the sheets, before any step, in finest spacings.
-        shift_m: length of the shifts written for the drives that go on.
-        shown: share (STEPS_ON + 1,) of the shift that the pose shows after each step of driving on, against a network that is
-            left alone, the mean of some directions; by which cells are overwritten and whether stripes drive the sheets.
-        driving_on: largest miss of that shift where rings and sheets are overwritten together, in finest spacings.
+        at_once: (draws,) error of the pose's response to a shift of the sheets, before any step, in finest spacings.
+        shift_m: length of the shifts for the drives that go on.
+        shown: share (STEPS_ON + 1,) of the shift in the pose after each further step, relative to an unchanged network; mean
+            over some directions; by which cells are overwritten and whether stripes drive the sheets.
+        driving_on: largest error of the response if rings and sheets are overwritten together, in finest spacings.
     """
 
     at_once: Array
@@ -40,7 +40,7 @@ class Overwriting:
 
 
 def overwritten(seed: np.random.SeedSequence, settings: dict[str, object], draws: int, directions: int) -> Overwriting:
-    """Overwrite sheets, rings, or both with themselves shifted; look at once, and drive on."""
+    """Shift the activity of sheets, rings, or both; decode at once, and while driving on."""
     rng = np.random.default_rng(seed)
     config = NeuralConfig.model_validate(settings)
     at_once = _at_once(rng, config, draws)
@@ -92,7 +92,7 @@ def _positions_after(config: NeuralConfig, drive: ExactDrive, cells: Cells | Non
 
 
 def overwrite(integrator: PathIntegrator, cells: Cells, way_m: Array) -> None:
-    """Put cells where they would be had the robot been displaced by `way_m` (2,)."""
+    """Set cells to the activity of a robot displaced by `way_m` (2,)."""
     shift = integrator.bands.wave_vectors @ way_m
     if cells != "sheets":
         integrator.bands.activity = integrator.bands.rates_at(integrator.bands.phases() + shift)

@@ -27,16 +27,16 @@ RATES_HZ = (30.0, 100.0)
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """How much is run; the defaults are what the bars are stated for.
+    """Size of the experiments; the bars are stated for the defaults.
 
     Attributes:
         paths: drives through the room, each of `distance_m`, at each rate with each rectifier.
         heading_steps, still_steps, overwrites: numbers of steps and of draws.
         overwritten_drives: directions in which cells are shifted before driving on.
-        arena_m, lattice_pitch_m, lattice_cells: side and pixel of the grid cells' arena, sampled cells a module.
+        arena_m, lattice_pitch_m, lattice_cells: side and pixel of the grid cells' arena, sampled cells per module.
         place_pitch_m, place_cells, place_epochs: pixel of the place cells' maps; cells and passes of the printed rule.
         noise: standard deviations of the neuron noise; `noise_repeats` drives of `noise_distance_m` for each.
-        workers: processes; None: as many as there are cores.
+        workers: processes; None: one per core.
     """
 
     paths: int = 5
@@ -59,7 +59,7 @@ class Scale:
 
 @dataclass(frozen=True, slots=True)
 class CellVerification:
-    """What the experiments gave.
+    """Results of the experiments.
 
     Attributes:
         head_direction, standstill: the ring after many turns; standing still.
@@ -67,9 +67,9 @@ class CellVerification:
         place: place fields.
         room: errors of every drive through the room, by (rectifier, rate in Hz).
         corridor: errors down the corridor, by rectifier.
-        overwritten: what the pose shows of a shift written into cells, by rectifier.
+        overwritten: response of the pose to a shift of the cells' activity, by rectifier.
         noise: errors of every drive with neuron noise, by its standard deviation.
-        printed_kernel: what the cells say of the printed kernel; empty if they accept it.
+        printed_kernel: error message for the printed kernel; empty if it is stable.
     """
 
     head_direction: HeadDirectionResult
@@ -149,7 +149,7 @@ def _tasks(seed: np.random.SeedSequence, scale: Scale, settings: dict[str, objec
 
 
 def printed_kernel(settings: dict[str, object]) -> str:
-    """What the cells say of the printed kernel with these settings; empty if they accept it."""
+    """The error message for the printed kernel with these settings; empty if it is stable."""
     try:
         PathIntegrator(NeuralConfig.model_validate(settings | {"kernel": "printed"}))
     except ConfigError as error:

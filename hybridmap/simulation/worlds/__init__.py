@@ -1,4 +1,4 @@
-"""The worlds by name; each is built only when it is asked for."""
+"""The worlds by name; each is built on demand."""
 
 from __future__ import annotations
 

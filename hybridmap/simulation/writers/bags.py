@@ -135,7 +135,7 @@ def _record(
 
 
 def _messages(stream: Stream, make: MessageFactory, progress: Progress) -> Iterator[_Written]:
-    """Topic, stamp and message of every sample, the mounting first, the truth beside the odometry."""
+    """Topic, stamp and message of every sample: first the mounting, and the ground truth after each odometry."""
     truth, total = stream.groundtruth, stream.expected_observations
     camera, laser = (stream.rig.sensors.get(name) for name in ("camera", "laser"))
     true_pose = {} if truth is None else dict(zip(truth.stamps_ns.tolist(), truth.poses, strict=True))

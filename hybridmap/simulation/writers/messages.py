@@ -1,4 +1,4 @@
-"""Samples as ROS messages, of ROS 1 or ROS 2, and rotations as quaternions that read back to the same bits."""
+"""Samples as messages of ROS 1 or ROS 2, and rotations as quaternions that read back to the same bits."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Progress = Callable[[int, int | None], None]
 
 
 def silent(done: int, total: int | None) -> None:
-    """The progress of somebody who does not watch."""
+    """A progress callback that does nothing."""
 
 
 def _is_recording(folder: Path) -> bool:

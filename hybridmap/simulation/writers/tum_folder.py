@@ -1,4 +1,4 @@
-"""A folder in the TUM RGB-D format with the wheel odometry, the truth and the calibration beside the pictures."""
+"""Write a folder in the TUM RGB-D format, with wheel odometry, ground truth and calibration."""
 
 from __future__ import annotations
 
