@@ -98,6 +98,12 @@ def test_what_lies_below_or_above_a_setting_that_has_gone_says_so_too(key, value
         Config.load(None, {key: value})
 
 
+def test_a_key_that_is_there_twice_is_refused(tmp_path):
+    (tmp_path / "a.yaml").write_text("nodes:\n  distance_m: 1\nseed: 2\nnodes: {angle_deg: 5}\n")
+    with pytest.raises(ConfigError, match=r"^\S+a.yaml: .*line 4: .*'nodes'"):
+        Config.load(tmp_path / "a.yaml")
+
+
 def test_all_settings_that_have_gone_are_named_at_once():
     with pytest.raises(ConfigError, match=r"^\S+: 160 keys are no longer settings") as error:
         Config.load(BEFORE)

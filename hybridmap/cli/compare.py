@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -143,7 +144,7 @@ def _table(rows: Sequence[Row], judged: Sequence[Metric]) -> list[list[str]]:
     """Column titles, then one list of cells per row."""
     from hybridmap.report.page_tables import number
 
-    by_name = {metric.name: f"{metric.value:.4f}" for metric in judged}
+    by_name = {metric.name: f"{metric.value:.4f}" if isfinite(metric.value) else "–" for metric in judged}
     errors = {name: title for name, title in _ERRORS.items() if any(key.startswith(f"{name}/") for key in by_name)}
     columns = ["back-end", "way", "chi2", "unit variance", *errors.values(), "status", "iterations", "CPU (s)"]
     table = [[*columns, "rejected loops", "certificate"]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,18 @@ from hybridmap.config.gone import what_became_of
 from hybridmap.errors import ConfigError, HybridMapError
 
 _WORDS = {"tuple_type": "a list", "list_type": "a list", "dict_type": "keys with values", "model_type": "keys with values"}
+
+
+class _Strict(yaml.SafeLoader):
+    """The safe loader of YAML; it takes no key twice, of which the last would win unseen."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[Any] = set()
+        for key, _ in node.value:
+            if key.value in seen and isinstance(key, yaml.ScalarNode):
+                raise yaml.constructor.ConstructorError(None, None, f"the key {key.value!r} is there twice", key.start_mark)
+            seen |= {key.value} if isinstance(key, yaml.ScalarNode) else set()
+        return super().construct_mapping(node, deep=deep)
 
 
 class Section(BaseModel):
@@ -86,9 +99,9 @@ def mapping_of(text: str, origin: str, error: type[HybridMapError] = ConfigError
 
 
 def value_of(text: str, origin: str, error: type[HybridMapError] = ConfigError) -> Any:
-    """Read one YAML value."""
+    """Read one YAML value; a key that a mapping has twice is refused."""
     try:
-        return yaml.safe_load(text)
+        return yaml.load(text, Loader=_Strict)
     except yaml.YAMLError as mistake:
         mark = getattr(mistake, "problem_mark", None)
         line = f"line {mark.line + 1}: " if mark is not None else ""

@@ -230,6 +230,7 @@ class Edge:
             None for every other edge.
         broken_by: failed checks of whether the robot drove from the source to the target.
         contradicts_odometry: a good registration that replaces the odometry edge of the same nodes.
+        note: the reason in words, where an earlier version stored these alone; nothing else looks at it.
         since_node: number of the newest node when the edge got its present status (-1: let the map note it), so that a
             replay brings an edge that was committed late at the same moment.
         key: number within the front-end that proposed it (-1: none did): a later proposal of the same key replaces this one.
@@ -249,6 +250,7 @@ class Edge:
     kidnapped_m: float | None = field(default=None, kw_only=True)
     broken_by: tuple[Check, ...] = field(default=(), kw_only=True)
     contradicts_odometry: bool = field(default=False, kw_only=True)
+    note: str = field(default="", kw_only=True)
     since_node: int = field(default=-1, kw_only=True)
     key: int = field(default=-1, kw_only=True, compare=False)
 
@@ -279,6 +281,8 @@ class Edge:
     @property
     def reason(self) -> str:
         """Reason of its status, in words."""
+        if self.note:
+            return self.note
         words = [] if self.lack is None else [self.lack.words]
         words += [check.miss for check in self.failed]
         if self.method is not None and not words:

@@ -124,7 +124,7 @@ def _facts(scene: SessionScene, edge: Edge) -> tuple[tuple[str, str], ...]:
         sigma = np.sqrt(np.diag(edge.relative.covariance))
         rows += [
             ("measured", f"({x:.3f}, {y:.3f}) m, {np.degrees(yaw):.2f}°"),
-            ("standard deviation", f"({sigma[0]:.3f}, {sigma[1]:.3f}) m, {np.degrees(sigma[2]):.2f}°"),
+            ("standard deviation of the edge", f"({sigma[0]:.3f}, {sigma[1]:.3f}) m, {np.degrees(sigma[2]):.2f}°"),
         ]
         drift = between(edge.relative.delta, between(nodes[edge.source].pose_odom, nodes[edge.target].pose_odom))
         rows.append((f"{ODOMETRY} disagrees by", f"{np.hypot(drift[0], drift[1]):.3f} m, {np.degrees(abs(drift[2])):.2f}°"))
@@ -221,7 +221,7 @@ _WORDS: dict[str, tuple[str, str]] = {
     "depth_residual_m": ("distance of the surfaces there (RMS)", "m"),
     "overlap": ("share of the depth in common view", ""),
     "points": ("points of depth in common view", ""),
-    "slack_m": ("standard deviation in the loosest direction", "m"),
+    "slack_m": ("standard deviation of the depth alone, in its loosest direction", "m"),
     "start": ("score of the coarse search (1 is best)", ""),
     "near": ("near: share of points with a partner", ""),
     "fit": ("fit: share of these that lie close", ""),
@@ -229,7 +229,7 @@ _WORDS: dict[str, tuple[str, str]] = {
     "gate_sigma_m": ("standard deviation of the expected position", "m"),
     "off_m": ("off the expected position by", "m"),
     "off_deg": ("off the expected heading by", "deg"),
-    "loosest_m": ("standard deviation in the loosest direction", "m"),
+    "loosest_m": ("standard deviation of the registration alone, in its loosest direction", "m"),
     "ambiguity": ("ambiguity: likelihood left when slid that way", ""),
     "violation": ("share of points seen through", ""),
     "inliers": ("share of all points that lie close", ""),

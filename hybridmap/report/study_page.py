@@ -159,10 +159,10 @@ def _tiles(study: Study) -> list[tuple[str, str]]:
         (len(config.sources), "source(s)"),
         (len(config.settings), "setting(s)"),
         (len(config.backends), "back-end(s)"),
-        (len({(cell.kind, cell.rate) for cell in study.grid.cells}), "mix(es) of false loops"),
-        (len({cell.seed for cell in study.grid.cells}), "seed(s)"),
+        (len({(cell.kind, cell.rate) for cell in study.grid.cells if cell.kind}), "mix(es) of false loops"),
+        (len({cell.seed for cell in study.grid.cells} - {None}), "seed(s)"),
     ]
-    return [(str(count), re.sub(r"\((\w+)\)", "" if count == 1 else r"\1", label)) for count, label in counts]
+    return [(str(count), re.sub(r"\((\w+)\)", "" if count == 1 else r"\1", label)) for count, label in counts if count]
 
 
 def _reference(study: Study) -> bool:

@@ -229,7 +229,7 @@ class MapStore:
             relative = None
             if row[9] is not None:
                 relative = RelativePose(np.array(row[6:9]), schema.unpack_floats(row[9], 3))
-            kind, status, record = EdgeKind[row[3].upper()], Status(row[4]), schema.record_from_json(row[10], version)
+            kind, status, record = EdgeKind[row[3].upper()], Status(row[4]), schema.record_from_json(row[10], row[5], version)
             experiences.add_edge(Edge(row[1], row[2], kind, status, relative, since_node=row[11], **record))
         return experiences
 

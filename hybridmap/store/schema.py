@@ -226,12 +226,12 @@ def record_to_json(edge: Edge) -> str:
     return json.dumps({name: value for name, value in fields.items() if value})
 
 
-def record_from_json(text: str, version: int = VERSION) -> dict[str, Any]:
-    """The fields of an edge that `record_to_json` wrote; a file before version 3 has figures alone."""
+def record_from_json(text: str, reason: str, version: int = VERSION) -> dict[str, Any]:
+    """The fields of an edge that `record_to_json` wrote; a file before version 3 has figures alone, and the reason in words."""
     fields: dict[str, Any] = json.loads(text)
     if version < 3:
         kidnapped_m = fields.pop("carried_m", None)
-        return {"figures": fields, "kidnapped_m": kidnapped_m}
+        return {"figures": fields, "kidnapped_m": kidnapped_m, "note": reason}
     fields["kidnapped_m"] = fields.pop("carried_m", None)
     for name in ("checks", "broken_by"):
         fields[name] = tuple(Check(figure, value, Need(needs), *limit) for figure, value, needs, *limit in fields.get(name, ()))

@@ -223,3 +223,17 @@ def test_a_map_of_the_version_before_has_no_anchors(tmp_path):
     connection.close()
     with MapStore.open(tmp_path) as store:
         assert len(store.track().anchors) == 0
+
+
+def test_a_map_of_a_version_before_keeps_the_reasons_that_it_stored(tmp_path):
+    write_session(tmp_path / "s", ring_map())
+    with sqlite3.connect(tmp_path / "s" / "map.db") as connection:
+        connection.execute("ALTER TABLE edges RENAME COLUMN record TO scores")
+        connection.execute("UPDATE edges SET reason = 'overlap 0.21 < 0.30', scores = '{\"overlap\": 0.21}'")
+        connection.execute("PRAGMA user_version = 2")
+    connection.close()
+    with MapStore.open(tmp_path / "s") as store:
+        edge = store.map().edges[-1]
+    assert edge.reason == "overlap 0.21 < 0.30"
+    assert edge.figures == {"overlap": 0.21}
+    assert edge.checks == ()
