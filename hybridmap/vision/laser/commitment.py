@@ -72,7 +72,7 @@ class Cluster:
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class AcceptedCluster:
     """A cluster that is accepted, and the checks that it passed."""
 
     cluster: Cluster
@@ -126,8 +126,8 @@ class Commitment:
 
     def _commit_all(self, belief: Belief, span_per_efold_m: float) -> list[Settled]:
         out: list[Settled] = []
-        while (chosen := self._choose(belief, span_per_efold_m)) is not None:
-            out += self._commit(chosen)
+        while (best := self._best_cluster(belief, span_per_efold_m)) is not None:
+            out += self._commit(best)
         return out
 
     def _keep(self, positions: list[int]) -> None:
@@ -135,7 +135,7 @@ class Commitment:
         self._consistent = self._consistent[np.ix_(known, known)]
         self._queue = [self._queue[p] for p in positions]
 
-    def _choose(self, belief: Belief, span_per_efold_m: float) -> Chosen | None:
+    def _best_cluster(self, belief: Belief, span_per_efold_m: float) -> AcceptedCluster | None:
         hypotheses = (w.hypothesis for w in self._queue)
         loops = Loops.measured([(h.probe, h.anchor, h.relative) for h in hypotheses])
         self._consistent = agreement(loops, belief.ways, known=self._consistent)
@@ -145,7 +145,7 @@ class Commitment:
         best = clusters[0]
         rival = max((c.score for c in clusters[1:] if self._rivals(best, c)), default=0.0)
         asked = self._asked(best, rival, span_per_efold_m)
-        return Chosen(best, asked) if passed(asked) else None
+        return AcceptedCluster(best, asked) if passed(asked) else None
 
     def _asked(self, cluster: Cluster, rival: float, span_per_efold_m: float) -> tuple[Check, ...]:
         """Checks of a cluster; `rival`: score of the best one that contradicts it."""
@@ -154,7 +154,7 @@ class Commitment:
         span_m = SPAN_M + span_per_efold_m * wider
         return checks.of_cluster(cluster.probes, probes, cluster.span_m, span_m, rival / max(cluster.score, 1e-9))
 
-    def _commit(self, chosen: Chosen) -> list[Settled]:
+    def _commit(self, chosen: AcceptedCluster) -> list[Settled]:
         """Accept all that agree with every member; reject those that contradict most of them."""
         members = list(chosen.cluster.members)
         agrees = self._consistent[:, members].mean(axis=1)
