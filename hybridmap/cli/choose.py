@@ -17,7 +17,7 @@ from hybridmap.streams.sensors import carried
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class OpenedSource:
     """A stream and the configuration to map it with."""
 
     stream: Stream
@@ -46,7 +46,7 @@ def choose(
     *,
     start_s: float | None = None,
     end_s: float | None = None,
-) -> Chosen:
+) -> OpenedSource:
     """Open a source and load its configuration.
 
     Without a configuration name, a simulated world uses its own configuration, and a recording that of the first sensor found.
@@ -59,13 +59,13 @@ def choose(
         config_name = world_of(source)
     if config_name is not None:
         config = Config.load(config_name, overrides)
-        return Chosen(open_stream(source, config, start_s=start_s, end_s=end_s), config)
+        return OpenedSource(open_stream(source, config, start_s=start_s, end_s=end_s), config)
     default = Config.load(None, overrides)
     stream = open_stream(source, default, start_s=start_s, end_s=end_s)
     config = _config_for(stream.rig, overrides)
     if config.sensors != default.sensors:
         stream = open_stream(source, config, start_s=start_s, end_s=end_s)
-    return Chosen(stream, config)
+    return OpenedSource(stream, config)
 
 
 def _config_for(rig: Rig, overrides: Mapping[str, Any]) -> Config:

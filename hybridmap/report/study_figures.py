@@ -11,7 +11,7 @@ import numpy as np
 
 from hybridmap.report import style
 from hybridmap.study.cell import CellResult
-from hybridmap.study.grid import Cell
+from hybridmap.study.cells import Cell
 from hybridmap.study.model import quoted
 from hybridmap.study.statistics import Summary
 from hybridmap.study.study import Study

@@ -17,8 +17,8 @@ from hybridmap.report.page_tables import rendered
 from hybridmap.report.study_figures import FLOOR_M, MOST_PANELS
 from hybridmap.study.bars import Verdict
 from hybridmap.study.cell import CellResult
+from hybridmap.study.cells import Cell
 from hybridmap.study.folder import PAGE
-from hybridmap.study.grid import Cell
 from hybridmap.study.measures import TIMINGS, measures_of
 from hybridmap.study.model import quoted
 from hybridmap.study.statistics import LEAST, Interval, Summary

@@ -135,7 +135,7 @@ _EVERY = 15
 
 
 @dataclass(frozen=True, slots=True)
-class CarriedDrive:
+class KidnappedDrive:
     """A drive with a kidnapping.
 
     Attributes:
@@ -152,7 +152,7 @@ class CarriedDrive:
     felt: Array
 
 
-def carry(drive: Array, distance_m: float, step_s: float) -> CarriedDrive:
+def carry(drive: Array, distance_m: float, step_s: float) -> KidnappedDrive:
     """Kidnap the robot: cut a piece out of a drive, from the pick-up to a later place that was visited before.
 
     The robot is picked up after the middle of the drive, at the first step with a visited place at this distance, farther
@@ -197,14 +197,14 @@ def _seen_before(drive: Array, step: int, middle: int) -> bool:
     return bool(np.any(near & (np.abs(wrap_angle(earlier[:, 2] - drive[step, 2])) <= _KNOWN_RAD)))
 
 
-def _cut(drive: Array, start: int, end: int, step_s: float) -> CarriedDrive:
+def _cut(drive: Array, start: int, end: int, step_s: float) -> KidnappedDrive:
     distance_m = float(np.hypot(*(drive[end, :2] - drive[start, :2])))
     steps = max(2, round(distance_m / _WALK_M_S / step_s))
     on_the_way = np.array([interpolate(drive[start], drive[end], at / steps) for at in range(1, steps)])
     truth = np.concatenate([drive[: start + 1], on_the_way, drive[end:]])
     after = compose(drive[start], between(drive[end], drive[end:]))
     felt = np.concatenate([drive[: start + 1], np.repeat(drive[start][None], steps - 1, axis=0), after])
-    return CarriedDrive(start, start + steps, distance_m, truth, felt)
+    return KidnappedDrive(start, start + steps, distance_m, truth, felt)
 
 
 TRANSLATION_M_PER_SQRT_M = 0.006

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hybridmap.config.inputs import SimulationConfig
 from hybridmap.errors import ConfigError
 from hybridmap.geometry import Array
-from hybridmap.simulation.motion import CarriedDrive, DriveLimits, as_transmitted, carry, drive, wheel_odometry
+from hybridmap.simulation.motion import DriveLimits, KidnappedDrive, as_transmitted, carry, drive, wheel_odometry
 from hybridmap.simulation.surfaces import World
 from hybridmap.simulation.worlds import build_world
 from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion, StreamReport
@@ -91,7 +91,7 @@ class SimulatedStream:
         return self._odometry
 
     @property
-    def carry(self) -> CarriedDrive | None:
+    def carry(self) -> KidnappedDrive | None:
         """The drive with its kidnapping; None without one."""
         return self._carry
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from hybridmap.backends.base import ODOMETRY
 from hybridmap.study.cell import CellResult
-from hybridmap.study.grid import Cell, Grid, Group
+from hybridmap.study.cells import Cell, Grid, Group
 from hybridmap.study.measures import unit_of
 from hybridmap.study.model import BarConfig
 

@@ -39,7 +39,7 @@ _KNOWN_M, _KNOWN_RAD = 1.0, math.radians(45.0)  # so close to where it was befor
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class MappedDrive:
     """A drive to be mapped; a worker needs the recording at the same path.
 
     Attributes:

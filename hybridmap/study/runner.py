@@ -10,8 +10,8 @@ from hybridmap.errors import StudyError
 from hybridmap.study import cell as cells
 from hybridmap.study import provenance, sources
 from hybridmap.study.cell import CellResult
+from hybridmap.study.cells import Grid
 from hybridmap.study.folder import StudyFolder
-from hybridmap.study.grid import Grid
 from hybridmap.study.pools import Lost, Pool
 from hybridmap.study.sources import SourceTask
 

@@ -20,7 +20,7 @@ from hybridmap.graph.io import read_graph
 from hybridmap.graph.paths import chain
 from hybridmap.graph.pose_graph import PoseGraph, prefix
 from hybridmap.study import disturb, provenance
-from hybridmap.study.drive import Drive, truth_at
+from hybridmap.study.drive import MappedDrive, truth_at
 from hybridmap.study.frozen import Frozen
 from hybridmap.study.model import SettingConfig, SourceConfig, SyntheticConfig
 
@@ -106,7 +106,7 @@ def _drive(source: SourceConfig, maps: bool) -> Source:
         if not maps:  # the other back-ends leave no trace in a graph
             backends = config.backends.model_copy(update={"names": config.backends.names[:1]})
             config = config.model_copy(update={"backends": backends})
-        drive = Drive(
+        drive = MappedDrive(
             source=str(source.recording or source.simulated),
             config=config.model_dump(mode="json"),
             start_s=source.start_s,

@@ -11,7 +11,7 @@ import numpy as np
 
 from hybridmap.geometry import Array
 from hybridmap.study.cell import CellResult
-from hybridmap.study.grid import Cell, Grid
+from hybridmap.study.cells import Cell, Grid
 from hybridmap.study.measures import measures_of, unit_of
 from hybridmap.study.model import StatisticsConfig, StudyConfig
 

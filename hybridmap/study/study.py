@@ -13,8 +13,8 @@ from hybridmap.output import held, write_text
 from hybridmap.study import bars, provenance, tables
 from hybridmap.study.bars import Verdict
 from hybridmap.study.cell import CellResult
+from hybridmap.study.cells import Cell, Grid, lay_out
 from hybridmap.study.folder import BARS_CSV, CELLS_CSV, METRICS, STUDY, STUDY_FOLDER, SUMMARY_CSV, TIMINGS_CSV, StudyFolder
-from hybridmap.study.grid import Cell, Grid, lay_out
 from hybridmap.study.measures import measures_of
 from hybridmap.study.model import StudyConfig, quoted
 from hybridmap.study.pools import Pool

@@ -10,7 +10,7 @@ from typing import Any
 
 from hybridmap.study.bars import Verdict
 from hybridmap.study.cell import CellResult
-from hybridmap.study.grid import Cell
+from hybridmap.study.cells import Cell
 from hybridmap.study.measures import TIMINGS
 from hybridmap.study.statistics import Summary
 

@@ -9,8 +9,8 @@ from hybridmap.output import held
 from hybridmap.report import study_figures, style
 from hybridmap.report.study_page import groups_of, write_study_page
 from hybridmap.study.cell import CellResult
+from hybridmap.study.cells import Cell, lay_out
 from hybridmap.study.folder import STUDY_FOLDER, StudyFolder
-from hybridmap.study.grid import Cell, lay_out
 from hybridmap.study.pools import ThisProcess
 from hybridmap.study.study import Study, run_study
 from tests.study.studies import TREE, small

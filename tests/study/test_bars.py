@@ -8,7 +8,7 @@ import pytest
 
 from hybridmap.study import bars
 from hybridmap.study.cell import CellResult
-from hybridmap.study.grid import lay_out
+from hybridmap.study.cells import lay_out
 from hybridmap.study.tables import bars_csv
 from tests.study.studies import small
 

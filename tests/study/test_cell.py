@@ -11,10 +11,10 @@ from hybridmap.errors import BackendError
 from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.study import cell as cells
-from hybridmap.study.drive import Drive
+from hybridmap.study.cells import lay_out
+from hybridmap.study.drive import MappedDrive
 from hybridmap.study.false_loops import with_drift, with_false_loops
 from hybridmap.study.frozen import Frozen
-from hybridmap.study.grid import lay_out
 from hybridmap.study.model import DriftConfig, SyntheticConfig
 from hybridmap.study.sources import SourceTask, laps, prepare
 from tests.narrowing import known
@@ -148,7 +148,7 @@ def test_without_truth_the_reference_is_the_clean_optimum(frozen):
 
 
 def test_a_source_that_cannot_be_had_is_a_status_of_its_cells():
-    result = prepare(SourceTask("key", Drive("lab", {"nodes": {"distance_m": -1.0}}).make))
+    result = prepare(SourceTask("key", MappedDrive("lab", {"nodes": {"distance_m": -1.0}}).make))
     failed = Frozen.unpack(result.frozen)
     assert failed.graph is None
     found = figures_of(failed, backends=["gtsam-lm"])["gtsam-lm", "random"]

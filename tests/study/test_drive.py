@@ -14,8 +14,8 @@ from hybridmap.evaluate.session_errors import evaluate_session
 from hybridmap.geometry import between
 from hybridmap.simulation.writers import write_rosbag2
 from hybridmap.streams import open_stream
+from hybridmap.study.cells import lay_out
 from hybridmap.study.folder import BARS_CSV, TIMINGS_CSV
-from hybridmap.study.grid import lay_out
 from hybridmap.study.model import StudyConfig
 from hybridmap.study.pools import ThisProcess
 from hybridmap.study.study import run_study

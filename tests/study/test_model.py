@@ -7,7 +7,7 @@ import pytest
 from hybridmap.config import Config
 from hybridmap.errors import ConfigError
 from hybridmap.study import StudyConfig, named_studies
-from hybridmap.study.grid import lay_out
+from hybridmap.study.cells import lay_out
 from hybridmap.study.model import DRIVES, backend_settings
 from tests.study.studies import TREE, small
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from hybridmap.study.cell import CellResult
-from hybridmap.study.grid import lay_out
+from hybridmap.study.cells import lay_out
 from hybridmap.study.model import StatisticsConfig
 from hybridmap.study.statistics import mean_of, summarise
 from tests.narrowing import known

@@ -9,8 +9,8 @@ import pytest
 from hybridmap.errors import GraphError
 from hybridmap.graph.io import write_g2o
 from hybridmap.study import provenance
+from hybridmap.study.cells import lay_out
 from hybridmap.study.false_loops import inject
-from hybridmap.study.grid import lay_out
 from hybridmap.study.model import SyntheticConfig
 from hybridmap.study.sources import laps
 from tests.narrowing import known
