@@ -35,7 +35,7 @@ class Table(Generic[T]):
             HybridMapError: the name is taken.
         """
         if name in self.names():
-            raise self._error(f"{self._what} {name!r}: there is one of this name already; choose another name")
+            raise self._error(f"{self._what} {name!r}: the name is taken; choose another name")
         self._registered[name] = factory
 
     def names(self) -> tuple[str, ...]:

@@ -34,7 +34,7 @@ def test_a_file_extends_another_beside_it_or_by_name(tmp_path):
 def test_extending_in_a_circle_is_refused(tmp_path):
     (tmp_path / "a.yaml").write_text("extends: b.yaml\n")
     (tmp_path / "b.yaml").write_text("extends: a.yaml\n")
-    with pytest.raises(ConfigError, match="leads back"):
+    with pytest.raises(ConfigError, match="forms a cycle"):
         Config.load(tmp_path / "a.yaml")
 
 

@@ -121,7 +121,7 @@ def verdict(estimate: Estimate, in_use: Gains) -> str:
             f"the delay differs from the one in use by {estimate.delay_s:.3g} s, more than {SIGNIFICANT_SIGMAS:g} sigma"
         )
     said += [
-        f"the drive does not tell the {name.replace('_', ' ')}: the one in use is kept"
+        f"the drive does not determine the {name.replace('_', ' ')}: the one in use is kept"
         for name, told in zip([*names, "delay"], estimate.measured, strict=True)
         if not told
     ]

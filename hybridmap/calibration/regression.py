@@ -226,13 +226,13 @@ def _require_found(values: Array, last_step: Array, sigmas: Array) -> None:
     vague = [name for name, sigma in zip(_HEADING, sigmas, strict=False) if not sigma <= MAX_SIGMA]
     if vague:
         raise NotToldError(
-            f"calibration: the drive does not tell the {' and the '.join(vague)}: found a standard deviation of "
+            f"calibration: the drive does not determine the {' and the '.join(vague)}: found a standard deviation of "
             f"{np.max(sigmas):.2g}, expected at most {MAX_SIGMA:.2g}; give a longer drive, one that turns"
         )
     require_delay(float(values[2]))
     if np.any(np.abs(last_step) > sigmas + 1e-9):
         raise EvaluationError(
-            f"calibration: the fit did not come to rest in {_ROUNDS} rounds; are odometry and poses of one recording?"
+            f"calibration: the fit did not converge in {_ROUNDS} rounds; are odometry and poses of one recording?"
         )
 
 

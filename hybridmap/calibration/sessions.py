@@ -158,7 +158,7 @@ def require_one_calibration(drives: Sequence[Drive]) -> None:
     for second, drive in enumerate(drives):
         for other in drives[:second]:
             if _same_recording(drive.motion, other.motion):
-                raise EvaluationError(f"{drive.name}: the same drive as {other.name}; it would count twice, give it once")
+                raise EvaluationError(f"{drive.name}: the same drive as {other.name}; give each drive once")
             for key, value in _in_use(other.config).items():
                 found = _in_use(drive.config)[key]
                 if found != value:
@@ -211,7 +211,7 @@ def require_closures(drive: Drive) -> None:
     """
     if not np.any(drive.graph.kinds != EdgeKind.ODOMETRY):
         raise EvaluationError(
-            f"{drive.name}: its map holds odometry alone, nothing that would contradict it; give --reference GT.tum, "
+            f"{drive.name}: its map holds odometry edges only; a calibration needs others: give --reference GT.tum, "
             f"or a session with loop closures"
         )
 

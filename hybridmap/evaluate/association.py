@@ -45,7 +45,7 @@ def associate(estimate: Trajectory, reference: Trajectory, max_gap_s: float = MA
     if np.count_nonzero(known) < 3:
         raise EvaluationError(
             f"estimate ({_span(estimate)}) and reference ({_span(reference)}) have {np.count_nonzero(known)} stamps in "
-            f"common, expected at least 3; are they of the same recording and on the same clock?"
+            f"common, expected at least 3; are both of the same recording and on the same clock?"
         )
     stamps = estimate.stamps_ns[known]
     return PosePairs(stamps, estimate.poses[known], reference.at(stamps), len(estimate))

@@ -181,7 +181,7 @@ def carry(drive: Array, distance_m: float, step_s: float) -> KidnappedDrive:
             break
     if best is None:
         raise ConfigError(
-            "simulation.carried_m: this drive comes to no place twice, so that there is no known place to carry to"
+            "simulation.carried_m: this drive visits no place twice, so the robot cannot be kidnapped to a visited place"
         )
     return _cut(drive, *best, step_s)
 

@@ -101,7 +101,7 @@ def _check(study: StudyConfig, origin: str) -> None:
     for key, titles in lists.items():
         twice = next((title for title in titles if titles.count(title) > 1), None)
         if twice is not None:
-            raise ConfigError(f"{origin}: {key}: {twice!r} is there twice; give each its own name")
+            raise ConfigError(f"{origin}: {key}: {twice!r} is given twice; give each a name of its own")
     for variant in study.backends:
         _check_backend(variant, f"{origin}: backends")
     for source in study.sources:
@@ -109,7 +109,9 @@ def _check(study: StudyConfig, origin: str) -> None:
     for setting in study.settings:
         _check_setting(setting, study, f"{origin}: settings: {setting.name}")
     if study.maps and any(study.false_loops.rates):
-        raise ConfigError(f"{origin}: false_loops: a drive as it was mapped takes none; use other back-ends or no false loops")
+        raise ConfigError(
+            f"{origin}: false_loops: they cannot be added to a drive; give back-ends that solve the graph, or none"
+        )
     for bar in study.bars:
         _check_bar(bar, lists, f"{origin}: bars: {bar.figure}")
 
@@ -130,7 +132,7 @@ def _check_source(source: SourceConfig, study: StudyConfig, origin: str) -> None
         if source.kind not in kinds and any(getattr(source, key) for key in keys):
             raise ConfigError(f"{origin}: {source.title}: {', '.join(keys)} are for {' and '.join(kinds)} only")
     if source.kind not in DRIVES and study.maps:
-        raise ConfigError(f"{origin}: {source.title}: is a graph already; name the back-ends that are to solve it")
+        raise ConfigError(f"{origin}: {source.title}: is a graph; give the back-ends that solve it")
     acting = next((setting.name for setting in study.settings if setting.overrides or setting.disturb), None)
     if source.kind not in DRIVES and acting is not None:
         raise ConfigError(

@@ -46,8 +46,8 @@ def test_a_gain_that_was_not_measured_stays_and_is_said():
     estimate = estimate_of(Gains(1.0, 0.9, 0.0), sigmas=[math.inf, 0.01, 0.002, math.inf])
     tree = {"neural": dict(zip(("gain", "turn_gain", "heading_bias_rad_m"), in_use.to_array().tolist(), strict=True))}
     assert Gains.of(written(tree, estimate, in_use).neural) == Gains(1.05, 0.9, 0.0)
-    assert "the drive does not tell the gain: the one in use is kept" in verdict(estimate, in_use)
-    assert "the drive does not tell the delay: the one in use is kept" in verdict(estimate, in_use)
+    assert "the drive does not determine the gain: the one in use is kept" in verdict(estimate, in_use)
+    assert "the drive does not determine the delay: the one in use is kept" in verdict(estimate, in_use)
     figures = {row.name: row.value for row in metrics_of(estimate, in_use)}
     assert all(
         math.isnan(figures[f"{name}/calibration"]) for name in ("gain", "gain_sigma", "gain_off", "delay", "delay_sigma")

@@ -62,7 +62,7 @@ def test_a_map_of_odometry_alone_is_refused(tmp_path):
     one = drive(np.random.default_rng(0), laps=1)
     one = type(one)(one.truth[:200], type(one.motion)(one.motion.stamps_ns[:200], one.motion.steps[:199]))
     read = read_drive(write_session(tmp_path / "s", one, np.random.default_rng(0), registered=False))
-    with pytest.raises(EvaluationError, match="holds odometry alone"):
+    with pytest.raises(EvaluationError, match="holds odometry edges only"):
         estimate_of([read], [], "alternating")
 
 
@@ -79,7 +79,7 @@ def test_a_drive_given_twice_is_refused_even_as_a_copy_or_under_other_gains(one,
     part = type(one)(one.truth[:801], type(one.motion)(one.motion.stamps_ns[:801], one.motion.steps[:800]))
     beginning = read_drive(write_session(tmp_path / "part", part, np.random.default_rng(0), gains=Gains(1.1, 1.0, 0.0)))
     for second in (read[0], read[1], beginning):
-        with pytest.raises(EvaluationError, match=r"the same drive as .*/a; it would count twice"):
+        with pytest.raises(EvaluationError, match=r"the same drive as .*/a; give each drive once"):
             estimate_of([read[0], second])
 
 

@@ -117,7 +117,7 @@ def test_two_configurations_have_no_common_one_to_write(monkeypatch, capsys, ses
         (("calibrate", "nowhere"), "no such session folder"),
         (("calibrate", "SESSION", "--estimator", "magic"), "unknown estimator 'magic'; there are alternating, joint"),
         (("calibrate", "SESSION", "SESSION", "--estimator", "joint"), "the joint estimator takes one session, found 2"),
-        (("calibrate", "SESSION", "SESSION"), "it would count twice, give it once"),
+        (("calibrate", "SESSION", "SESSION"), "give each drive once"),
         (("calibrate", "SESSION", "--reference", "x.tum", "--estimator", "magic"), "unknown estimator 'magic'"),
         (("calibrate", "SESSION", "--reference", "x.tum", "--estimator", "joint"), "is for sessions without a reference"),
         (("calibrate", "SESSION", "--estimator", "joint", "--leg", "4"), "the joint estimator takes legs of its own"),
