@@ -43,9 +43,12 @@ def calibrate(
     from hybridmap.cli.show import emit
     from hybridmap.odometry_model import Gains
     from hybridmap.output import staged, write_text
+    from hybridmap.store import SessionFolder
     from hybridmap.trajectory import read_tum
 
     require_options(len(folders), len(reference or []), estimator, leg)
+    for folder in folders if out is not None else ():
+        SessionFolder(folder).require_foreign(out)
     with nullcontext() if out is None else staged(out, overwrite=overwrite) as work:
         drives = [read_drive(folder) for folder in folders]
         truths = [read_tum(path) for path in reference or []]

@@ -33,9 +33,12 @@ def optimize(
     from hybridmap.cli.show import emit
     from hybridmap.graph.io import held, write_g2o
     from hybridmap.output import staged
+    from hybridmap.store import SessionFolder
 
     source = open_graph(graph)
     chosen = create(backend, settings_of(source, config, setting))
+    if source.is_session and out is not None:
+        SessionFolder(graph).require_foreign(out)
     with nullcontext() if out is None else staged(out, overwrite=overwrite) as work:
         solution = chosen.solve(source.graph)
         report = solution.report

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import deepcopy
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any, Self
@@ -90,6 +91,16 @@ class Config(Section):
     def to_yaml(self) -> str:
         """The resolved configuration as YAML that `load` reads back to an equal one."""
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+
+
+@cache
+def is_allowed(key: str, value: float) -> bool:
+    """Whether a setting, the others at their defaults, may have a value; a key that is no setting may have none."""
+    try:
+        Config.load(None, {key: value})
+    except ConfigError:
+        return False
+    return True
 
 
 def named_configs() -> dict[str, Path]:

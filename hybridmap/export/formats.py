@@ -150,6 +150,7 @@ def export_session(
     chosen = FORMATS[format_name]
     targets = _targets(out, chosen)
     for target in targets:
+        SessionFolder(folder).require_foreign(target)
         if chosen.by_suffix and target.suffix != chosen.suffix:
             raise ExportError(f"{target}: Open3D reads a {format_name} by its suffix; name a file that ends in {chosen.suffix}")
     module, function = chosen.writer.split(":")

@@ -9,8 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
+from math import ceil, floor, inf, isfinite, nextafter
 from typing import Any, Self
 
+from hybridmap.config.root import is_allowed
 from hybridmap.geometry import RelativePose
 
 
@@ -176,15 +178,24 @@ class Check:
     def otherwise(self) -> str:
         """What would have had to be different for the other outcome."""
         least = self.needs is Need.AT_LEAST
+        setting = self.setting if self._can_move_the_limit else None
         if self.passed:
             change = "above" if least else "below"
-            return f"refused with {self.setting or 'a limit'} {change} {self.value:.4g} (now {self.limit:.4g})"
+            return f"refused with {setting or 'a limit'} {change} {self.value:.4g} (now {self.limit:.4g})"
         wanted = f"{self.figure} {'>=' if least else '<='} {self.limit:.4g} instead of {self.value:.4g}"
-        return (
-            wanted
-            if self.setting is None
-            else f"{wanted}, or {self.setting} {'at most' if least else 'at least'} {self.value:.4g}"
-        )
+        return wanted if setting is None else f"{wanted}, or {setting} {'at most' if least else 'at least'} {self.value:.4g}"
+
+    @property
+    def _can_move_the_limit(self) -> bool:
+        """Whether the setting may be such that the outcome is the other one."""
+        if self.setting is None or not isfinite(self.value):
+            return False
+        up = self.passed == (self.needs is Need.AT_LEAST)
+        whole, near = (ceil(self.value), inf) if up else (floor(self.value), -inf)
+        moved = (self.value, whole)
+        if self.passed:  # then the limit must lie beyond the value
+            moved = (nextafter(self.value, near), floor(self.value) + 1 if up else ceil(self.value) - 1)
+        return any(is_allowed(self.setting, value) for value in moved)
 
 
 def at_least(figure: str, value: float, limit: float, setting: str | None = None) -> Check:
@@ -300,7 +311,8 @@ class Edge:
     @property
     def otherwise(self) -> str:
         """What would have changed its status; empty if unknown."""
-        if self.lack is not None:
-            return self.lack.needed
-        asked = self.failed or sorted(self.checks, key=lambda check: check.slack)
-        return asked[0].otherwise if asked else ""
+        needed = [] if self.lack is None else [self.lack.needed]
+        needed += [check.otherwise for check in self.failed]
+        if needed or not self.checks:
+            return "; and ".join(needed)
+        return min(self.checks, key=lambda check: check.slack).otherwise

@@ -104,10 +104,12 @@ class SessionFolder:
         """Check that there is a session, and warn where its run did not end.
 
         Raises:
-            StoreError: the folder is missing or holds no map.
+            StoreError: the folder is missing or holds no map, or the map is damaged.
         """
         self.require_map()
-        if not _ended(self.path):
+        with MapStore.open(self.path) as store:
+            ended = store.ended
+        if not ended:
             log.warning("%s: %s", self.path, self._why_unended())
 
     def require_map(self) -> None:
@@ -119,6 +121,16 @@ class SessionFolder:
         if not self.map_db.is_file():
             what = "holds no session (no map.db)" if self.path.is_dir() else "no such session folder"
             raise StoreError(f"{self.path}: {what}; expected what `hybridmap map SOURCE --out DIR` writes")
+
+    def require_foreign(self, target: Path) -> None:
+        """Check that a file to be written is none of the session's own.
+
+        Raises:
+            OutputError: it is.
+        """
+        folder, file = self.path.resolve(), target.resolve()
+        if file.is_relative_to(folder) and {*file.relative_to(folder).parts[:1]} & {*_FILES}:
+            raise OutputError(f"{target}: is a file of the session that is read; choose another name")
 
     def _why_unended(self) -> str:
         if is_held(self.path):

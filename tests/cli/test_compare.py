@@ -138,6 +138,7 @@ def test_a_session_is_shown_in_both_ways_with_its_errors(monkeypatch, capsys, se
     assert "beginning with dead reckoning" in page
     assert "The true way is laid onto" in page
     assert "relations (m)" in page
+    assert ">nan<" not in page
 
 
 def test_what_only_a_session_has_is_refused_for_a_file(monkeypatch, capsys, square, tmp_path):

@@ -246,3 +246,13 @@ def _one_node():
     single = type(experiences)()
     single.add_node(experiences.node(0), np.zeros(3))
     return single
+
+
+@pytest.mark.parametrize("name", ["map.db", "trajectory/gtsam-lm.tum", "new/../map.db", "trajectory/new.tum"])
+def test_no_file_of_the_session_that_is_read_is_replaced(folder, name):
+    before = (folder / "map.db").read_bytes()
+    with pytest.raises(OutputError, match="a file of the session that is read"):
+        export_session(folder, "tum", folder / name, overwrite=True)
+    assert (folder / "map.db").read_bytes() == before
+    export_session(folder, "tum", folder / "mine.tum")
+    (folder / "mine.tum").unlink()

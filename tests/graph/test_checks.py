@@ -68,16 +68,29 @@ def test_settling_adds_to_the_record(before, more, lack):
     assert settled.status is edge(*before, *more, lack=lack).status
 
 
+INLIERS, GATE = "vision.rgbd.pnp.min_inliers", "vision.closing.gate_sigmas"
+
+
 def test_a_missed_check_says_what_had_to_be_different():
-    missed = edge(at_least("matches", 20, 12, "a.b"), at_least("feature_inliers", 8, 12, "a.c"))
-    assert missed.otherwise == "feature_inliers >= 12 instead of 8, or a.c at most 8"
+    missed = edge(at_least("matches", 20, 12, GATE), at_least("feature_inliers", 8, 12, INLIERS))
+    assert missed.otherwise == f"feature_inliers >= 12 instead of 8, or {INLIERS} at most 8"
     assert missed.reason == "feature_inliers 8 < 12"
     assert edge(at_most("off_m", 3.0, 1.0)).otherwise == "off_m <= 1 instead of 3"
 
 
+def test_all_checks_that_were_missed_are_named():
+    missed = edge(at_most("off_m", 3.0, 1.0), at_least("near", 0.7, 0.5), at_least("feature_inliers", 8, 12, INLIERS))
+    assert missed.otherwise == f"off_m <= 1 instead of 3; and feature_inliers >= 12 instead of 8, or {INLIERS} at most 8"
+
+
+def test_a_value_that_the_setting_cannot_have_is_not_advised():
+    assert edge(at_least("feature_inliers", 1, 12, INLIERS)).otherwise == "feature_inliers >= 12 instead of 1"
+    assert edge(at_most("off_m", float("nan"), 1.0, GATE)).otherwise == "off_m <= 1 instead of nan"
+
+
 def test_an_accepted_edge_says_what_would_have_refused_it():
-    accepted = edge(at_least("matches", 60, 12, "a.b"), at_least("feature_inliers", 13, 12, "a.c"))
-    assert accepted.otherwise == "refused with a.c above 13 (now 12)"
+    accepted = edge(at_least("matches", 60, 12, GATE), at_least("feature_inliers", 13, 12, INLIERS))
+    assert accepted.otherwise == f"refused with {INLIERS} above 13 (now 12)"
 
 
 @pytest.mark.parametrize("lack", Lack)

@@ -74,6 +74,8 @@ def test_few_seeds_have_no_verdict_and_the_page_says_so(made, method, seeds, jud
     assert (f"({seeds} values: no interval)" in page) == (judged == 0)
     told = next(metric.description for metric in study.metrics if metric.name.startswith("ate_difference/"))
     assert ("95 % interval" in told) == (judged > 0)
+    assert "mix of false loops" not in page
+    assert "mixes of false loops" not in page
 
 
 def test_what_failed_is_said_once_and_not_shown_empty(made):

@@ -112,3 +112,13 @@ def test_require_says_what_is_missing(tmp_path):
         SessionFolder(tmp_path / "gone").require()
     with pytest.raises(StoreError, match="holds no session"):
         SessionFolder(tmp_path).require()
+
+
+def test_a_map_that_was_cut_is_damaged_and_not_said_to_be_broken_off(tmp_path, caplog):
+    write_session(tmp_path / "s", ring_map())
+    content = (tmp_path / "s" / "map.db").read_bytes()
+    for left in (len(content) // 3, 20, 0):
+        (tmp_path / "s" / "map.db").write_bytes(content[:left])
+        with pytest.raises(StoreError, match=r"map\.db: "):
+            SessionFolder(tmp_path / "s").require()
+    assert caplog.text == ""
