@@ -36,7 +36,7 @@ def calibrate(
     """Estimate the systematic errors of wheel odometry: gain, turn gain, heading bias (rad/m), with standard deviations.
 
     The estimate comes from the loop closures of the sessions, or from reference trajectories if they are given.
-    --out writes a configuration with the estimate. A value within three standard deviations of the present one is kept.
+    --out writes a configuration with the estimate. Present values stay unless one differs by more than three sigma.
     """
     from hybridmap.calibration.estimate import calibrated, changes, metrics_of, verdict
     from hybridmap.calibration.sessions import common_tree, estimate_of, read_drive, require_options

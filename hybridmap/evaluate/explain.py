@@ -45,7 +45,7 @@ class Decision:
     error: tuple[float, float] | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """The decision as plain values for JSON."""
         e = self.edge
         return {
             "edge": self.number,
@@ -110,7 +110,7 @@ class NodeStory:
     later: list[Decision]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """The story as plain values for JSON."""
         return {
             "node": self.node,
             "stamp_ns": self.stamp_ns,
@@ -156,7 +156,7 @@ class FrameStory:
     poses: Mapping[str, Array]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """The story as plain values for JSON."""
         return {
             "stamp_ns": self.stamp_ns,
             "time_s": self.time_s,
