@@ -47,8 +47,9 @@ def calibrate(
     from hybridmap.trajectory import read_tum
 
     require_options(len(folders), len(reference or []), estimator, leg)
-    for folder in folders if out is not None else ():
-        SessionFolder(folder).require_foreign(out)
+    if out is not None:
+        for folder in folders:
+            SessionFolder(folder).require_foreign(out)
     with nullcontext() if out is None else staged(out, overwrite=overwrite) as work:
         drives = [read_drive(folder) for folder in folders]
         truths = [read_tum(path) for path in reference or []]
