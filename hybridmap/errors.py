@@ -4,6 +4,15 @@ The library raises them; only the command line turns an error into one line and 
 A message names the file, topic or field, what was found, what was expected and what to do.
 """
 
+_MOST_QUOTED = 40
+
+
+def quoted(found: object) -> str:
+    """What was found in a file, fit for a message: on one line, printable, and no longer than it takes to know it again."""
+    text = " ".join(str(found).split())
+    text = "".join(letter if letter.isprintable() and letter != "\ufffd" else "?" for letter in text)
+    return repr(text if len(text) <= _MOST_QUOTED else f"{text[: _MOST_QUOTED - 3]}...")
+
 
 class HybridMapError(Exception):
     """Root of every error that the user can do something about."""

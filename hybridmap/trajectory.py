@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hybridmap.errors import GeometryError, StreamError
+from hybridmap.errors import GeometryError, StreamError, quoted
 from hybridmap.geometry import Array, between, compose, interpolate, quaternion_from_yaw, yaw_from_quaternion
 from hybridmap.output import write_text
 
@@ -135,7 +135,7 @@ def read_tum(path: Path) -> Trajectory:
             stamp_ns = int((Decimal(text[0]) * NS_PER_S).to_integral_value())
             row = [float(field) for field in text[1:]]
         except (InvalidOperation, ValueError, OverflowError):
-            raise StreamError(f"{path}:{number}: expected numbers, found {line.strip()[:60]!r}") from None
+            raise StreamError(f"{path}:{number}: expected numbers, found {quoted(line)}") from None
         if len(row) != 7 or not np.isfinite(row).all():
             raise StreamError(
                 f"{path}:{number}: expected 8 finite numbers `stamp x y z qx qy qz qw`, found {len(text)}"

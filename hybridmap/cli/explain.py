@@ -79,8 +79,9 @@ def _node_lines(story: NodeStory) -> Iterator[str]:
         yield f"  view         template {story.template}" + (", which it founded" if story.founded else ", seen before")
     yield from _pose_lines(story.poses, "pose")
     yield from _gate_lines(story)
-    yield ""
-    yield "chain"
+    if story.chain:
+        yield ""
+        yield "chain"
     yield from _decisions(story.chain, story.node)
     yield ""
     yield f"loops to older nodes: {_counts(story.loops)}" + (f": {story.no_loops}" if story.no_loops else "")

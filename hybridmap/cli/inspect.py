@@ -34,6 +34,7 @@ def inspect(
     from hybridmap.streams.inspection import inspect_source
 
     topics = sensor_settings(
+        source,
         odometry_topic=odometry_topic,
         scan_topic=scan_topic,
         color_topic=color_topic,

@@ -42,6 +42,7 @@ def map_source(
     from hybridmap.cli.choose import choose, parse_settings
 
     topics = sensor_settings(
+        source,
         odometry_topic=odometry_topic,
         scan_topic=scan_topic,
         color_topic=color_topic,

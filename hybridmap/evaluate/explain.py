@@ -232,7 +232,7 @@ class Explainer:
             ranked=np.asarray(kept.get("ranked", np.zeros((0, 3))), dtype=np.float64),
             chain=[d for d in newest if d.edge.kind is not EdgeKind.LOOP],
             loops=loops,
-            no_loops="" if loops else self._why_no_loops(gate),
+            no_loops="" if loops else self._why_no_loops(number, gate),
             later=[d for d in edges if d not in newest and d.edge.kind is EdgeKind.LOOP],
         )
 
@@ -317,7 +317,9 @@ class Explainer:
                 out[name] = solution.poses[number]
         return out
 
-    def _why_no_loops(self, gate: Gate | None) -> str:
+    def _why_no_loops(self, number: int, gate: Gate | None) -> str:
+        if number == 0:
+            return "it is the first node"
         if gate is not None:
             if gate.older == 0:
                 least = _setting(self._settings, "vision.rgbd.closing.min_age_s")

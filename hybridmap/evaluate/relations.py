@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.errors import EvaluationError
+from hybridmap.errors import EvaluationError, quoted
 from hybridmap.geometry import Array, between
 from hybridmap.trajectory import NS_PER_S, Trajectory, known_at
 
@@ -82,9 +82,9 @@ def read_relations(path: Path) -> Relations:
             first, second = (int((Decimal(field) * NS_PER_S).to_integral_value()) for field in fields[:2])
             delta = [float(field) for field in fields[2:]]
         except (InvalidOperation, ValueError, OverflowError):
-            raise EvaluationError(f"{path}:{number}: expected numbers, found {line.strip()[:60]!r}") from None
+            raise EvaluationError(f"{path}:{number}: expected numbers, found {quoted(line)}") from None
         if len(delta) != 3 or not np.isfinite(delta).all():
-            raise EvaluationError(f"{path}:{number}: expected 5 finite numbers `t1 t2 dx dy dyaw`, found {line.strip()[:60]!r}")
+            raise EvaluationError(f"{path}:{number}: expected 5 finite numbers `t1 t2 dx dy dyaw`, found {quoted(line)}")
         stamps.append((first, second))
         deltas.append(delta)
     if not stamps:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybridmap.errors import GraphError
+from hybridmap.errors import GraphError, quoted
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
@@ -81,7 +81,7 @@ def _parse(lines: _Lines, fields: list[str], where: str) -> None:
         lines.fixed += _integers(fields, len(fields) - 1, where)
     else:
         known = ", ".join((*_VERTICES, *_EDGES, _FIX))
-        raise GraphError(f"{where}: unknown record {tag[:40]!r}, expected one of {known}")
+        raise GraphError(f"{where}: unknown record {quoted(tag)}, expected one of {known}")
 
 
 def _integers(fields: list[str], count: int, where: str) -> list[int]:
@@ -89,7 +89,7 @@ def _integers(fields: list[str], count: int, where: str) -> list[int]:
         return [int(field) for field in fields[1 : 1 + count]]
     except ValueError:
         raise GraphError(
-            f"{where}: expected {count} whole number(s) after {fields[0]}, found {fields[1 : 1 + count]}"
+            f"{where}: expected {count} whole number(s) after {fields[0]}, found {quoted(' '.join(fields[1 : 1 + count]))}"
         ) from None
 
 
@@ -99,7 +99,7 @@ def _numbers(fields: list[str], start: int, count: int, where: str) -> list[floa
     try:
         numbers = [float(field) for field in fields[start:]]
     except ValueError:
-        raise GraphError(f"{where}: expected numbers after {fields[0]}, found {' '.join(fields[start:])[:60]!r}") from None
+        raise GraphError(f"{where}: expected numbers after {fields[0]}, found {quoted(' '.join(fields[start:]))}") from None
     if not np.isfinite(numbers).all():
         raise GraphError(f"{where}: found NaN or Inf, expected finite numbers")
     return numbers

@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from hybridmap.errors import StreamError
+from hybridmap.errors import StreamError, quoted
 from hybridmap.trajectory import NS_PER_S
 
 _TF_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
@@ -167,7 +167,7 @@ class BagFile:
     def _damaged(self, error: Exception) -> StreamError:
         found = " ".join(_plain(part) for part in error.args) or type(error).__name__
         advice = next((text for sign, text in _ADVICE.items() if sign in found.lower()), "the file is cut off or damaged")
-        return StreamError(f"{self.path}: cannot be read as a bag ({found.rstrip('.')}): {advice}")
+        return StreamError(f"{self.path}: cannot be read as a bag ({quoted(found.rstrip('.'))[1:-1]}): {advice}")
 
     def _undecodable(self, message: RawMessage) -> StreamError:
         return StreamError(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hybridmap.config.inputs import CameraIntrinsics, CameraMounting, SensorsConfig
 from hybridmap.config.root import Config
 from hybridmap.config.section import read_mapping
-from hybridmap.errors import StreamError
+from hybridmap.errors import StreamError, quoted
 from hybridmap.geometry import Array
 from hybridmap.streams.base import Rig, Sample, SelfMotion, StreamReport
 from hybridmap.streams.cameras import (
@@ -150,7 +150,7 @@ def _stamp_ns(text: str, path: Path, number: int) -> int:
     try:
         return int((Decimal(text) * NS_PER_S).to_integral_value())
     except (InvalidOperation, ValueError, OverflowError):
-        raise StreamError(f"{path}:{number}: expected a stamp in seconds, found {text[:40]!r}") from None
+        raise StreamError(f"{path}:{number}: expected a stamp in seconds, found {quoted(text)}") from None
 
 
 def _read_lines(path: Path, fields: int) -> list[tuple[int, list[str]]]:

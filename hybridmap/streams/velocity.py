@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from hybridmap.config.root import Config
-from hybridmap.errors import StreamError
+from hybridmap.errors import StreamError, quoted
 from hybridmap.streams.base import Rig, Sample, StreamReport, Velocity
 from hybridmap.streams.order import Window, sorted_order
 from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
 
 COLUMNS = ("stamp_s", "v_m_s", "omega_rad_s")
+_FASTEST = 1000.0  # m/s and rad/s; no robot comes near it
 
 
 class VelocityStream:
@@ -56,8 +57,9 @@ def read_table(path: Path) -> list[Velocity]:
         rows = csv.reader(file)
         header = tuple(name.strip() for name in next(rows, []))
         if header != COLUMNS:
-            found = ",".join(header)[:80] or "nothing"
-            raise StreamError(f"{path}: expected the header {','.join(COLUMNS)}, found {found}")
+            raise StreamError(
+                f"{path}: expected the header {','.join(COLUMNS)}, found {quoted(','.join(header)) if header else 'nothing'}"
+            )
         samples = [_read_row(path, number, row) for number, row in enumerate(rows, start=2) if row]
     if not samples:
         raise StreamError(f"{path}: holds no velocity")
@@ -70,9 +72,11 @@ def _read_row(path: Path, number: int, row: list[str]) -> Velocity:
         stamp_ns = int((Decimal(row[0].strip()) * NS_PER_S).to_integral_value())
         values = [float(field) for field in row[1:]]
     except (InvalidOperation, ValueError, OverflowError):
-        raise StreamError(f"{path}:{number}: expected numbers, found {','.join(row)[:60]!r}") from None
+        raise StreamError(f"{path}:{number}: expected numbers, found {quoted(','.join(row))}") from None
     if len(values) != 2:
         raise StreamError(f"{path}:{number}: expected 3 fields, found {len(row)}")
     if not np.isfinite(values).all():
         raise StreamError(f"{path}:{number}: found NaN or Inf, expected finite numbers")
+    if max(map(abs, values)) > _FASTEST:
+        raise StreamError(f"{path}:{number}: expected at most {_FASTEST:g} m/s and rad/s, found {quoted(','.join(row[1:]))}")
     return Velocity(stamp_ns, values[0], values[1])

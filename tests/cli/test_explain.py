@@ -39,6 +39,12 @@ def test_a_node_is_told_in_words(run, session):
     assert "off by     3.804 m" in out
 
 
+def test_the_first_node_has_no_chain_and_no_older_nodes(run, session):
+    out = run(session, "--node", 0)[1]
+    assert "chain" not in out
+    assert "loops to older nodes: none was considered: it is the first node" in out
+
+
 def test_newer_nodes_are_told_too_but_not_all(run, session):
     out = run(session, "--node", 19)[1]
     assert "loops from newer nodes: " in out

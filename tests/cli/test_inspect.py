@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from hybridmap.cli.app import app
 from hybridmap.config import Config
-from hybridmap.errors import StreamError
+from hybridmap.errors import ConfigError, StreamError
 from hybridmap.simulation.writers import write_rosbag1, write_rosbag2, write_tum
 from hybridmap.streams import open_stream
 from hybridmap.streams.inspection import inspect_source
@@ -136,3 +136,14 @@ def test_a_foreign_bag_without_scans_or_pictures(data_dir):
     assert found.mappable
     assert found.uses == {"odometry": "/odom"}
     assert any("self-motion alone" in remark for remark in found.remarks)
+
+
+@pytest.mark.parametrize(
+    ("source", "option"),
+    [("lab", "--scan-topic"), ("drive.csv", "--odometry-topic"), ("drive.csv", "--odometry-file"), ("bag", "--odometry-file")],
+)
+def test_an_option_that_does_not_fit_the_source_is_refused(laser_bag, tmp_path, source, option):
+    (tmp_path / "drive.csv").write_text("stamp_s,v_m_s,omega_rad_s\n0,1,0\n")
+    named = {"lab": "lab", "bag": str(laser_bag)}.get(source, str(tmp_path / source))
+    with pytest.raises(ConfigError, match=f"^{option}: is for a"):
+        CliRunner().invoke(app, ["inspect", named, option, "x"], catch_exceptions=False)

@@ -47,6 +47,7 @@ def test_a_truth_beside_the_table_is_found_and_a_part_can_be_cut_out(tmp_path):
         (HEADER + "1,2\n", [":2", "3 fields"]),
         (HEADER + "1,2,x\n", [":2", "expected numbers"]),
         (HEADER + "1,0,0\n2,nan,0\n", [":3", "NaN"]),
+        (HEADER + "1,0,0\n2,1e300,0\n", [":3", "1000 m/s", "1e300"]),
         (HEADER + "1,0,0\n3,0,0\n4,0,0\n2,0,0\n", ["stamp 2.000000000", "goes back"]),
     ],
 )

@@ -1,0 +1,21 @@
+"""What messages quote."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hybridmap.errors import quoted
+
+
+@given(st.text() | st.binary())
+def test_a_message_quotes_little_and_only_what_can_be_printed(found):
+    said = quoted(found)
+    assert said.isprintable()
+    assert "\ufffd" not in said
+    assert len(said) <= 2 * 40 + 2  # a backslash of the text is doubled
+
+
+def test_a_short_text_is_quoted_as_it_is():
+    assert quoted(" 1 x\n") == "'1 x'"
+    assert quoted("0123456789" * 5) == f"'{'0123456789' * 3}0123456...'"
