@@ -11,7 +11,7 @@ def quoted(found: object) -> str:
     """What was found in a file, fit for a message: on one line, printable, and no longer than it takes to know it again."""
     text = " ".join(str(found).split())
     text = "".join(letter if letter.isprintable() and letter != "\ufffd" else "?" for letter in text)
-    return repr(text if len(text) <= _MOST_QUOTED else f"{text[: _MOST_QUOTED - 3]}...")
+    return f"'{text if len(text) <= _MOST_QUOTED else text[: _MOST_QUOTED - 3] + '...'}'"
 
 
 class HybridMapError(Exception):
