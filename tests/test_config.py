@@ -41,7 +41,8 @@ def test_extending_in_a_circle_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("nodes: {distanse_m: 1}\n", r"unknown key 'nodes.distanse_m'"),
+        ("nodes: {distanse_m: 1}\n", r"unknown key 'nodes.distanse_m'; did you mean 'distance_m'\?"),
+        ("xyz: 1\n", r"unknown key 'xyz'; expected one of seed, "),
         ("nodes: {distance_m: -1}\n", r"nodes.distance_m: .*greater than 0, found -1"),
         ("nodes: {distance_m: .nan}\n", r"nodes.distance_m: .*finite"),
         ("nodes: [1]\n", r"nodes: expected keys with values, found \[1\]"),

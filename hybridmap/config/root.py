@@ -77,7 +77,7 @@ class Config(Section):
         try:
             return cls.model_validate(tree)
         except ValidationError as error:
-            raise ConfigError(f"{origin}: {said(error)}") from None
+            raise ConfigError(f"{origin}: {said(error, cls)}") from None
 
     @classmethod
     def stored(cls, text: str, origin: str) -> Self:

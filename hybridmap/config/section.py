@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -36,13 +37,14 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
 
 
-def said(error: ValidationError, section: str = "") -> str:
+def said(error: ValidationError, model: type[BaseModel], section: str = "") -> str:
     """The first error of pydantic as one line: the key, what was expected, what was found.
 
     Unknown keys are reported first: a missing key may be the same key, misspelt.
 
     Args:
         error: of a section.
+        model: class of that section.
         section: dotted name of that section in the whole configuration; empty for the whole.
     """
     complaints = error.errors()
@@ -56,7 +58,7 @@ def said(error: ValidationError, section: str = "") -> str:
     kind, message = first["type"], first["msg"]
     where = _dotted("", *first["loc"])
     if kind == "extra_forbidden":
-        return f"unknown key {where!r}"
+        return f"unknown key {where!r}{_hint(where, model)}"
     if kind == "missing":
         return f"{where}: is missing"
     if kind == "value_error":
@@ -69,6 +71,18 @@ def said(error: ValidationError, section: str = "") -> str:
         expected = message.removeprefix("Input should be ")
         message = f"expected {'a number ' if expected.startswith(('greater', 'less')) else ''}{expected}"
     return f"{where}: {message}, found {repr(first.get('input'))[:80]}"
+
+
+def _hint(unknown: str, model: type[BaseModel]) -> str:
+    """The key that was probably meant, or else the keys of the section in which the unknown one stands; empty: not known."""
+    *parts, last = unknown.split(".")
+    for part in parts:
+        field = model.model_fields.get(part)
+        if field is None or not (isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)):
+            return ""
+        model = field.annotation
+    near = get_close_matches(last, model.model_fields, n=1)
+    return f"; did you mean {near[0]!r}?" if near else f"; expected one of {', '.join(model.model_fields)}"
 
 
 def _dotted(section: str, *parts: int | str) -> str:

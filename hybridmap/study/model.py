@@ -299,7 +299,7 @@ class StudyConfig(Section):
         try:
             study = cls.model_validate(_spelt_out(tree))
         except ValidationError as error:
-            raise ConfigError(f"{origin}: {said(error)}") from None
+            raise ConfigError(f"{origin}: {said(error, cls)}") from None
         return resolved(study, origin, folder)
 
     def to_yaml(self) -> str:
@@ -333,7 +333,7 @@ def backend_settings(variant: BackendVariant) -> BackendsConfig:
     try:
         return BackendsConfig.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError(f"backends: {variant.title}: settings: {said(error, 'backends')}") from None
+        raise ConfigError(f"backends: {variant.title}: settings: {said(error, BackendsConfig, 'backends')}") from None
 
 
 def nested(dotted: str, value: Any) -> dict[str, Any]:
