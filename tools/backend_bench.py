@@ -1,15 +1,16 @@
-"""What the back-ends cost, by process time and as ratios within one run, held against bars.
+"""Measure the CPU time of the back-ends and hold it against bars. The bars are on ratios of times of the same run.
 
     python tools/backend_bench.py sweep
     python tools/backend_bench.py overhead gnc isam2 --data $HYBRIDMAP_DATA
 
-`sweep`     relaxation-ratslam against loops in plain Python over the same links in the same order: 1,000 nodes, 1,500 edges
-`overhead`  gtsam-lm against tools/bare_gtsam.py on the same file, from the parsed file in memory to the optimised poses
-`gnc`       gtsam-gnc against gtsam.GncLMOptimizer with odometry as known inliers: intel, random false loops
-`isam2`     updates of a replay against one batch optimisation from the odometry chain, and false edges taken out again:
-            Manhattan and city10000, some minutes
+`sweep`     compares a sweep of relaxation-ratslam with plain Python over the same links in the same order. The graph has
+            1,000 nodes and 1,500 edges.
+`overhead`  compares gtsam-lm with tools/bare_gtsam.py on the same files. The time to read a file does not count.
+`gnc`       compares gtsam-gnc with gtsam.GncLMOptimizer on intel with random false loops. Odometry edges are known inliers.
+`isam2`     compares an update of gtsam-isam2 with one batch optimisation. It then adds false edges and removes them again.
+            The graphs are Manhattan and city10000. This takes some minutes.
 
-Exit code 1 where a bar is missed.
+The exit code is 1 if a bar is missed.
 """
 
 from __future__ import annotations
@@ -42,15 +43,15 @@ from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.metrics import Metric, to_json
 from hybridmap.study.false_loops import inject
 
-_ROUNDS = 7  # of measuring everything in turn, so that all see the same machine
+_ROUNDS = 7  # All candidates are timed in turn, this many times, so that load on the machine affects them alike.
 
 
 def main() -> None:
     """Run the studies that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("studies", nargs="+", choices=sorted(STUDIES))
-    parser.add_argument("--data", type=Path, default=None, help="folder with posegraphs/, for all but `sweep`")
-    parser.add_argument("--json", action="store_true", help="one JSON object on standard output; the table goes to stderr")
+    parser.add_argument("--data", type=Path, default=None, help="folder that holds posegraphs/; only `sweep` runs without it")
+    parser.add_argument("--json", action="store_true", help="print one JSON object; the table goes to standard error")
     chosen = parser.parse_args()
     table, metrics = sys.stderr if chosen.json else sys.stdout, list[Metric]()
     for study in chosen.studies:
@@ -63,13 +64,13 @@ def main() -> None:
 
 
 def line(metric: Metric) -> str:
-    """A figure as people read it."""
+    """Format a figure as one line of the table."""
     verdict = "" if metric.passed is None else "ok" if metric.passed else "MISSED"
     return f"{metric.name:52}{metric.value:12.6g} {metric.unit:3}{verdict:7}{metric.description}"
 
 
 def cpu_s(work: Callable[[], object], repeats: int = 3) -> float:
-    """Least process time of some runs, s."""
+    """Return the shortest CPU time of several runs, in s."""
     best = math.inf
     for _ in range(repeats):
         started = time.process_time()
@@ -79,7 +80,7 @@ def cpu_s(work: Callable[[], object], repeats: int = 3) -> float:
 
 
 def drive(nodes: int, edges: int, rng: np.random.Generator) -> PoseGraph:
-    """A noisy drive in circles with loops between random nodes that lie apart in time."""
+    """Make the pose graph of a noisy drive in circles. Its loops join random nodes that are far apart in time."""
     truth = np.zeros((nodes, 3))
     for k in range(1, nodes):
         truth[k] = compose(truth[k - 1], [0.5, 0.05, 2 * np.pi / 50])
@@ -102,7 +103,7 @@ def drive(nodes: int, edges: int, rng: np.random.Generator) -> PoseGraph:
 
 
 def loop_over_arrays(graph: PoseGraph, theta: float, sweeps: int) -> Array:
-    """The rule as one writes it: a Python loop over the rows of the arrays."""
+    """Relax a graph by a direct Python loop over the rows of numpy arrays."""
     poses, order = graph.initial.copy(), np.argsort(graph.sources, kind="stable")
     for _ in range(sweeps):
         for e in order:
@@ -119,7 +120,7 @@ def loop_over_arrays(graph: PoseGraph, theta: float, sweeps: int) -> Array:
 
 
 def loop_over_floats(graph: PoseGraph, theta: float, sweeps: int) -> Array:
-    """The same with everything taken out of numpy beforehand: as fast as plain Python gets."""
+    """Relax a graph by a Python loop over plain floats. This is the fastest form without numpy and numba."""
     x, y, yaw = graph.initial.T.tolist()
     order = np.argsort(graph.sources, kind="stable")
     ends = zip(graph.sources[order].tolist(), graph.targets[order].tolist(), strict=True)
@@ -141,10 +142,10 @@ def loop_over_floats(graph: PoseGraph, theta: float, sweeps: int) -> Array:
 
 
 def sweep_study(data: Path | None) -> Iterator[Metric]:
-    """A sweep of the per-link rule against plain Python, all in the same order of links."""
+    """Time a relaxation sweep against plain Python. All visit the links in the same order."""
     del data
     graph, theta = drive(1000, 1500, np.random.default_rng(0)), 0.5
-    vars(sweeps)["TOLERANCE_M"] = 0.0  # no run ends early
+    vars(sweeps)["TOLERANCE_M"] = 0.0  # so that no run stops early
     config = RelaxationConfig(theta=theta)
 
     def ours(count: int, robust: bool = False) -> Array:
@@ -165,18 +166,20 @@ def sweep_study(data: Path | None) -> Iterator[Metric]:
         for name, (count, work) in studied.items():
             spent[name] = min(spent[name], cpu_s(work, 1) / count)
     for name, cost_s in spent.items():
-        yield Metric(f"sweep/{name}", 1e6 * cost_s, "us", f"a sweep of {graph.n_nodes} nodes, {graph.n_edges} edges")
+        yield Metric(f"sweep/{name}", 1e6 * cost_s, "us", f"one sweep over {graph.n_nodes} nodes and {graph.n_edges} edges")
     for name in ("relaxation-ratslam", "relaxation-ratslam-by-20"):
-        yield at_least(f"speed/{name}", spent["loop-over-floats"] / spent[name], 15.0, "times as fast as plain Python's floats")
+        yield at_least(
+            f"speed/{name}", spent["loop-over-floats"] / spent[name], 15.0, "times as fast as Python with plain floats"
+        )
 
 
 def solved(name: str, graph: PoseGraph) -> backends.Solution:
-    """What a back-end makes of a graph."""
+    """Solve a graph with the named back-end."""
     return backends.create(name).solve(graph)
 
 
 def overhead_study(data: Path | None) -> Iterator[Metric]:
-    """`gtsam-lm` against GTSAM alone."""
+    """Compare `gtsam-lm` with GTSAM alone, in CPU time and in chi2."""
     for name in ("intel.g2o", "manhattanOlson3500.g2o"):
         path = posegraph(data, name)
         graph, parsed = read_graph(path), bare_gtsam.parse(path)
@@ -185,12 +188,12 @@ def overhead_study(data: Path | None) -> Iterator[Metric]:
             bare = min(bare, cpu_s(partial(bare_gtsam.optimise, *parsed), 1))
             ours = min(ours, cpu_s(partial(solved, "gtsam-lm", graph), 1))
         mine = solved("gtsam-lm", graph).report.chi2
-        yield at_most(f"overhead/{path.stem}", ours / bare, 1.15, f"of {bare:.3f} s of CPU of bare gtsam")
-        yield at_most(f"chi2_ratio/{path.stem}", mine / chi2, 1.0 + 1e-6, f"of the chi2 of bare gtsam, {chi2:.6g}")
+        yield at_most(f"overhead/{path.stem}", ours / bare, 1.15, f"CPU time over that of GTSAM alone, {bare:.3f} s")
+        yield at_most(f"chi2_ratio/{path.stem}", mine / chi2, 1.0 + 1e-6, f"chi2 over that of GTSAM alone, {chi2:.6g}")
 
 
 def gnc_study(data: Path | None) -> Iterator[Metric]:
-    """Our GNC against GTSAM's."""
+    """Compare `gtsam-gnc` with GTSAM's own GNC, in CPU time and in the loops that are rejected."""
     graph = read_graph(posegraph(data, "intel.g2o"))
     for share, times in ((0.1, 5.0), (0.4, 20.0)):
         false, name = inject(graph, share, "random", np.random.default_rng(0)), f"intel-{share:.0%}"
@@ -199,16 +202,18 @@ def gnc_study(data: Path | None) -> Iterator[Metric]:
         plain = time.process_time() - started
         ours = cpu_s(partial(solved, "gtsam-gnc", false))
         rejected = np.array(solved("gtsam-gnc", false).report.rejected_edge_ids)
-        yield at_least(f"speed_gnc/{name}", plain / ours, times, f"times as fast as GncLMOptimizer, {plain:.2f} s of CPU")
+        yield at_least(
+            f"speed_gnc/{name}", plain / ours, times, f"times as fast as GncLMOptimizer, which takes {plain:.2f} s of CPU"
+        )
         injected = np.setdiff1d(false.edge_ids, graph.edge_ids)
         lost, bar = (float(np.isin(graph.edge_ids, out).sum()) for out in (rejected, theirs))
-        yield at_most(f"true_loops_lost/{name}", lost, bar, "the bar is GncLMOptimizer's")
+        yield at_most(f"true_loops_lost/{name}", lost, bar, "true loops rejected; the bar is what GncLMOptimizer rejects")
         kept, bar = (float((~np.isin(injected, out)).sum()) for out in (rejected, theirs))
-        yield at_most(f"false_loops_kept/{name}", kept, bar, "the bar is GncLMOptimizer's")
+        yield at_most(f"false_loops_kept/{name}", kept, bar, "false loops kept; the bar is what GncLMOptimizer keeps")
 
 
 def gtsams_gnc(graph: PoseGraph) -> NDArray[np.int64]:
-    """Edge ids that GTSAM's own GNC rejects, odometry being known inliers."""
+    """Return the ids of the loops that GTSAM's own GNC rejects. Odometry edges are known inliers."""
     params = gtsam.GncLMParams()
     params.setLossType(gtsam.GncLossType.TLS)
     params.setKnownInliers([*np.flatnonzero(~graph.is_loop).tolist(), graph.n_edges])
@@ -219,13 +224,13 @@ def gtsams_gnc(graph: PoseGraph) -> NDArray[np.int64]:
 
 
 def isam2_study(data: Path | None) -> Iterator[Metric]:
-    """A replay's updates against one batch optimisation, with false edges put in and taken out."""
+    """Time incremental updates, then add false edges and remove them; see `replay_bench`."""
     for name in replay_bench.GRAPHS:
         yield from replay_bench.study(posegraph(data, name))
 
 
 def posegraph(data: Path | None, name: str) -> Path:
-    """A standard graph in the folder of recordings."""
+    """Return the path of a standard pose graph in the folder of recordings."""
     if data is None:
         raise SystemExit("backend_bench: this study needs --data, the folder of recordings")
     return data / "posegraphs" / name

@@ -1,9 +1,9 @@
-"""Levenberg-Marquardt by GTSAM alone: what `hybridmap optimize --backend gtsam-lm` is measured against.
+"""Optimise a pose graph with GTSAM alone. `hybridmap optimize --backend gtsam-lm` is measured against this.
 
     python tools/bare_gtsam.py GRAPH.g2o
 
-Reads a planar g2o file, optimises it from its own poses with GTSAM's defaults, prints chi2 and CPU seconds from the parsed
-file in memory to the optimised poses. Knows nothing of hybridmap.
+The script reads a planar g2o file and runs Levenberg-Marquardt with GTSAM's defaults, from the poses in the file. It prints
+chi2 and the CPU time of the optimisation, without the time to read the file. It does not import hybridmap.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Edges = list[tuple[int, int, list[float], NDArray[np.float64]]]
 
 
 def parse(path: Path) -> tuple[dict[int, list[float]], Edges]:
-    """Poses by vertex, and (source, target, delta, information) of each edge."""
+    """Read a g2o file. Return the poses by vertex, and (source, target, delta, information) of each edge."""
     poses: dict[int, list[float]] = {}
     edges: Edges = []
     for line in path.read_text(encoding="utf-8").splitlines():
@@ -37,7 +37,7 @@ def parse(path: Path) -> tuple[dict[int, list[float]], Edges]:
 
 
 def optimise(poses: dict[int, list[float]], edges: Edges) -> tuple[NDArray[np.float64], float]:
-    """Optimised poses (N, 3) and chi2."""
+    """Optimise a graph. Return the poses (N, 3) and chi2."""
     graph = gtsam.NonlinearFactorGraph()
     for source, target, delta, information in edges:
         noise = gtsam.noiseModel.Gaussian.Information(information)
@@ -52,7 +52,7 @@ def optimise(poses: dict[int, list[float]], edges: Edges) -> tuple[NDArray[np.fl
 
 
 def main() -> None:
-    """Optimise the file that the command line names."""
+    """Optimise the file given on the command line."""
     poses, edges = parse(Path(sys.argv[1]))
     started = time.process_time()
     _, chi2 = optimise(poses, edges)

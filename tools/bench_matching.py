@@ -1,7 +1,9 @@
-"""How fast views are matched: the search against bare OpenCV and plain numpy, and the growth with the map when gated.
+"""Measure how fast a view is matched with the stored views.
 
-`python tools/bench_matching.py [--bands B] [--json]`. Set OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1: times are of the
-CPU, on one core, the best of several repeats, and the ratios are of one run.
+    python tools/bench_matching.py [--bands B] [--json]
+
+The search is compared with OpenCV alone and with plain numpy. Gated matching is measured on maps of growing size. Set
+OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1. Times are CPU times on one core, the best of several repeats.
 """
 
 from __future__ import annotations
@@ -26,21 +28,21 @@ WIDTH, MAX_SHIFT, NEAREST = 64, 16, 5
 MATCHING = MatchingConfig()
 BARS = {"search / bare": 1.5, "numpy / search": 10.0, "gated, against the smallest": 2.0}
 STEP_M, LANE_M, LANE_NODES = 0.25, 1.0, 200
-"""The map of the gated case: lanes of 50 m, one metre apart, a node every 25 cm; it grows by further lanes."""
+"""The map for gated matching: parallel lanes of 50 m, 1 m apart, with a node every 25 cm. A larger map has more lanes."""
 GATE_M, GATE_RAD = 5.0, float(np.deg2rad(50.0))
 
 Bytes = NDArray[np.uint8]
 
 
 def views(count: int, bands: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Smooth random profiles (count, bands, WIDTH), z-normalised."""
+    """Make smooth random profiles (count, bands, WIDTH), z-normalised."""
     rough = rng.standard_normal((count, bands, WIDTH + 6), dtype=np.float32)
     smooth = np.sum([rough[:, :, at : at + WIDTH] for at in range(7)], axis=0)
     return np.asarray(normalised(smooth.reshape(-1, WIDTH), "z"), dtype=np.float32).reshape(count, bands, WIDTH)
 
 
 def best_of(work: Callable[[], object], seconds: float = 1.0) -> float:
-    """CPU time of one call, ms: the best of those that fit into some seconds, three at least."""
+    """Return the CPU time of one call in ms: the best of the calls that fit into `seconds`, and of three at least."""
     work()
     best, calls, begin = np.inf, 0, time.process_time()
     while calls < 3 or time.process_time() - begin < seconds:
@@ -52,7 +54,7 @@ def best_of(work: Callable[[], object], seconds: float = 1.0) -> float:
 
 @dataclass(frozen=True)
 class Bare:
-    """What OpenCV needs for the same bytes and shifts: one `batchDistance` a shift, and nothing made of its answers."""
+    """The same search by OpenCV alone: one `batchDistance` for each shift. Its results are not merged."""
 
     stored: Bytes
     query: Bytes
@@ -69,7 +71,7 @@ class Bare:
 
 
 def plain(query: NDArray[np.float32], stored: NDArray[np.float32]) -> NDArray[np.int64]:
-    """The baseline: equation 12 for every shift in numpy, the bands' mean, the least over the shifts, the nearest."""
+    """Search in plain numpy: equation 12 for each shift, mean over the bands, minimum over the shifts, nearest views."""
     least = np.full(len(stored), np.inf)
     for c in range(-MAX_SHIFT, MAX_SHIFT + 1):
         ours = query[:, max(c, 0) : WIDTH + min(c, 0)]
@@ -79,7 +81,7 @@ def plain(query: NDArray[np.float32], stored: NDArray[np.float32]) -> NDArray[np
 
 
 def lanes(count: int) -> NDArray[np.float64]:
-    """Poses (count, 3) of the gated case."""
+    """Make the poses (count, 3) of the map for gated matching."""
     lane, at = np.divmod(np.arange(count), LANE_NODES)
     odd = lane % 2 == 1
     x = np.where(odd, LANE_NODES - 1 - at, at) * STEP_M
@@ -87,7 +89,7 @@ def lanes(count: int) -> NDArray[np.float64]:
 
 
 def gated(matcher: Matcher, poses: NDArray[np.float64], query: NDArray[np.float32]) -> int:
-    """One frame with gating: the nodes near by, their best, and the new profile stored. Returns how many were near."""
+    """Match one frame with the nodes in the gate and store its profile. Return the number of nodes in the gate."""
     node = len(poses) // 2
     near = nodes_within(poses, node, GATE_M, GATE_RAD, before=len(poses))
     matcher.best(query, NEAREST, near)
@@ -96,7 +98,7 @@ def gated(matcher: Matcher, poses: NDArray[np.float64], query: NDArray[np.float3
 
 
 def measure(count: int, bands: int, numpy_up_to: int) -> dict[str, float]:
-    """Times in ms, and their ratios, of one size of map."""
+    """Measure one size of map. Return times in ms, and their ratios."""
     rng = np.random.default_rng(count)
     stored, query = views(count, bands, rng), views(1, bands, rng)[0]
     index = ProfileIndex(np.full(bands, 1.0 / bands), WIDTH, MAX_SHIFT)
@@ -121,7 +123,7 @@ def measure(count: int, bands: int, numpy_up_to: int) -> dict[str, float]:
 
 
 def metrics_of(size: int, row: dict[str, float]) -> list[Metric]:
-    """One size of map as a flat list: times in ms, and ratios held against their bars."""
+    """Turn the figures of one size of map into metrics. The ratios have bars."""
     metrics = []
     for what, value in row.items():
         name = f"{what.replace(' / ', '_over_').replace(', ', '_').replace(' ', '_')}/{size}"
@@ -134,12 +136,16 @@ def metrics_of(size: int, row: dict[str, float]) -> list[Metric]:
 
 
 def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bands", type=int, default=4, help="bands of a profile")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[1000, 10_000, 100_000], help="stored profiles")
-    parser.add_argument("--numpy-up-to", type=int, default=100_000, help="largest map for the slow baseline")
-    parser.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    """Measure and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--bands", type=int, default=4, help="number of bands of a profile")
+    parser.add_argument(
+        "--sizes", type=int, nargs="+", default=[1000, 10_000, 100_000], help="numbers of stored profiles to measure"
+    )
+    parser.add_argument(
+        "--numpy-up-to", type=int, default=100_000, help="largest number of stored profiles for the slow numpy search"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     rows = {size: measure(size, arguments.bands, arguments.numpy_up_to) for size in sorted(arguments.sizes)}

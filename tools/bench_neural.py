@@ -1,7 +1,9 @@
-"""How fast the cells are: the grid sheets against a straightforward FFT implementation, and the whole path integrator.
+"""Measure how fast the cells are.
 
-`python tools/bench_neural.py [--steps N] [--json]`. Set OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1: rates are of CPU time on
-one core, the best of many repeats.
+    python tools/bench_neural.py [--steps N] [--json]
+
+The sheets of grid cells are compared with a plain FFT implementation. The whole path integrator is timed as well. Set
+OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1. Rates are per second of CPU time on one core, the best of many repeats.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ JUDGED = "float32 relu"
 
 
 class PlainSheets:
-    """The baseline: the same dynamics by one `rfft2` and one `irfft2` over the whole stack a step."""
+    """The baseline: the same dynamics, with one `rfft2` and one `irfft2` over all sheets at each step."""
 
     def __init__(self, integrator: PathIntegrator) -> None:
         grid, config = integrator.grid, integrator.config
@@ -43,7 +45,7 @@ class PlainSheets:
         self._softplus = SOFTPLUS_SHARPNESS if config.rectifier == "softplus" else None
 
     def step(self, shift_cycles: NDArray[np.floating], phasors: NDArray[np.complexfloating]) -> None:
-        """Advance the sheets by shifts (M, 2), cycles, with the stripes of bands at phasors (M, 3)."""
+        """Advance the sheets by shifts (M, 2) in cycles. The stripes of the band cells stand at phasors (M, 3)."""
         turn = np.exp(-2j * np.pi * shift_cycles[:, 0, None] * self._p)[:, :, None]
         turn = turn * np.exp(-2j * np.pi * shift_cycles[:, 1, None] * self._q)[:, None, :]
         modes = np.fft.rfft2(self.activity) * (turn * self._gains)
@@ -59,7 +61,10 @@ class PlainSheets:
 
 
 def rates(steps: dict[Callable[[], None], int], repeats: int = 150) -> list[float]:
-    """Steps per CPU-second of each, so many steps a repeat: turn by turn in one run, the best repeat of each."""
+    """Return the steps per second of CPU time of each function.
+
+    `steps` gives the number of steps in one repeat. The functions take turns. The best repeat of each counts.
+    """
     best = dict.fromkeys(steps, np.inf)
     for _ in range(repeats):
         for step, count in steps.items():
@@ -71,7 +76,7 @@ def rates(steps: dict[Callable[[], None], int], repeats: int = 150) -> list[floa
 
 
 def measure(dtype: str, rectifier: str, steps: int) -> dict[str, float]:
-    """Rates of one precision and rectifier, steps per CPU-second."""
+    """Measure one precision and rectifier. Rates are steps per second of CPU time."""
     config = NeuralConfig.model_validate({"rectifier": rectifier})
     integrator = PathIntegrator(config, dtype=dtype)
     plain = PlainSheets(integrator)
@@ -104,7 +109,7 @@ def measure(dtype: str, rectifier: str, steps: int) -> dict[str, float]:
 
 
 class Driving:
-    """Steps of 5 mm on a circle; the pose and the place code are read once every `node_m`, as at a node."""
+    """A drive on a circle in steps of 5 mm. The pose and the place code are read every `node_m`, as at a node."""
 
     def __init__(self, integrator: PathIntegrator, node_m: float) -> None:
         self._integrator, self._node_steps, self._steps = integrator, max(1, round(node_m / STEP_M)), 0
@@ -118,7 +123,7 @@ class Driving:
 
 
 def metrics_of(rows: dict[str, dict[str, float]]) -> list[Metric]:
-    """The table as a flat list; the bars hold for float32 with the paper's rectifier."""
+    """Turn the table into metrics. Only float32 with the paper's rectifier has bars."""
     metrics = []
     for row, figures in rows.items():
         for what, value in figures.items():
@@ -130,7 +135,10 @@ def metrics_of(rows: dict[str, dict[str, float]]) -> list[Metric]:
 
 
 def wandering(config: NeuralConfig, dtype: str, way_m: float = 120.0) -> tuple[float, int]:
-    """Steps per CPU-second on a walk at random, the best of its last parts, and how many place cells it has by then."""
+    """Measure a random walk.
+
+    Return the steps per second of CPU time, the best of the parts in its second half, and the number of place cells at the end.
+    """
     drive = wander(np.random.default_rng(1), way_m, ODOMETRY_HZ)
     integrator = PathIntegrator(config, dtype=dtype)
     ways, gone_m, part, times = np.hypot(drive.deltas[:, 0], drive.deltas[:, 1]), 0.0, len(drive.deltas) // 40, []
@@ -147,10 +155,10 @@ def wandering(config: NeuralConfig, dtype: str, way_m: float = 120.0) -> tuple[f
 
 
 def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=100, help="steps a repeat")
-    parser.add_argument("--json", action="store_true", help="one JSON object instead of a table")
+    """Measure and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=100, help="steps in one repeat")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     arguments = parser.parse_args()
     rows = {
         f"{dtype} {rectifier}": measure(dtype, rectifier, arguments.steps)

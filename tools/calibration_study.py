@@ -1,11 +1,14 @@
-"""What calibration does to dead reckoning: trained on the first half of each log, tested on every window of the second.
+"""Measure how much calibration improves dead reckoning.
 
     python tools/calibration_study.py --data ../shared/data/real --out /somewhere [--only fr079]
 
-The laser logs are trained on their own map of the first half (no reference), the motion-capture robots on the reference of the
-first half, each alone and all five together. A window begins every half metre of the reference's way wherever 16.8 m or 70 m
-follow; its error is the distance between where dead reckoning and the reference end, both begun at the same pose. Every
-window of every log is in `windows.json`. All bars are held against gains and delay together.
+The calibration is learnt from the first half of each log and tested on the second half. For a laser log it is learnt from the
+map of the first half, without a reference. For the robots with motion capture it is learnt from their reference: from each
+robot alone, and from all five together.
+
+A window is a stretch of 16.8 m or 70 m of the second half. A new window begins every half metre of the reference. Dead
+reckoning and reference start a window at the same pose. The error of the window is the distance between their ends. The
+bars are on dead reckoning with the learnt gains and delay. `windows.json` holds the errors of every window.
 """
 
 from __future__ import annotations
@@ -60,7 +63,7 @@ ROBOTS = {f"mrclam6-{k}": (f"mrclam6/robot{k}.csv", f"mrclam6/robot{k}_groundtru
 
 @dataclass(frozen=True)
 class Log:
-    """A recording: its raw odometry, its reference, and where its second half begins."""
+    """A recording with its raw odometry and its reference. `half_s` is where its second half begins."""
 
     name: str
     source: Path
@@ -70,12 +73,12 @@ class Log:
 
     @property
     def half_ns(self) -> int:
-        """Stamp at which the second half begins."""
+        """Return the stamp at which the second half begins."""
         return int(self.motion.stamps_ns[0]) + round(self.half_s * NS_PER_S)
 
 
 def read_log(name: str, source: Path, reference: Path) -> Log:
-    """Raw odometry of a whole recording, as the mapper's synchroniser hands it out."""
+    """Read a recording. Its raw odometry is what the synchroniser gives to the mapper."""
     stream = choose(str(source), None, {}).stream
     synchroniser = Synchroniser()
     steps = [s for sample in stream if isinstance(sample, SelfMotion | Velocity) for s in synchroniser.push(sample)]
@@ -86,7 +89,7 @@ def read_log(name: str, source: Path, reference: Path) -> Log:
 
 
 def first_half(log: Log, out: Path) -> Drive:
-    """Map the first half of a log; nothing of the second is read."""
+    """Map the first half of a log. The second half is not read."""
     folder = out / f"{log.name}-first-half"
     if not (folder / "metrics.json").is_file():
         chosen = choose(str(log.source), None, {}, end_s=log.half_s)
@@ -95,7 +98,7 @@ def first_half(log: Log, out: Path) -> Drive:
 
 
 def windows(log: Log, gains: Gains, delay_s: float, length_m: float) -> tuple[Array, Array]:
-    """Start (s from the log's begin) and end error (m) of every window of the second half."""
+    """Return the start (s since the start of the log) and the end error (m) of every window of the second half."""
     shift = round(delay_s * NS_PER_S)
     stamps = log.motion.stamps_ns
     used = known_at(log.reference, stamps + shift) & (stamps >= log.half_ns)
@@ -112,7 +115,7 @@ def windows(log: Log, gains: Gains, delay_s: float, length_m: float) -> tuple[Ar
 
 
 def judge(log: Log, how: str, estimate: Estimate, table: TextIO) -> list[Row]:
-    """Errors of raw and calibrated dead reckoning, for each length of window."""
+    """Return one row for each length of window: the errors of raw and of calibrated dead reckoning."""
     rows: list[Row] = []
     for length in LENGTHS_M:
         start, raw = windows(log, NEUTRAL, 0.0, length)
@@ -151,7 +154,7 @@ def judge(log: Log, how: str, estimate: Estimate, table: TextIO) -> list[Row]:
 
 
 def line(row: Row) -> str:
-    """One row of the table."""
+    """Format one row of the table."""
     bar = BARS.get((row["log"], row["length_m"]))
     s, met = row["sigmas"], bar is not None and row["delay_mean"] <= bar
     cells = [
@@ -173,9 +176,10 @@ def line(row: Row) -> str:
 
 
 def judged(rows: list[Row]) -> list[Metric]:
-    """The figures that have a bar: end error of calibrated dead reckoning in % of raw, and how many robots get better.
+    """Return the figures with a bar.
 
-    Every log is judged by gains and delay together, unrounded: that is what `calibrate --out` writes and the mapper applies.
+    They are the end error of calibrated dead reckoning in % of the raw one, and the number of robots whose error shrinks.
+    Dead reckoning uses the learnt gains and the delay, not rounded. `calibrate --out` writes these and the mapper applies them.
     """
     metrics = []
     for found in rows:
@@ -190,18 +194,22 @@ def judged(rows: list[Row]) -> list[Metric]:
             name = f"mrclam6-{how.replace(', ', '-').replace(' ', '-')}"
             median, better = 100.0 * float(np.median(ratios)), sum(ratio < 1.0 for ratio in ratios)
             metrics.append(at_most(f"end_error/{name}", median, 75.0, f"{_OF_RAW}, median over the robots", "%"))
-            metrics.append(at_least(f"better/{name}", better, 4.0, f"of {len(ratios)} robots better calibrated than raw"))
+            metrics.append(
+                at_least(f"better/{name}", better, 4.0, f"of {len(ratios)} robots have a smaller end error than raw odometry")
+            )
     return metrics
 
 
 def main() -> None:
     """Run the study."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--only", default="")
-    parser.add_argument("--estimators", nargs="+", default=["alternating", "joint"])
-    parser.add_argument("--json", action="store_true", help="print the figures with bars; the table goes to stderr")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, help="folder of real recordings")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the sessions and windows.json")
+    parser.add_argument("--only", default="", help="run the logs whose name contains this text")
+    parser.add_argument("--estimators", nargs="+", default=["alternating", "joint"], help="estimators for the laser logs")
+    parser.add_argument(
+        "--json", action="store_true", help="print the figures with a bar as one JSON object; the table goes to standard error"
+    )
     options = parser.parse_args()
     rows: list[Row] = []
     table = sys.stderr if options.json else sys.stdout

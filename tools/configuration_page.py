@@ -1,7 +1,10 @@
-"""Write `docs/configuration.md`: every setting with unit, limits, default, what it does and what to watch.
+"""Write `docs/configuration.md`, the page of all settings.
 
-`python tools/configuration_page.py` writes it. The settings are those of `hybridmap.config.Config`, the texts are the
-docstrings under its fields, and the figures of the last part are those of `docs/sensitivity.csv` (`tools/sensitivity.py`).
+    python tools/configuration_page.py
+
+The page gives the unit, limits and default of each setting, what it does, and what to watch when changing it. The settings
+are the fields of `hybridmap.config.Config`. The texts are the docstrings under the fields. The last part of the page shows
+figures from `docs/sensitivity.csv`, which `tools/sensitivity.py` writes.
 """
 
 from __future__ import annotations
@@ -38,7 +41,7 @@ UNITS = {
     "px": "px",
     "hz": "Hz",
 }
-"""End of a name -> its unit; the longest one counts. Numbers without one are pure."""
+"""End of a name -> unit. The longest end that fits counts. A number whose name has no such end has no unit."""
 
 INTRODUCTION = """# Settings
 
@@ -67,7 +70,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """One section of the configuration: its dotted name, what it is about, its own settings."""
+    """One section of the configuration: its dotted name, its title, and its own settings."""
 
     key: str
     title: str
@@ -75,7 +78,7 @@ class Table:
 
 
 def tables(section: type[Section] = Config, key: str = "", title: str = "The whole") -> Iterator[Table]:
-    """Every section that has settings of its own, in the order of the model."""
+    """Yield each section that has settings of its own, in the order of the model."""
     inner: list[tuple[str, FieldInfo, type[Section]]] = []
     own: list[Setting] = []
     for name, field in section.model_fields.items():
@@ -92,19 +95,19 @@ def tables(section: type[Section] = Config, key: str = "", title: str = "The who
 
 
 def section_of(annotation: Any) -> type[Section] | None:
-    """The section that a field holds, or may hold; None for a setting."""
+    """Return the section that a field holds, also if it is optional. Return None for a setting."""
     if isinstance(annotation, type) and issubclass(annotation, Section):
         return annotation
     return next((found for part in typing.get_args(annotation) if (found := section_of(part))), None)
 
 
 def count(tree: dict[str, Any]) -> int:
-    """How many settings a configuration has; one section that is given as a whole or not at all counts as one."""
+    """Count the settings of a configuration. A section that is given as a whole or not at all counts as one."""
     return sum(count(value) if isinstance(value, dict) else 1 for value in tree.values())
 
 
 def page() -> str:
-    """The whole page."""
+    """Return the whole page."""
     found = list(tables())
     parts = [INTRODUCTION.format(count=count(Config().model_dump()))]
     for table in found:
@@ -116,7 +119,7 @@ def page() -> str:
 
 
 def _sensitive() -> list[str]:
-    """Those that changed a map's error when they were moved, from the record."""
+    """Return the part on the settings that changed the error of a map, from the record."""
     if not SENSITIVITY.is_file():
         return []
     with SENSITIVITY.open(encoding="utf-8", newline="") as file:
@@ -144,13 +147,13 @@ def _setting(dotted: str, name: str, field: FieldInfo) -> Setting:
 
 
 def unit_of(name: str) -> str:
-    """The unit that a name ends with; `1` for a pure number."""
+    """Return the unit that the end of a name stands for; `1` for a number without unit."""
     ends = [end for end in UNITS if name == end or name.endswith(f"_{end}")]
     return UNITS[max(ends, key=len)] if ends else "1"
 
 
 def _words(field: FieldInfo) -> tuple[str, str]:
-    """What a setting does, and what to watch: the two parts of its docstring."""
+    """Split the docstring of a setting into what it does and what to watch."""
     does, _, watch = " ".join((field.description or "").split()).partition(" Watch: ")
     return does, watch
 

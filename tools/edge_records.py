@@ -1,8 +1,9 @@
-"""Why the edges of sessions are not in the graph: how many by each check that failed and each thing that they lacked.
+"""Count the reasons why edges of sessions are not in the graph.
 
     python tools/edge_records.py DIR [DIR ...]
 
-The exit code is 1 where an edge is not in the graph and its record does not say why, or is in it against its record.
+A reason is the first failed check of an edge, or what the edge lacks, such as support. The exit code is 1 if an edge outside
+the graph has no reason in its record, or if an edge in the graph has one.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from hybridmap.store import MapStore
 
 
 def why(edge: Edge) -> str:
-    """The named lack or the first failed check of an edge; empty where there is neither."""
+    """Return what an edge lacks, or its first failed check. Return an empty text if there is neither."""
     return f"lack: {edge.lack}" if edge.lack else edge.failed[0].figure if edge.failed else ""
 
 
 def main() -> None:
-    """Print a table a session."""
+    """Print a table for each session."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="session folders")
     unexplained = 0

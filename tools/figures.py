@@ -1,4 +1,7 @@
-"""Draw the README's picture from a demo session: `python tools/figures.py [--session DIR] [--out docs/images/demo.png]`."""
+"""Draw the picture of the README from a session of the demo.
+
+python tools/figures.py [--session DIR] [--out docs/images/demo.png]
+"""
 
 from __future__ import annotations
 
@@ -18,10 +21,10 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def main() -> None:
-    """Parse the command line, run the demo where no session is given, draw."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--session", type=Path, help="a session folder; without it the demo is run")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "images" / "demo.png", help="the picture")
+    """Draw a session. Run the demo first if no session is given."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--session", type=Path, help="session folder; without it, the demo is run")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "images" / "demo.png", help="PNG file to write")
     arguments = parser.parse_args()
     if arguments.session is not None:
         draw(SessionFolder(arguments.session), arguments.out)
@@ -34,7 +37,7 @@ def main() -> None:
 
 
 def draw(session: SessionFolder, out: Path) -> None:
-    """The map with every trajectory, and below it the position error over time, as one PNG."""
+    """Draw one PNG: the map with all trajectories, and the position error over time below it."""
     with MapStore.open(session.path) as store:
         scene = load_scene(session, store)
         building = raster(outlines(store, len(scene.nodes)), scene.nodes)

@@ -1,4 +1,4 @@
-"""An incremental replay against one batch optimisation, and what false edges leave behind when they are taken out again."""
+"""Measure `gtsam-isam2` as a graph grows node by node, and after false edges are removed. `backend_bench.py` runs this."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from hybridmap.metrics import Metric
 from hybridmap.study.false_loops import inject
 
 GRAPHS = {"manhattanOlson3500.g2o": None, "city10000.g2o": 4000}
-"""Files, and how many nodes of each are replayed with false edges (all of them: minutes of least squares on a ruined map)."""
+"""Pose graph -> how many of its nodes are replayed with false edges; None for all. All of city10000 would take minutes."""
 
 _SHARE, _SEED = 0.05, 0
 
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """A replay node by node.
+    """Result of growing a graph node by node.
 
     Attributes:
-        spent_s: process time of each update; making the state of the graph at that node is not in it.
-        works: how many updates called the solver.
-        last: solution of the last update.
+        spent_s: CPU time of each update, without the time to make the graph up to that node.
+        works: number of updates that called the solver.
+        last: solution after the last update.
     """
 
     spent_s: Array
@@ -43,7 +43,7 @@ class Replay:
 
 
 def study(path: Path) -> Iterator[Metric]:
-    """Figures of `gtsam-isam2` over one graph: the cost of its updates, then false edges put in and taken out."""
+    """Yield the figures of `gtsam-isam2` on one graph: first the cost of its updates, then the test with false edges."""
     graph, name = chain(read_graph(path)), path.stem
     batch_s = min(_batch_s(graph) for _ in range(3))
     best = backends.create("gtsam-lm").solve(graph).report.chi2
@@ -51,17 +51,27 @@ def study(path: Path) -> Iterator[Metric]:
     replay = replayed(backend, graph)
     end = backend.finish(graph).report
     median_s, p99_s = np.quantile(replay.spent_s, [0.5, 0.99])
-    yield Metric(f"update_median/{name}", 1e3 * median_s, "ms", f"ISAM2 worked at {replay.works} of {graph.n_nodes} nodes")
-    yield Metric(f"update_p99/{name}", 1e3 * p99_s, "ms", f"{replay.spent_s.sum():.1f} s in all")
-    times = f"median update goes so often into one batch optimisation from the chain, {batch_s:.3f} s of CPU"
+    yield Metric(
+        f"update_median/{name}",
+        1e3 * median_s,
+        "ms",
+        f"median CPU time of an update; {replay.works} of {graph.n_nodes} updates called ISAM2",
+    )
+    yield Metric(
+        f"update_p99/{name}",
+        1e3 * p99_s,
+        "ms",
+        f"99th percentile of the CPU time of an update; all updates take {replay.spent_s.sum():.1f} s",
+    )
+    times = f"CPU time of one batch optimisation from the chain, {batch_s:.3f} s, over that of the median update"
     yield at_least(f"updates_a_batch/{name}", batch_s / median_s, 300.0, times)
-    yield at_most(f"chi2_last_update/{name}", replay.last.report.chi2 / best, 1.001, "of batch")
-    yield at_most(f"chi2_at_the_end/{name}", end.chi2 / best, 1.001, f"of batch; {end.cpu_s:.2f} s of CPU")
+    yield at_most(f"chi2_last_update/{name}", replay.last.report.chi2 / best, 1.001, "chi2 over that of batch")
+    yield at_most(f"chi2_at_the_end/{name}", end.chi2 / best, 1.001, f"chi2 over that of batch; takes {end.cpu_s:.2f} s of CPU")
     yield from _false_edges(prefix(graph, GRAPHS.get(path.name) or graph.n_nodes), name)
 
 
 def replayed(backend: Backend, graph: PoseGraph) -> Replay:
-    """Grow a graph node by node, with the clock running in the updates only."""
+    """Grow a graph node by node. Only the updates are timed."""
     spent, works, last = [], 0, None
     for nodes in range(1, graph.n_nodes + 1):
         part = prefix(graph, nodes)
@@ -80,14 +90,18 @@ def _batch_s(graph: PoseGraph) -> float:
 
 
 def _false_edges(clean: PoseGraph, name: str) -> Iterator[Metric]:
-    """Replay with false edges, take them all out at once, and compare with the optimum that never saw them."""
+    """Replay with false edges, remove them all at once, and compare with the optimum of the graph without them."""
     best = backends.create("gtsam-lm").solve(clean)
     false = inject(clean, _SHARE, "random", np.random.default_rng(_SEED))
     backend = backends.create("gtsam-isam2")
     ruined = replayed(backend, false)
     back = backend.update(clean)
     off = np.abs(between(best.poses, back.poses))
-    what = f"{false.n_edges - clean.n_edges} false edges over {clean.n_nodes} nodes"
-    chi2 = f"of the optimum without them; {ruined.last.report.chi2:.4g} before, {back.report.cpu_s:.2f} s of CPU"
+    what = f"{false.n_edges - clean.n_edges} false edges among {clean.n_nodes} nodes removed"
+    chi2 = (
+        f"chi2 over that of the optimum; it was {ruined.last.report.chi2:.4g}; removal takes {back.report.cpu_s:.2f} s of CPU"
+    )
     yield at_most(f"chi2_after_removal/{name}", back.report.chi2 / best.report.chi2, 1.0 + 1e-6, f"{what}: {chi2}")
-    yield Metric(f"off_after_removal/{name}", float(off[:, :2].max()), "m", "largest distance from that optimum")
+    yield Metric(
+        f"off_after_removal/{name}", float(off[:, :2].max()), "m", "largest distance of a node from its place in the optimum"
+    )

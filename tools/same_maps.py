@@ -1,13 +1,13 @@
-"""Hold the maps of one tree against those of another: errors, graph hashes, trajectories, and the cost of mapping.
+"""Compare the maps that two checkouts of the project make: errors, graph hashes, trajectories, and CPU time.
 
     python tools/same_maps.py measure --tree ../before --out before.json
     python tools/same_maps.py measure --out after.json
     python tools/same_maps.py compare before.json after.json
     python tools/same_maps.py speed --before ../before --pairs 5
 
-`measure` runs the command line of a checkout (default: this one) with this interpreter. `compare` exits with 1 where an error
-grew by more than 2 % and by more than 0.5 mm. `speed` maps in alternating pairs and exits with 1 where the median ratio of the
-processor time is above 1.02. Recordings are looked for in `$HYBRIDMAP_DATA`, else in `../shared/data`.
+`measure` maps every case with one checkout and records the results. `compare` compares two records. It exits with 1 if an
+error grew by more than 2 % and by more than 0.5 mm. `speed` maps with both checkouts in turn. It exits with 1 if the median
+ratio of the CPU times is above 1.02. The folder of recordings is `$HYBRIDMAP_DATA`, or `../shared/data` if that is not set.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ WORSE_SHARE, WORSE_M, SLOWER = 1.02, 0.0005, 1.02
 
 @dataclass(frozen=True)
 class Case:
-    """One drive or graph.
+    """One drive or pose graph.
 
     Attributes:
-        commands: run one after the other in one folder; `DATA` is the folder of recordings. The first one makes `out`.
-        figures: errors in m that must not grow, of any command; `PRIMARY` stands for the back-end that drives the pose.
-        graph: name of a pose graph whose copies with 40 % false loops, by kind and seed, the commands solve; the figures are
-            then their errors against the least-squares optimum of the graph without false loops.
+        commands: run one after the other in one folder. `DATA` stands for the folder of recordings. The first one makes `out`.
+        figures: errors in m that must not grow. `PRIMARY` stands for the primary back-end.
+        graph: name of a pose graph, or empty. The commands then solve copies of it with 40 % false loops, one for each kind
+            and seed. The figures are the errors of these copies against the optimum of the graph without false loops.
     """
 
     commands: tuple[str, ...]
@@ -91,20 +91,20 @@ SPEED = {"aces": "map DATA/real/aces/aces.bag --out out", "demo": "demo --out ou
 
 
 def main() -> None:
-    """Parse the command line and do one of the three."""
+    """Run the subcommand given on the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
-    one = commands.add_parser("measure")
-    one.add_argument("--tree", type=Path, default=ROOT, help="a checkout")
-    one.add_argument("--out", type=Path, required=True, help="JSON file; cases that it holds and that are not run are kept")
-    one.add_argument("--only", nargs="+", choices=list(CASES), default=list(CASES))
-    two = commands.add_parser("compare")
-    two.add_argument("before", type=Path)
-    two.add_argument("after", type=Path)
-    three = commands.add_parser("speed")
-    three.add_argument("--before", type=Path, required=True, help="a checkout")
-    three.add_argument("--after", type=Path, default=ROOT, help="a checkout")
-    three.add_argument("--pairs", type=int, default=5)
+    one = commands.add_parser("measure", help="map every case with one checkout and record the results")
+    one.add_argument("--tree", type=Path, default=ROOT, help="checkout to measure; default: this one")
+    one.add_argument("--out", type=Path, required=True, help="JSON file; results in it of cases that are not run are kept")
+    one.add_argument("--only", nargs="+", choices=list(CASES), default=list(CASES), help="cases to run")
+    two = commands.add_parser("compare", help="compare two records")
+    two.add_argument("before", type=Path, help="JSON file of `measure`")
+    two.add_argument("after", type=Path, help="JSON file of `measure`")
+    three = commands.add_parser("speed", help="compare the CPU time of two checkouts")
+    three.add_argument("--before", type=Path, required=True, help="checkout to compare with")
+    three.add_argument("--after", type=Path, default=ROOT, help="checkout to judge; default: this one")
+    three.add_argument("--pairs", type=int, default=5, help="number of runs of each checkout")
     chosen = parser.parse_args()
     if chosen.command == "measure":
         measure(chosen.tree.resolve(), chosen.out, chosen.only)
@@ -115,7 +115,7 @@ def main() -> None:
 
 
 def measure(tree: Path, out: Path, names: list[str]) -> None:
-    """Run cases on a checkout; what was found is written after each."""
+    """Run cases with a checkout. The results are written after each case."""
     found: dict[str, Any] = json.loads(out.read_text()) if out.is_file() else {}
     for name in names:
         found[name] = measured(tree, CASES[name])
@@ -124,7 +124,7 @@ def measure(tree: Path, out: Path, names: list[str]) -> None:
 
 
 def measured(tree: Path, case: Case) -> dict[str, Any]:
-    """Errors, hash of the graph, hash of the trajectories and processor time of one case."""
+    """Run one case. Return its errors, the hashes of graph and trajectories, and the CPU time."""
     with tempfile.TemporaryDirectory() as name:
         folder, figures, graph_hash, cpu_s = Path(name), dict[str, float](), "", 0.0
         wanted = case.figures
@@ -154,7 +154,7 @@ def falsify(case: Case, folder: Path) -> None:
 
 
 def graph_errors(case: Case, folder: Path) -> dict[str, float]:
-    """Root mean square error of positions of each solved copy, m, after alignment with the optimum."""
+    """Return the ATE of each solved copy against the optimum, in m."""
     optimum = backends.create("gtsam-lm").solve(read_graph(DATA / "posegraphs" / f"{case.graph}.g2o")).poses
     found = {}
     for name in case.figures:
@@ -165,7 +165,7 @@ def graph_errors(case: Case, folder: Path) -> dict[str, float]:
 
 
 def run(tree: Path, command: str, folder: Path) -> tuple[dict[str, Any], float]:
-    """One command of a checkout: what it printed as JSON, and its processor time in s."""
+    """Run one command with a checkout. Return its JSON output and its CPU time in s."""
     arguments = [*command.replace("DATA", str(DATA)).split(), "--json"]
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -178,7 +178,7 @@ def run(tree: Path, command: str, folder: Path) -> tuple[dict[str, Any], float]:
 
 
 def compare(before: dict[str, Any], after: dict[str, Any]) -> int:
-    """Print one line a figure; how many got worse, as an exit code."""
+    """Print one line for each figure. Return 1 if a figure got worse, else 0."""
     worse = 0
     print("| case | error | before, m | after, m | same graph | same trajectories |\n|---|---|---:|---:|---|---|")
     for name in (name for name in before if name in after):
@@ -194,19 +194,19 @@ def compare(before: dict[str, Any], after: dict[str, Any]) -> int:
 
 
 def same(before: str, after: str) -> str:
-    """Whether two hashes are equal, as a word of the table; a graph that was read has none."""
+    """Say whether two hashes are equal. A pose graph that was read from a file has no hash."""
     return "–" if not before else "yes" if before == after else "no"
 
 
 def speed(before: Path, after: Path, pairs: int) -> int:
-    """Map in alternating pairs; 1 where the median ratio is above the bar."""
+    """Map with both checkouts in turn. Return 1 if a median ratio is above the bar, else 0."""
     slow = 0
     for name, command in SPEED.items():
         ratios = []
         for pair in range(pairs + 1):
             trees = (before, after) if pair % 2 else (after, before)
             seconds = {tree: timed(tree, command) for tree in trees}
-            if pair:  # the first pair fills the caches of compiled code
+            if pair:  # the first pair only fills the caches of compiled code
                 ratios.append(seconds[after] / seconds[before])
                 print(f"{name}: {seconds[before]:.2f} s before, {seconds[after]:.2f} s after", flush=True)
         median = statistics.median(ratios)
@@ -216,7 +216,7 @@ def speed(before: Path, after: Path, pairs: int) -> int:
 
 
 def timed(tree: Path, command: str) -> float:
-    """Processor time of one command, s."""
+    """Return the CPU time of one command, in s."""
     with tempfile.TemporaryDirectory() as folder:
         return run(tree, command, Path(folder))[1]
 

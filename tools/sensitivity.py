@@ -1,13 +1,14 @@
-"""Move each numeric setting by 30 % down and up, map a recording each time, and record what that does to the error of the map.
+"""Measure how much each numeric setting changes the error of a map.
 
     python tools/sensitivity.py aces.bag --config laser --relations relations.txt --end 200
     hybridmap simulate lab --out lab.mcap
     python tools/sensitivity.py lab.mcap --config rgbd
 
-The error is that of the primary back-end, which runs alone: the mean translation error over verified relations, or the ATE
-against the recording's own truth. Rows are added to `docs/sensitivity.csv` one by one, and those that are there are not run
-again, so that a run can be broken off and taken up; delete the file to begin anew. `tools/configuration_page.py` shows those
-that matter.
+Each setting is lowered by 30 % and raised by 30 %, and the recording is mapped each time. Only the primary back-end runs. The
+error is the mean translation error over verified relations, or else the ATE against the ground truth in the recording.
+
+Each result is one row of `docs/sensitivity.csv`. Rows that are in the file are not measured again, so an interrupted run can
+be continued. Delete the file to start again. `tools/configuration_page.py` shows the settings that matter.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ SHARE, MATTERS = 0.3, 0.02
 FIELDS = ("recording", "setting", "usual", "value", "error_m", "usual_m", "change", "matters")
 ELSEWHERE = {"laser": ("vision.rgbd.",), "rgbd": ("vision.laser.",)}
 NOT_THE_MAPPER = ("seed", "simulation.")
-"""Settings of the world and its noise, not of the mapper."""
+"""Settings of the simulated world and its noise. The mapper does not use them."""
 
 
 def main() -> None:
-    """Parse the command line, map, write rows."""
+    """Measure every setting that has no row yet."""
     options = _parser().parse_args()
     with tempfile.TemporaryDirectory() as folder:
         trial = Trial(options, Path(folder))
@@ -59,7 +60,7 @@ def main() -> None:
 
 
 class Trial:
-    """One recording, mapped again and again."""
+    """A recording that is mapped with changed settings."""
 
     def __init__(self, options: argparse.Namespace, folder: Path) -> None:
         self.name = Path(options.source).name
@@ -67,7 +68,7 @@ class Trial:
         self._options, self._folder = options, folder
 
     def error_m(self, settings: dict[str, Any]) -> float:
-        """Error of the primary back-end, m, with some settings of their own."""
+        """Map with some settings changed. Return the error of the primary back-end, in m."""
         primary = self.config.backends.names[0]
         config = Config.load(self._options.config, {"backends.names": [primary], **settings})
         stream = open_stream(self._options.source, config, end_s=self._options.end)
@@ -77,12 +78,12 @@ class Trial:
         if self._options.relations is not None:
             return relation_errors(estimate, relations_of(self._options.relations, estimate)).all.trans_mean_m
         if stream.groundtruth is None:
-            raise ConfigError(f"{self.name}: holds no truth; give --relations")
+            raise ConfigError(f"{self.name}: holds no ground truth; give --relations")
         return absolute_error(estimate, stream.groundtruth).rmse_m
 
 
 def moved(config: Config, elsewhere: tuple[str, ...]) -> Iterator[tuple[str, float, float]]:
-    """Each numeric setting that is not 0: its key, its value, and the value 30 % down and up."""
+    """Yield each numeric setting that is not 0, twice: its key, its usual value, and the lowered or raised value."""
     for setting in (setting for table in tables() for setting in table.settings):
         usual: Any = config
         for name in setting.key.split("."):
@@ -98,7 +99,7 @@ def moved(config: Config, elsewhere: tuple[str, ...]) -> Iterator[tuple[str, flo
 
 
 def rows(path: Path) -> list[dict[str, str]]:
-    """What has been recorded."""
+    """Return the recorded rows."""
     if not path.is_file():
         return []
     with path.open(encoding="utf-8", newline="") as file:
@@ -106,7 +107,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 def add(path: Path, row: tuple[str, ...]) -> None:
-    """Write one more row, with the header before the first."""
+    """Append one row. A new file gets the header first."""
     new = not path.is_file()
     with path.open("a", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -115,11 +116,13 @@ def add(path: Path, row: tuple[str, ...]) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("source", help="a recording")
-    parser.add_argument("--config", default="laser", help="configuration whose settings are moved")
-    parser.add_argument("--relations", type=Path, help="file of verified relations, where the recording holds no truth")
-    parser.add_argument("--end", type=float, help="seconds of the recording that are mapped")
-    parser.add_argument("--out", type=Path, default=SENSITIVITY, help="CSV file that rows are added to")
+    parser.add_argument("source", help="recording to map")
+    parser.add_argument("--config", default="laser", help="configuration whose settings are changed")
+    parser.add_argument(
+        "--relations", type=Path, help="file of verified relations; needed if the recording has no ground truth"
+    )
+    parser.add_argument("--end", type=float, help="map only the first so many seconds")
+    parser.add_argument("--out", type=Path, default=SENSITIVITY, help="CSV file to which rows are added")
     return parser
 
 

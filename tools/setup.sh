@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Leaves `.venv` with the command `hybridmap` and the developers' tools in it. May be run again at any time and from any
-# state: it does only what is missing. Needs Python >= 3.11 with venv; on Debian and Ubuntu, with root or password-less
-# sudo, it also installs the system libraries that open3d links.
+# Set up `.venv` with the command `hybridmap` and the tools for developers. The script may be run again at any time; it does
+# only what is missing. It needs Python >= 3.11 with venv. It also installs the system libraries that open3d needs, on
+# Debian and Ubuntu, if it has root or sudo without a password.
 #
-#   tools/setup.sh            use the first suitable python on the PATH
-#   PYTHON=/path/to/python tools/setup.sh
+#   tools/setup.sh                           use the first suitable Python on the PATH
+#   PYTHON=/path/to/python tools/setup.sh    use this Python
 set -euo pipefail
 
 root="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
@@ -14,13 +14,13 @@ stamp="$venv/.setup-stamp"
 say() { printf 'setup: %s\n' "$*" >&2; }
 die() { say "error: $*"; exit 1; }
 
-# Two `make` at once would fill the same folder: the second one waits.
+# Only one setup runs at a time. A second one waits.
 if command -v flock >/dev/null; then
   exec 9<"$root/pyproject.toml"
   flock 9
 fi
 
-# A virtual environment that an interrupted run left without pip, or without being one, is none.
+# An interrupted run may leave a folder that is no virtual environment, or one without pip. Such a folder is made anew.
 usable_venv() {
   "$venv/bin/python" -c 'import importlib.util as u, sys
 sys.exit(sys.prefix == sys.base_prefix or sys.version_info < (3, 11) or u.find_spec("pip") is None)' >/dev/null 2>&1
@@ -55,8 +55,8 @@ create_venv() {
   "$python" -m venv "$venv" || die "$python could not create $venv (see above)"
 }
 
-# What the installed packages are determined by: the declared dependencies, the place (an editable install and the
-# shebangs hold absolute paths) and the interpreter.
+# Everything that the installed packages depend on: the declared dependencies, the Python version, and the path of the
+# checkout, because an editable install and the shebangs hold absolute paths.
 fingerprint() {
   "$venv/bin/python" - "$root" <<'PY'
 import hashlib, pathlib, sys
@@ -91,7 +91,7 @@ package_of() {
   esac
 }
 
-# Sonames that the loader cannot find; open3d's optional torch and tensorflow plug-ins are none of ours.
+# Print the shared libraries that the loader cannot find. The plug-ins of open3d for torch and tensorflow are not used.
 missing_libraries() {
   command -v ldd >/dev/null || return 0
   local library

@@ -1,9 +1,9 @@
-"""How large a tree is: lines, modules, modules that serve one other alone, settings.
+"""Count the lines, modules and settings of a checkout, and the modules that only one other module imports.
 
     python tools/size.py [TREE]
 
-TREE is the folder that holds `hybridmap/` and `tools/`; default: the one that this file lies in. An importer is a module of
-the package with an `import` of the module anywhere in it, by its own name or as a name of its package.
+TREE is the folder that holds `hybridmap/` and `tools/`; default: this checkout. Every `import` counts, also inside a
+function.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ PACKAGE = "hybridmap"
 
 
 def main(tree: Path) -> None:
-    """Print the table."""
+    """Print the counts."""
     sys.path.insert(0, str(tree))
     from hybridmap.config import Config
 
@@ -37,17 +37,17 @@ def main(tree: Path) -> None:
 
 
 def name_of(path: Path, tree: Path) -> str:
-    """Dotted name of a module."""
+    """Return the dotted name of a module."""
     return ".".join(path.relative_to(tree).with_suffix("").parts).removesuffix(".__init__")
 
 
 def is_command(name: str) -> bool:
-    """Whether a module belongs to the command line."""
+    """Tell whether a module belongs to the command line."""
     return name.startswith(f"{PACKAGE}.cli")
 
 
 def importers(files: dict[str, Path]) -> dict[str, set[str]]:
-    """Module -> the modules that import it; packages themselves are not asked after."""
+    """Return module -> the modules that import it. The `__init__` modules of packages are left out."""
     found: dict[str, set[str]] = defaultdict(set)
     for user, path in files.items():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -58,7 +58,7 @@ def importers(files: dict[str, Path]) -> dict[str, set[str]]:
 
 
 def imported(node: ast.AST) -> Iterator[str]:
-    """Dotted names that a statement imports, modules or what is in them."""
+    """Yield the dotted names that a statement imports: modules, and names in modules."""
     if isinstance(node, ast.Import):
         yield from (alias.name for alias in node.names)
     elif isinstance(node, ast.ImportFrom) and node.module is not None:
@@ -67,7 +67,7 @@ def imported(node: ast.AST) -> Iterator[str]:
 
 
 def settings(section: type[BaseModel], above: str = "") -> Iterator[str]:
-    """Dotted names of the values that can be set; a section that may be left out counts as one."""
+    """Yield the dotted name of each setting. An optional section counts as one setting."""
     for name, field in section.model_fields.items():
         kind = field.annotation
         if isinstance(kind, type) and issubclass(kind, BaseModel):

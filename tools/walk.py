@@ -1,9 +1,9 @@
-"""Which files of the package one visits who follows a laser scan that becomes a node: every function that `Mapper.step` calls.
+"""Count the files of the package that take part when a laser scan becomes a node.
 
     python tools/walk.py [TREE] [--source SOURCE] [--end SECONDS]
 
-TREE is the folder that holds `hybridmap/`; default: the one that this file lies in. Functions that numba has compiled are not
-seen. Files are counted a node, so that a search for loops counts where it is made.
+The script maps a recording and notes each function that `Mapper.step` calls. For each new node it counts the files of these
+functions. Functions compiled by numba are not seen. TREE is the folder that holds `hybridmap/`; default: this checkout.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ ACES = Path(os.environ.get("HYBRIDMAP_DATA") or ROOT.parent / "shared" / "data")
 
 
 def main() -> None:
-    """Map a stretch and print the table."""
+    """Map part of a recording and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("tree", nargs="?", type=Path, default=ROOT)
+    parser.add_argument("tree", nargs="?", type=Path, default=ROOT, help="folder that holds hybridmap/")
     parser.add_argument("--source", default=str(ACES), help="recording or simulated world with a laser; default: aces")
-    parser.add_argument("--end", type=float, default=200.0, help="seconds of it")
+    parser.add_argument("--end", type=float, default=200.0, help="map only the first so many seconds")
     options = parser.parse_args()
     sys.path.insert(0, str(options.tree))
     visited = walk(options.source, options.end, options.tree.resolve() / "hybridmap")
@@ -39,14 +39,14 @@ def main() -> None:
 
 
 def walk(source: str, end_s: float, package: Path, overrides: Mapping[str, Any] = MappingProxyType({})) -> list[set[str]]:
-    """The files of the package that each step that made a node visited."""
+    """Return one set of files for each node: those whose functions were called in the step that made it."""
     from hybridmap.cli.choose import choose
     from hybridmap.mapper import Mapper
 
     visited: list[set[str]] = []
 
     class Watched(Mapper):
-        """A mapper whose steps are watched."""
+        """A mapper that notes which functions its steps call."""
 
         def step(self, ready: Any) -> Any:
             files: set[str] = set()

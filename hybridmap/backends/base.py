@@ -45,6 +45,7 @@ class Outcome:
         rejected: ids of the loops treated as outliers.
         values: the poses in the solver's own form, for a warm start.
         calibrated: the graph with the odometry calibration that the solver estimated.
+        figures: further figures that only this solver knows, by the name of their measure in `metrics.FIGURES`.
     """
 
     poses: Array
@@ -55,6 +56,7 @@ class Outcome:
     rejected: tuple[int, ...] = ()
     values: Any = None
     calibrated: PoseGraph | None = None
+    figures: dict[str, float] = field(default_factory=dict)
 
 
 Solver = Callable[[PoseGraph, Array], Outcome]
@@ -82,6 +84,7 @@ class SolveReport:
         weak_edges: down-weighted odometry and registration edges -> weight, if the kernel `backends.robust.odometry` leaves
             less than a tenth. They are excluded from the unit variance.
         hanging_nodes: number of nodes that only down-weighted edges and rejected loops join to node 0.
+        figures: further figures that only this solver knows, by the name of their measure.
 
     If the back-end calibrates odometry, its estimate applies to odometry chi2, unit variance, clusters and down-weighted edges.
     """
@@ -101,6 +104,7 @@ class SolveReport:
     inconsistent_edge_ids: tuple[int, ...] = ()
     weak_edges: dict[int, float] = field(default_factory=dict)
     hanging_nodes: int = 0
+    figures: dict[str, float] = field(default_factory=dict)
 
     @property
     def doubt(self) -> str:

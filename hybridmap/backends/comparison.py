@@ -19,7 +19,7 @@ from hybridmap.config.backends import BackendsConfig, ConsistencyConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
-from hybridmap.metrics import Metric, figure
+from hybridmap.metrics import FIGURES, Metric, figure
 
 Progress = Callable[[int, int], None]
 
@@ -184,6 +184,12 @@ def _driven(row: Row, backend: Backend, graph: PoseGraph, report: Callable[[int]
     return replace(row, solution=Solution(final.poses, total), curve=np.array(curve, dtype=np.float64))
 
 
+def _own_figure(measure: str, title: str, value: float) -> Metric:
+    """A figure that only the solver knows; back-ends of other packages may have some that our list does not describe."""
+    name = f"{measure}/{title}"
+    return figure(name, value) if f"{measure}/" in FIGURES else Metric(name, float(value), "1", f"{measure} by the solver")
+
+
 def metrics_of(rows: Sequence[Row]) -> list[Metric]:
     """Figures `<measure>/<title>` of the rows with a solution."""
     metrics = []
@@ -208,4 +214,5 @@ def metrics_of(rows: Sequence[Row]) -> list[Metric]:
         known = {measure: value for measure, value in figures.items() if value is not None}
         title = row.title or row.backend
         metrics += [figure(f"{measure}/{title}", value, what="the solution") for measure, value in known.items()]
+        metrics += [_own_figure(measure, title, value) for measure, value in report.figures.items()]
     return metrics

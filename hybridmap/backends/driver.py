@@ -221,6 +221,7 @@ class Driver:
             unit_variance=unit_variance(meant, strain, without),
             weak_edges=weak,
             hanging_nodes=hanging,
+            figures=outcome.figures,
         )
         return Solution(outcome.poses, report)
 

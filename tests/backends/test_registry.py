@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 
 from hybridmap import backends
-from hybridmap.backends.comparison import compare
-from hybridmap.backends.driver import Ensemble
+from hybridmap.backends.base import Outcome
+from hybridmap.backends.comparison import compare, metrics_of
+from hybridmap.backends.driver import Driver, Ensemble
 from hybridmap.config import Config
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.mapper import Mapper
 from hybridmap.metrics import StageClock
+from hybridmap.store.schema import report_from_json, report_to_json
 from tests.backends.graphs_for_tests import laps
 
 
@@ -50,3 +52,15 @@ def test_back_ends_come_once_each_under_their_own_names():
         Ensemble(BackendsConfig(), StageClock(), [Still(), Still()])
     with pytest.raises(BackendError, match="gtsam-lm"):
         backends.register("gtsam-lm", lambda config: Still())
+
+
+def test_a_figure_that_only_the_solver_knows_comes_through_to_comparison_and_map_file():
+    def solve(graph, start):
+        return Outcome(start, backends.SolveStatus.CONVERGED, "as it was", 1, figures={"iterations": 7.0, "stiffness": 3.0})
+
+    graph, _ = laps(np.random.default_rng(0), nodes=8, per_lap=4)
+    (row,) = compare(graph, [Driver("still", BackendsConfig(), solve)])
+    assert row.solution is not None
+    assert report_from_json(report_to_json(row.solution.report)).figures == {"iterations": 7.0, "stiffness": 3.0}
+    (stiffness,) = (metric for metric in metrics_of([row]) if metric.name == "stiffness/still")
+    assert (stiffness.value, stiffness.unit) == (3.0, "1")
