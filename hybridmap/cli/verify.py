@@ -11,7 +11,7 @@ import typer
 def verify(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for verify.html and metrics.json.")],
     seed: Annotated[int, typer.Option(help="Random seed of drives, sampled cells and noise.", min=0)] = 0,
-    setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. neural.kernel_gain_first=1.3.")] = None,
+    setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. neural.spacing_max_m=0.6.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing verification.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
