@@ -24,7 +24,7 @@ def calibrate(
     leg: Annotated[
         float | None,
         typer.Option(
-            help="Length of the compared legs, m (>= 0.1; not with `joint`). Default: 1 to 16 m, chosen from the drive."
+            help="Length of the pieces of the drive that are compared, 0.1 m or more; not with `joint`. Default: 1 to 16 m."
         ),
     ] = None,
     out: Annotated[
@@ -36,7 +36,8 @@ def calibrate(
     """Estimate the systematic errors of wheel odometry: gain, turn gain, heading bias (rad/m), with standard deviations.
 
     The estimate comes from the loop closures of the sessions, or from reference trajectories if they are given.
-    --out writes a configuration with the estimate. Present values stay unless one differs by more than three sigma.
+    --out writes a configuration with the estimate. Its values change only if one of them differs from the
+    estimate by more than three standard deviations.
     """
     from hybridmap.calibration.estimate import calibrated, changes, metrics_of, verdict
     from hybridmap.calibration.sessions import common_tree, estimate_of, read_drive, require_options

@@ -19,15 +19,16 @@ _ROUND_OFF = 1e-6  # a map without any loop is that of odometry; by so much may 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Result of one bar for one group and back-end.
+    """Result of one bar (a limit for a figure) for one group of cells and one back-end.
 
     Attributes:
-        bar: the bar.
-        cell: the first cell of the group; its labels are those of the group, except for the seed.
-        values: of the cells over the seeds; None for a missing figure, which misses any bar.
+        bar: the configured limit that was checked.
+        cell: first cell of the group; all cells of the group share its labels, except for the seed.
+        values: the figure in each cell of the group, one per seed; None for a missing figure, which misses any bar.
         limits: the limit of each value.
-        value, limit: the statistic of the values, and its limit; NaN if a value is missing.
-        passed: whether the bar is kept.
+        value: the bar's statistic (worst, median or mean) of the values; NaN if a value is missing.
+        limit: the limit for that statistic; NaN if a value is missing.
+        passed: whether the figure is within the limit.
     """
 
     bar: BarConfig
@@ -40,12 +41,12 @@ class Verdict:
 
     @property
     def label(self) -> str:
-        """The group in words, with the back-end."""
+        """Name of the group and the back-end, for people."""
         return f"{self.cell.label}/{self.cell.backend}"
 
     @property
     def unit(self) -> str:
-        """Unit of the figure."""
+        """Unit of the figure that the bar limits."""
         return unit_of(self.bar.figure)
 
     @property
@@ -60,7 +61,7 @@ class Verdict:
 
     @property
     def said(self) -> str:
-        """One line for people."""
+        """One line for people: statistic, number of seeds, missing figures, and limit."""
         over = f" of {len(self.values)} seeds" if len(self.values) > 1 else ""
         missing = sum(value is None for value in self.values)
         lacking = f", {missing} without a figure" if missing else ""
@@ -68,7 +69,7 @@ class Verdict:
 
 
 def judge(grid: Grid, results: Mapping[str, CellResult]) -> list[Verdict]:
-    """Check every bar of the study against every group that it applies to, in order."""
+    """Check every bar of a study against every group of cells that it applies to, in the order of the bars."""
     groups = grid.groups()
     return [
         _verdict(bar, cells, groups, results)

@@ -34,10 +34,13 @@ class CellTask:
     """The input of a cell; it may be sent to another machine.
 
     Attributes:
-        key: digest of everything that determines the figures.
-        frozen: the graph with its reference, packed.
-        drift, kind, rate, seed: disturbance of the graph.
-        backend, settings, start, way: as in `model.BackendVariant`.
+        key: digest of everything that determines the figures of the cell.
+        frozen: the clean graph with its reference poses, as bytes of `Frozen.pack`.
+        drift: errors to add to the odometry edges.
+        kind: kind of the false loop closures to add.
+        rate: share of false loops among all loops of the disturbed graph, 0 <= rate < 1.
+        seed: seed of the random disturbances.
+        variant: the back-end, its settings, and how it gets the graph.
     """
 
     key: str
@@ -54,11 +57,12 @@ class CellResult:
     """The result of a cell.
 
     Attributes:
-        key: of the task.
-        status: that of the back-end, `failed` for a typed error, `unmapped` if there was no graph.
+        key: key of the task.
+        status: status of the back-end; `failed` for an error of hybridmap, `unmapped` if the source gave no graph, `mapped` if
+            the map of the drive itself was judged.
         message: one line for people.
-        figures: of `measures`, and counts of the graph; None for a missing figure (no map, no error).
-        timings: `measures.TIMINGS`; kept apart from the results.
+        figures: name -> value, for the figures of `measures` and counts of the graph; None for a missing one.
+        timings: name -> value, for the names in `measures.TIMINGS`; stored apart from the figures, as they differ between runs.
         code: digest of the code that computed the result.
     """
 
@@ -70,19 +74,18 @@ class CellResult:
     code: str = field(default_factory=lambda: provenance.solving())
 
     def figure(self, name: str) -> float | None:
-        """A figure or timing by name; None if missing."""
+        """Value of the figure or timing of this name; None if missing."""
         return self.figures.get(name, self.timings.get(name))
 
 
 def key_of(source_key: str, drift: DriftConfig, false_loops: tuple[str, float, int], variant: BackendVariant) -> str:
-    """Digest of everything that determines a cell. Inputs without effect are left out: at a rate of 0, kind and seed.
+    """Digest of everything that determines a cell. At a rate of 0, the kind and seed of false loops are left out.
 
     Args:
-        source_key: of the clean graph.
-        drift: disturbance of its odometry.
-        false_loops: kind, rate and seed.
-        variant: the back-end's name, start and way.
-        settings: its whole section, a `BackendsConfig`.
+        source_key: key of the clean graph.
+        drift: errors to add to its odometry edges.
+        false_loops: kind, rate and seed of the false loops.
+        variant: the back-end, its settings, and how it gets the graph.
     """
     kind, rate, seed = false_loops
     return provenance.digest(
@@ -99,7 +102,7 @@ def key_of(source_key: str, drift: DriftConfig, false_loops: tuple[str, float, i
 
 
 def run(task: CellTask) -> CellResult:
-    """Disturb the graph, solve it and compute the errors. A typed error becomes a result; any other exception is raised."""
+    """Disturb the graph, solve it and compute the errors. A `HybridMapError` becomes a result; other exceptions are raised."""
     frozen = Frozen.unpack(task.frozen)
     if frozen.graph is None:
         return CellResult(task.key, UNMAPPED, frozen.failure)
@@ -136,7 +139,14 @@ def _as_mapped(task: CellTask, frozen: Frozen) -> CellResult:
 
 
 def judge(own: PoseGraph, graph: PoseGraph, solution: Solution, reference: Array) -> dict[str, float | None]:
-    """Figures of a solution of `graph`, which is `own` with false loops appended; `reference` (N, 3) may hold NaN."""
+    """Compute the figures of a solution of `graph`.
+
+    Args:
+        own: the graph without false loops.
+        graph: the same graph with false loops appended.
+        solution: a back-end's solution of `graph`.
+        reference: (N, 3) reference poses, m and rad; NaN where unknown.
+    """
     false = np.arange(graph.n_edges) >= own.n_edges
     kept, rejected = _fates(graph, solution)
     ate_m, yaw_deg = errors(solution.poses, reference)
@@ -156,7 +166,10 @@ def judge(own: PoseGraph, graph: PoseGraph, solution: Solution, reference: Array
 
 
 def errors(poses: Array, reference: Array) -> tuple[float, float]:
-    """RMSE of position (m) and heading (deg) after SE(2) alignment, over the nodes with a known reference; NaN without."""
+    """Root mean square errors of position (m) and heading (deg) against the reference (N, 3), after SE(2) alignment.
+
+    Only nodes with a known reference pose count; both errors are NaN if there are too few.
+    """
     known = np.isfinite(reference).all(axis=1)
     if np.count_nonzero(known) < 3:
         return math.nan, math.nan

@@ -21,12 +21,12 @@ class Cell:
     """One cell: one row of the table.
 
     Attributes:
-        source, setting, backend: titles in the study.
-        kind: of the false loops; empty at rate 0.
-        rate: share of false loops.
-        seed: None if nothing in the cell is random.
-        source_key: of the clean graph.
-        key: of the result; cells with necessarily equal results share a key.
+        source, setting, backend: titles of source, setting and back-end in the study.
+        kind: kind of the added false loops; empty string at rate 0.
+        rate: share of false loops among all loops, 0 <= rate < 1.
+        seed: seed of everything random; None if nothing in the cell is random.
+        source_key: cache key of the clean graph.
+        key: cache key of the result; cells whose results are necessarily equal share a key.
     """
 
     source: str
@@ -40,12 +40,12 @@ class Cell:
 
     @property
     def label(self) -> str:
-        """The group in words."""
+        """Source, setting, kind and rate of the cell, as one name for people."""
         return f"{self.source}/{self.setting}" + (f"/{self.kind} {100 * self.rate:g} %" if self.kind else "")
 
     @property
     def group(self) -> Group:
-        """The labels shared by the cells of all back-ends and seeds that are summarised together."""
+        """The labels of the cell without back-end and seed; cells with equal labels are summarised together."""
         return self.source, self.setting, self.kind, self.rate
 
 
@@ -54,9 +54,9 @@ class Grid:
     """All cells of a study, and the tasks that make their graphs.
 
     Attributes:
-        study: the study.
-        cells: in the order of the tables.
-        sources: key -> task, for every graph that a cell needs.
+        study: the configuration of the study.
+        cells: all cells, in the order of the tables.
+        sources: cache key of a clean graph -> the task that makes it, for every graph that a cell needs.
     """
 
     study: StudyConfig
@@ -64,14 +64,14 @@ class Grid:
     sources: dict[str, SourceTask]
 
     def groups(self) -> dict[tuple[Group, str], list[Cell]]:
-        """Group and back-end -> its cells, one per seed, in order."""
+        """(Group, back-end) -> its cells, one per seed, in the order of the tables."""
         found: dict[tuple[Group, str], list[Cell]] = {}
         for cell in self.cells:
             found.setdefault((cell.group, cell.backend), []).append(cell)
         return found
 
     def task(self, cell: Cell, frozen: bytes) -> CellTask:
-        """The task of a cell, given its packed graph."""
+        """The task that computes a cell, given its clean graph as bytes of `Frozen.pack`."""
         setting = next(setting for setting in self.study.settings if setting.name == cell.setting)
         variant = next(variant for variant in self.study.backends if variant.title == cell.backend)
         kind: Kind = "aliased" if cell.kind == "aliased" else "random"
@@ -79,7 +79,7 @@ class Grid:
 
 
 def lay_out(study: StudyConfig) -> Grid:
-    """Make the cells: sources, settings, kinds and rates, seeds, back-ends; the last varies fastest.
+    """Make the cells of a study: the product of sources, settings, false loops, seeds and back-ends; back-ends vary fastest.
 
     Files, sessions and recordings are read, since their content is part of the keys. Nothing is mapped.
 

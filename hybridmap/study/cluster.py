@@ -45,7 +45,7 @@ class DaskCluster:
             raise StudyError(f"{address}: the scheduler has no worker; start some with `dask worker {address}`") from None
 
     def run(self, work: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[tuple[int, Outcome | Lost]]:
-        """See `pools.Pool.run`.
+        """Run every task on the cluster; yield (index of the task, outcome) in any order, each index once.
 
         Raises:
             StudyError: the connection to the scheduler is lost; finished tasks have been yielded.
@@ -62,7 +62,7 @@ class DaskCluster:
             self._client.cancel(list(futures))
 
     def close(self) -> None:
-        """Close the connection; scheduler and workers keep running."""
+        """Close the connection to the scheduler; scheduler and workers keep running."""
         self._client.close()
 
     def _lost(self, error: BaseException) -> Lost:

@@ -35,12 +35,12 @@ _SLIP = (0.3, 0.05, math.radians(15.0))  # standard deviations of a slip: ahead,
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """An entry of the table.
+    """An entry of the table of disturbances.
 
     Attributes:
         apply: (samples, strength, generator, rig) -> disturbed samples. The strength is a number, or `count` numbers.
-        by_chance: whether it is random.
-        most: the greatest strength.
+        by_chance: whether the disturbance uses random numbers.
+        most: greatest strength that a study may give.
         count: how many numbers the strength consists of.
     """
 
@@ -51,13 +51,13 @@ class Disturbance:
 
 
 def disturbed(samples: Samples, rig: Rig, disturbances: Mapping[str, float | tuple[float, ...]], seed: int) -> Iterator[Sample]:
-    """The disturbed samples; the disturbances apply in the order of `TABLE`.
+    """Disturb the samples of a drive; the disturbances are applied in the order of `TABLE`.
 
     Args:
-        samples: of a stream, in order of stamp.
-        rig: its sensors.
+        samples: samples of a stream, in order of stamp.
+        rig: the sensors of the stream.
         disturbances: name -> strength.
-        seed: of the random ones; each has a generator of its own.
+        seed: seed of the random disturbances; each has a generator of its own.
     """
     for name, one in TABLE.items():
         strength = disturbances.get(name, 0.0)
@@ -67,12 +67,12 @@ def disturbed(samples: Samples, rig: Rig, disturbances: Mapping[str, float | tup
 
 
 def by_chance(disturbances: Mapping[str, float | tuple[float, ...]]) -> bool:
-    """Whether the samples depend on the seed."""
+    """Whether any of the disturbances (name -> strength) uses random numbers, so that the samples depend on the seed."""
     return any(TABLE[name].by_chance and np.any(strength) for name, strength in disturbances.items())
 
 
 def check(name: str, strength: float | tuple[float, ...], origin: str) -> None:
-    """Check an entry of a study.
+    """Check one disturbance that a study asks for; `origin` names the study in the error.
 
     Raises:
         ConfigError: an unknown disturbance, or an invalid strength.
@@ -89,35 +89,35 @@ def check(name: str, strength: float | tuple[float, ...], origin: str) -> None:
 
 
 def scan_range_m(ranges: Ranges, limit_m: float, _rng: np.random.Generator) -> Ranges:
-    """Remove returns beyond this range, m."""
+    """Remove laser returns beyond `limit_m`."""
     return np.where(ranges < limit_m, ranges, np.float32(np.nan))
 
 
 def scan_covered(ranges: Ranges, share: float, _rng: np.random.Generator) -> Ranges:
-    """Cover this share of the field of view, half of it at either end."""
+    """Cover this share of the laser's field of view, half of it at either end."""
     ranges, covered = ranges.copy(), round(0.5 * share * len(ranges))
     ranges[:covered] = ranges[len(ranges) - covered :] = np.nan
     return ranges
 
 
 def scan_noise_m(ranges: Ranges, sigma_m: float, rng: np.random.Generator) -> Ranges:
-    """Add white noise to every range; standard deviation, m."""
+    """Add white noise of standard deviation `sigma_m` to every laser range."""
     return ranges + np.float32(sigma_m) * rng.standard_normal(ranges.shape, dtype=np.float32)
 
 
 def beams_lost(ranges: Ranges, share: float, rng: np.random.Generator) -> Ranges:
-    """Remove the returns of this share of the beams."""
+    """Remove the returns of a random share of the laser's beams."""
     return np.where(rng.random(ranges.shape) < share, np.float32(np.nan), ranges)
 
 
 def beams_short(ranges: Ranges, share: float, rng: np.random.Generator) -> Ranges:
-    """Stop this share of the beams at a random part of their range."""
+    """Shorten a random share of the laser's beams to a random part of their range, as dust or passers-by would."""
     stopped, where = rng.random((2, *ranges.shape), dtype=np.float32)
     return np.where(stopped < share, where * ranges, ranges)
 
 
 def blur_s(samples: Samples, exposure_s: float, _rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
-    """Blur images along their rows by the robot's turn during this exposure time, s."""
+    """Blur images along their rows, as the robot's turn during an exposure of `exposure_s` would."""
     newest: SelfMotion | None = None
     rate_rad_s, camera = 0.0, rig.sensors.get("camera")
     for sample in samples:
@@ -133,53 +133,53 @@ def blur_s(samples: Samples, exposure_s: float, _rng: np.random.Generator, rig: 
 
 
 def darker(frame: RgbdFrame, share: float, _rng: np.random.Generator) -> RgbdFrame:
-    """Reduce every colour value by this share: 0.9 is dusk, 1 is night."""
+    """Reduce every colour value by this share: 0.9 is like dusk; 1 gives black images."""
     return replace(frame, color=np.rint(round(1.0 - share, 9) * frame.color).astype(np.uint8))
 
 
 def color_noise(frame: RgbdFrame, sigma: float, rng: np.random.Generator) -> RgbdFrame:
-    """Add white noise to every colour value; standard deviation, out of 255."""
+    """Add white noise of standard deviation `sigma` to every colour value, which is in 0..255."""
     grain = np.float32(sigma) * rng.standard_normal(frame.color.shape, dtype=np.float32)
     return replace(frame, color=np.clip(frame.color + grain + np.float32(0.5), 0, 255).astype(np.uint8))
 
 
 def depth_noise_m(frame: RgbdFrame, sigma_m: float, rng: np.random.Generator) -> RgbdFrame:
-    """Add white noise to every depth; standard deviation at 1 m, growing with the square of the depth, m."""
+    """Add white noise to every depth. Its standard deviation is `sigma_m` at 1 m and grows with the square of the depth."""
     grain = np.float32(sigma_m) * rng.standard_normal(frame.depth_m.shape, dtype=np.float32)
     noisy = frame.depth_m + grain * (frame.depth_m / np.float32(_NEAR_DEPTH_M)) ** 2
     return replace(frame, depth_m=np.where(frame.depth_m > 0.0, np.maximum(noisy, 0.0), frame.depth_m))
 
 
 def depth_range_m(frame: RgbdFrame, limit_m: float, _rng: np.random.Generator) -> RgbdFrame:
-    """Remove depth beyond this, m."""
+    """Remove depth beyond `limit_m`."""
     return replace(frame, depth_m=np.where(frame.depth_m > limit_m, np.float32(0.0), frame.depth_m))
 
 
 def depth_lost(frame: RgbdFrame, share: float, rng: np.random.Generator) -> RgbdFrame:
-    """Remove the depth of this share of the pixels."""
+    """Remove the depth of a random share of the pixels."""
     gone = rng.random(frame.depth_m.shape, dtype=np.float32) < share
     return replace(frame, depth_m=np.where(gone, np.float32(0.0), frame.depth_m))
 
 
 def wheel_scale(step: Array, share: float, _rng: np.random.Generator) -> Array:
-    """Increase every reported distance by this share."""
+    """Increase the distance of an odometry step by this share of it."""
     factors: Array = np.array([1.0 + share, 1.0 + share, 1.0])
     return step * factors
 
 
 def wheel_turn_scale(step: Array, share: float, _rng: np.random.Generator) -> Array:
-    """Increase every reported turn by this share."""
+    """Increase the turn of an odometry step by this share of it."""
     factors: Array = np.array([1.0, 1.0, 1.0 + share])
     return step * factors
 
 
 def wheel_pull_deg_per_m(step: Array, bias_deg: float, _rng: np.random.Generator) -> Array:
-    """Add a heading bias to the left, degrees per metre driven."""
+    """Turn an odometry step to the left by `bias_deg` per metre driven."""
     return _turned(step, math.radians(bias_deg) * math.hypot(step[0], step[1]))
 
 
 def wheel_noise_deg_per_sqrt_m(step: Array, sigma_deg: float, rng: np.random.Generator) -> Array:
-    """Add a random walk of the heading, degrees per square root of a metre."""
+    """Add a random walk to the heading of odometry, of standard deviation `sigma_deg` times the square root of the metres."""
     return _turned(step, rng.normal() * math.radians(sigma_deg) * math.sqrt(math.hypot(step[0], step[1])))
 
 
@@ -189,13 +189,13 @@ def _turned(step: Array, turn_rad: float) -> Array:
 
 
 def wheel_slips_per_m(step: Array, rate: float, rng: np.random.Generator) -> Array:
-    """Add slips of about 0.3 m and 15 degrees to single steps, this many per metre driven."""
+    """Add slips of about 0.3 m and 15 degrees to random odometry steps, on average `rate` per metre driven."""
     hit, slip = rng.random() < rate * math.hypot(step[0], step[1]), rng.normal(size=3) * _SLIP
     return step + slip if hit else step
 
 
 def views_lost(samples: Samples, share: float, _rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
-    """Remove this share of the scans and frames at regular intervals, as a lower rate would."""
+    """Remove this share of the scans and frames at regular intervals, as a lower sensor rate would."""
     number, kept = 0, 1.0 - share
     for sample in samples:
         if isinstance(sample, Observation):
@@ -206,7 +206,7 @@ def views_lost(samples: Samples, share: float, _rng: np.random.Generator, _rig: 
 
 
 def views_late_s(samples: Samples, late_s: float, _rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
-    """Delay the stamps of scans and frames by this time, s."""
+    """Make the stamps of scans and frames later by `late_s`."""
     held: deque[Observation] = deque()
     for sample in samples:
         while held and held[0].stamp_ns < sample.stamp_ns:
@@ -221,9 +221,9 @@ def views_late_s(samples: Samples, late_s: float, _rng: np.random.Generator, _ri
 def kidnapped_s(
     samples: Samples, times_s: tuple[float, float, float], _rng: np.random.Generator, _rig: Rig
 ) -> Iterator[Sample]:
-    """Kidnap the robot: [picked up, put down, end of the drive], s from the first stamp.
+    """Kidnap the robot at `times_s`: picked up, put down, end of the drive; seconds from the first stamp.
 
-    Samples in between are removed, and the odometry continues from its last pose: the wheels do not turn.
+    Samples between the first two times are removed. Odometry continues from its last pose, as the wheels do not turn.
     """
     up_ns = down_ns = end_ns = -1
     held, onward = IDENTITY, None

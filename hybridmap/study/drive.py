@@ -40,15 +40,16 @@ _KNOWN_M, _KNOWN_RAD = 1.0, math.radians(45.0)  # so close to where it was befor
 
 @dataclass(frozen=True, slots=True)
 class MappedDrive:
-    """A drive to be mapped; a worker needs the recording at the same path.
+    """A drive to be mapped; on a cluster, every worker needs the recording at the same path.
 
     Attributes:
-        source: a simulated world or the path of a recording.
+        source: name of a simulated world, or path of a recording.
         config: configuration of the mapping, as plain values.
-        start_s, end_s: map only this part.
-        disturb: disturbances and their strengths.
-        seed: of the disturbances.
-        reference, relations: paths of ground truth and relations; empty: none, or the stream's own ground truth.
+        start_s, end_s: map only this part, seconds from the first stamp; None: no limit.
+        disturb: name of a disturbance -> strength.
+        seed: seed of the disturbances.
+        reference: path of the ground truth; empty string: the stream's own ground truth, if it has one.
+        relations: path of a file of true relative poses; empty string: none.
     """
 
     source: str
@@ -251,7 +252,7 @@ def _stamps(mapper: Mapper) -> NDArray[np.int64]:
 
 
 def truth_at(truth: Trajectory, stamps_ns: NDArray[np.int64]) -> Array:
-    """True poses (N, 3) at stamps, NaN where unknown."""
+    """True poses (N, 3) at stamps (N,) ns, m and rad; NaN where the ground truth has no pose."""
     poses = truth.at(stamps_ns)
     poses[~known_at(truth, stamps_ns)] = np.nan
     return poses

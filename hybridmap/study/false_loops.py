@@ -22,7 +22,7 @@ _RUN = 5  # aliased loops that come one after the other and agree with each othe
 
 
 def with_drift(graph: PoseGraph, drift: DriftConfig, seed: int) -> PoseGraph:
-    """The graph with disturbed odometry edges; `initial` changes with them.
+    """Copy of the graph with errors added to its odometry edges; `initial` becomes the chain of the disturbed edges.
 
     A step of length s turns by another bias * s, half of it before the step, and its length becomes (1 + scale) s.
     """
@@ -42,10 +42,10 @@ def with_drift(graph: PoseGraph, drift: DriftConfig, seed: int) -> PoseGraph:
 
 
 def with_false_loops(graph: PoseGraph, kind: Kind, rate: float, seed: int) -> PoseGraph:
-    """The graph with false loops appended (`inject`); the same for every back-end.
+    """Copy of the graph with false loops appended (see `inject`); the same arguments give the same loops.
 
     Raises:
-        GraphError: no loop to copy.
+        GraphError: the graph has no loop to copy.
     """
     return graph if rate == 0.0 else inject(graph, rate, kind, np.random.default_rng(seed))
 
@@ -55,9 +55,9 @@ def inject(graph: PoseGraph, share: float, mode: Kind, rng: np.random.Generator)
 
     Args:
         graph: a graph with true loops, whose measurements and information the false ones copy.
-        share: of false loops among all loops afterwards, 0 <= share < 1.
-        mode: `random` joins two random nodes; `aliased` copies a run of neighbouring true loops with all old nodes shifted
-            by the same number, as two similar corridors would.
+        share: share of false loops among all loops afterwards, 0 <= share < 1.
+        mode: kind of false loops. `random` joins two random nodes. `aliased` copies a run of neighbouring true loops with all
+            old nodes shifted by the same number, as two similar corridors would.
         rng: the only random generator.
 
     Raises:
@@ -85,14 +85,14 @@ def inject(graph: PoseGraph, share: float, mode: Kind, rng: np.random.Generator)
 
 
 def drop_out(graph: PoseGraph, share: float, rng: np.random.Generator) -> PoseGraph:
-    """Disturb some odometry steps; `initial` becomes the resulting chain.
+    """Copy of the graph with large errors in some odometry edges; `initial` becomes the chain of the disturbed edges.
 
-    Each chosen odometry edge turns by 20 deg more, to either side, and slips 0.5 m in any direction. Its information stays,
+    Each chosen edge turns by 20 deg more, to either side, and slips 0.5 m in any direction. Its information stays the same,
     as the wheels do not notice.
 
     Args:
-        graph: with odometry edges.
-        share: of its odometry edges to disturb, 0 <= share <= 1.
+        graph: a graph with odometry edges.
+        share: share of the odometry edges to disturb, 0 <= share <= 1.
         rng: the only random generator.
 
     Raises:

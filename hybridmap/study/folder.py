@@ -21,7 +21,7 @@ STUDY_FOLDER = Kind("study", _FILES, lambda folder: holds_only(folder, _FILES), 
 
 @dataclass(frozen=True, slots=True)
 class StudyFolder:
-    """Paths and files of one study; results of earlier configurations stay without effect.
+    """Paths and files of one study. Results of other configurations may stay in the folder; they are not read.
 
     Attributes:
         path: the folder, as given by `--out`.
@@ -30,18 +30,18 @@ class StudyFolder:
     path: Path
 
     def result(self, key: str) -> CellResult | None:
-        """The stored result of a cell; None if there is none, or if it is damaged, as by a loss of power."""
+        """The stored result with this key; None if there is none, or if its file is damaged, e.g. by a loss of power."""
         try:
             return CellResult(**json.loads(self._cell(key).read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError):
             return None
 
     def keep_result(self, result: CellResult) -> None:
-        """Write a result atomically."""
+        """Write the result of a cell atomically."""
         write_bytes(self._cell(result.key), json.dumps(asdict(result), allow_nan=False).encode())
 
     def frozen(self, key: str) -> bytes | None:
-        """A packed graph; None if there is none, or if it is damaged."""
+        """The stored bytes of the frozen graph with this key (`Frozen.pack`); None if there are none, or if they are broken."""
         try:
             data = self._source(key).read_bytes()
             Frozen.unpack(data)
@@ -50,7 +50,7 @@ class StudyFolder:
         return data
 
     def keep_frozen(self, key: str, data: bytes) -> None:
-        """Write a packed graph atomically."""
+        """Write the bytes of a frozen graph atomically under its key."""
         write_bytes(self._source(key), data)
 
     def _cell(self, key: str) -> Path:

@@ -22,9 +22,9 @@ class Mapped:
     """The figures of a drive as it was mapped.
 
     Attributes:
-        primary: the primary back-end.
-        figures: back-end (or `odometry`) -> figures of `measures.MAPPED`.
-        timings: figures of `measures.TIMINGS`.
+        primary: name of the back-end whose map the mapper used.
+        figures: name of a back-end (or `odometry`) -> its figures, named as in `measures.MAPPED`.
+        timings: name -> value, for the names in `measures.TIMINGS`.
     """
 
     primary: str
@@ -34,14 +34,14 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class Frozen:
-    """A frozen graph with its reference.
+    """A frozen graph with its reference poses.
 
     Attributes:
-        graph: without false loops or drift; None if it could not be made.
-        reference: (N, 3) m and rad, NaN where unknown.
-        of_truth: whether the reference is ground truth; else it is the optimum of the clean graph by `gtsam-lm`.
-        failure: why there is no graph; empty otherwise.
-        mapped: of the drive that the graph comes from; None if it comes from no drive.
+        graph: the clean graph, without added false loops or drift; None if it could not be made.
+        reference: (N, 3) reference pose of each node, m and rad; NaN where unknown.
+        of_truth: True: the reference is ground truth; False: it is the optimum of the clean graph by `gtsam-lm`.
+        failure: why there is no graph; empty string if there is one.
+        mapped: figures of the drive that the graph comes from; None if it does not come from a drive.
     """
 
     graph: PoseGraph | None
@@ -51,7 +51,7 @@ class Frozen:
     mapped: Mapped | None = None
 
     def pack(self) -> bytes:
-        """As bytes that `unpack` reads; the same content gives the same bytes."""
+        """Serialise to bytes that `unpack` reads; equal content gives equal bytes."""
         arrays: dict[str, Any] = {"reference": self.reference, "of_truth": self.of_truth, "failure": self.failure}
         if self.graph is not None:
             given = {name: getattr(self.graph, name) for name in _ARRAYS}
@@ -64,10 +64,10 @@ class Frozen:
 
     @classmethod
     def unpack(cls, data: bytes) -> Frozen:
-        """Read the bytes of `pack`.
+        """Read the bytes written by `pack`.
 
         Raises:
-            ValueError, OSError, KeyError, zipfile.BadZipFile: it is damaged.
+            ValueError, OSError, KeyError, zipfile.BadZipFile: the bytes are damaged.
         """
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             given = {name: arrays[name] for name in _ARRAYS if name in arrays}

@@ -66,11 +66,11 @@ FIGURES = (*dict.fromkeys((*MEASURES, *MAPPED, *TIMINGS)),)
 
 
 def measures_of(study: StudyConfig) -> dict[str, tuple[str, str]]:
-    """Figure -> unit and meaning, for the figures that the study's cells can have, in the order of its tables."""
+    """Name of a figure -> its unit and meaning, for the figures that cells of a study can have, in the order of tables."""
     solves = any(variant.way != "mapped" for variant in study.backends)
     return (MEASURES if solves else {}) | (MAPPED if study.maps else {})
 
 
 def unit_of(figure: str) -> str:
-    """The unit of a figure."""
+    """Unit of the figure of this name."""
     return (MEASURES | MAPPED | TIMINGS)[figure][0]

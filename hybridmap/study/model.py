@@ -45,7 +45,7 @@ Names = Annotated[tuple[str, ...], BeforeValidator(_listed)]
 
 
 class SyntheticConfig(Section):
-    """A pose graph without sensors: a robot drives in circles, and each node is joined to the node one lap ago."""
+    """A pose graph without sensors: a robot drives in circles, and a loop joins each node to the node one lap earlier."""
 
     nodes: int = Field(default=120, ge=4)
     """Nodes of the drive."""
@@ -100,17 +100,17 @@ class SourceConfig(Section):
 
     @property
     def knows_truth(self) -> bool:
-        """Whether ground truth is certainly known."""
+        """Whether the source always has ground truth."""
         return self.kind in ("simulated", "synthetic")
 
     @property
     def kind(self) -> str:
-        """The kind of source, one of `KINDS`."""
+        """Kind of the source, one of `KINDS`."""
         return next(kind for kind in KINDS if getattr(self, kind) is not None)
 
     @property
     def title(self) -> str:
-        """Its title in the tables."""
+        """Title of the source in the tables."""
         if self.name is not None:
             return self.name
         path = self.recording or self.session or self.graph
@@ -131,17 +131,17 @@ class DriftConfig(Section):
 
     @property
     def by_chance(self) -> bool:
-        """Whether it is random."""
+        """Whether the errors depend on the seed."""
         return self.noise > 0.0 or self.dropouts > 0.0
 
     @property
     def idle(self) -> bool:
-        """Whether it changes nothing."""
+        """Whether no errors are added."""
         return self == DriftConfig()
 
 
 class SettingConfig(Section):
-    """Everything before the back-ends: configuration of the mapping, and disturbances."""
+    """What happens to a source before the back-ends: configuration of the mapping, and disturbances."""
 
     name: str
     """Title in the tables."""
@@ -156,12 +156,12 @@ class SettingConfig(Section):
 
     @property
     def title(self) -> str:
-        """Its title in the tables."""
+        """Title of the setting in the tables."""
         return self.name
 
 
 class BackendVariant(Section):
-    """A back-end with its settings and the way it gets the graph."""
+    """A back-end with its settings, the poses that it starts from, and the way it gets the graph."""
 
     name: str | None = None
     """Title in the tables; default: the back-end's name."""
@@ -183,7 +183,7 @@ class BackendVariant(Section):
 
     @property
     def title(self) -> str:
-        """Its title in the tables."""
+        """Title of the variant in the tables."""
         return self.name if self.name is not None else self.backend
 
 
@@ -208,7 +208,7 @@ class StatisticsConfig(Section):
 
 
 class BarConfig(Section):
-    """A limit for a figure, in every group that it applies to: give `at_most` or `at_least`."""
+    """A limit for a figure, checked in every group of cells that it applies to: give `at_most` or `at_least`."""
 
     figure: str
     """A column of `cells.csv` or `timings.csv`."""
@@ -231,7 +231,7 @@ class BarConfig(Section):
 
     @property
     def side(self) -> str:
-        """`at least` or `at most`."""
+        """Which limit is given: `at least` or `at most`."""
         return "at most" if self.at_least is None else "at least"
 
 
@@ -243,7 +243,7 @@ MAPPED = (
 
 
 class StudyConfig(Section):
-    """A whole study."""
+    """Configuration of a whole study."""
 
     name: str = "study"
     """Headline of the page."""
@@ -266,7 +266,7 @@ class StudyConfig(Section):
 
     @property
     def maps(self) -> bool:
-        """Whether a drive is evaluated as it was mapped."""
+        """Whether a back-end is evaluated on its map of the drive itself, rather than on the frozen graph."""
         return any(variant.way == "mapped" for variant in self.backends)
 
     @classmethod
@@ -289,10 +289,10 @@ class StudyConfig(Section):
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any], origin: str, folder: Path) -> StudyConfig:
-        """Validate a nested mapping; `origin` names it in errors, and relative paths start in `folder`.
+        """Make a study from a nested mapping; `origin` names it in errors, and relative paths start in `folder`.
 
         Raises:
-            ConfigError: as `load`.
+            ConfigError: an unknown key (named with its path), or a value out of range.
         """
         from hybridmap.study.resolve import resolved
 
@@ -303,7 +303,7 @@ class StudyConfig(Section):
         return resolved(study, origin, folder)
 
     def to_yaml(self) -> str:
-        """The resolved study as YAML that `load` reads back to an equal one."""
+        """The study with all defaults, as YAML that `load` reads back to an equal study."""
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
 
 
@@ -313,14 +313,14 @@ def quoted(title: str) -> str:
 
 
 def named_studies() -> dict[str, Path]:
-    """Name -> file of the studies that come with the package (in a checkout: `configs/studies/`)."""
+    """Name -> file, for the studies that come with the package (in a checkout: `configs/studies/`)."""
     package = Path(str(resources.files("hybridmap")))
     folder = next((f for f in (package / "configs", package.parent / "configs") if f.is_dir()), package)
     return {path.stem: path for path in sorted((folder / "studies").glob("*.yaml"))}
 
 
 def backend_settings(variant: BackendVariant) -> BackendsConfig:
-    """The whole section of settings for a variant's back-end.
+    """All back-end settings for a variant: the defaults, changed by the settings of the variant.
 
     Raises:
         ConfigError: an unknown key or a value out of range.
@@ -337,14 +337,14 @@ def backend_settings(variant: BackendVariant) -> BackendsConfig:
 
 
 def nested(dotted: str, value: Any) -> dict[str, Any]:
-    """`("a.b", 1)` -> `{"a": {"b": 1}}`."""
+    """Turn a dotted key into a nested mapping: `("a.b", 1)` -> `{"a": {"b": 1}}`."""
     for key in reversed(dotted.split(".")):
         value = {key: value}
     return dict(value)
 
 
 def merge(base: dict[str, Any], top: Mapping[str, Any]) -> None:
-    """Merge `top` into `base`, section by section."""
+    """Merge `top` into `base` in place; nested mappings are merged, other values replaced."""
     for key, value in top.items():
         if isinstance(value, Mapping) and isinstance(base.get(key), dict):
             merge(base[key], value)

@@ -1,6 +1,6 @@
 """Pools of workers: this process, or several processes on this machine.
 
-A pool yields outcomes in any order; nothing made of them may depend on the order.
+A pool yields outcomes in any order; no result may depend on that order.
 """
 
 from __future__ import annotations
@@ -27,28 +27,31 @@ ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUM
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """A task without an outcome: it raised because of a bug, or too many workers died. The next run tries it again."""
+    """A task without an outcome: it raised an unexpected exception, or too many workers died. The next run tries it again."""
 
     message: str
 
     @classmethod
     def by(cls, error: BaseException) -> Lost:
-        """The outcome of a task that raised."""
+        """Make the outcome of a task that raised this exception."""
         return cls(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
 
 
 class Pool(Protocol):
-    """Runs tasks."""
+    """Interface of a pool of workers that runs tasks."""
 
     def run(self, work: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[tuple[int, Outcome | Lost]]:
-        """Yield (number of the task, outcome) in any order, each once; `work` must be importable by its name."""
+        """Run `work` on every task; yield (index of the task, outcome) in any order, each index once.
+
+        `work` must be a function of a module, so that another process can import it.
+        """
 
 
 class ThisProcess:
     """Runs one task after the other in this process."""
 
     def run(self, work: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[tuple[int, Outcome | Lost]]:
-        """See `Pool.run`."""
+        """Run `work` on every task in order; yield (index of the task, outcome)."""
         for index, task in enumerate(tasks):
             yield index, _attempt(work, task)
 
@@ -67,7 +70,7 @@ class LocalProcesses:
         return tuple(worker.pid for worker in self._workers)
 
     def run(self, work: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[tuple[int, Outcome | Lost]]:
-        """See `Pool.run`."""
+        """Run `work` on every task in parallel; yield (index of the task, outcome) in any order, each index once."""
         waiting, deaths = deque(range(len(tasks))), [0] * len(tasks)
         try:
             self._workers = [_Worker(work) for _ in range(min(self._count, len(tasks)))]
@@ -158,7 +161,7 @@ def _attempt(work: Callable[[Task], Outcome], task: Task) -> Outcome | Lost:
 
 @contextlib.contextmanager
 def one_thread_for_children() -> Iterator[None]:
-    """Let processes started meanwhile use one thread for matrix products: there are as many processes as cores."""
+    """Processes started within this context use one thread for matrix products, since there are as many processes as cores."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:

@@ -32,20 +32,20 @@ _JUDGING = ("study/disturb.py", "study/drive.py")
 
 
 def digest(tree: Mapping[str, Any]) -> str:
-    """SHA-256 of plain values, independent of the order of keys; 64 hexadecimal digits."""
+    """SHA-256 of a nested mapping of plain values, independent of the order of keys; 64 hexadecimal digits."""
     text = json.dumps(tree, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 @cache
 def solving() -> str:
-    """Digest of everything that turns a graph into figures: our code, versions of libraries, the kind of machine."""
+    """Digest of everything that determines the figures of a graph: our code, versions of libraries, the kind of machine."""
     return digest({"code": digest_of_code(solving_only=True), **_surroundings()})
 
 
 @cache
 def mapping() -> str:
-    """Digest of everything that turns a drive into a graph and its figures."""
+    """Digest of all that determines graph and figures of a drive: our code, versions of libraries, the kind of machine."""
     return digest({"code": digest_of_code(solving_only=False), **_surroundings()})
 
 
@@ -67,7 +67,11 @@ def _version(library: str) -> str:
 
 
 def digest_of_code(*, solving_only: bool) -> str:
-    """SHA-256 of our source text: of the part that turns a graph into figures, or also of the part that maps a drive."""
+    """SHA-256 of hybridmap's source text.
+
+    Args:
+        solving_only: leave out the modules that only mapping a drive uses, and not solving a graph.
+    """
     package = Path(str(resources.files("hybridmap")))
     total = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):

@@ -1,4 +1,4 @@
-"""Check and complete a study: paths, variants, and conditions that its types cannot express."""
+"""Check and complete a study: paths, variants, and conditions that the types of its configuration cannot express."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _Entry = TypeVar("_Entry", BackendVariant, SettingConfig)
 
 
 def resolved(study: StudyConfig, origin: str, folder: Path) -> StudyConfig:
-    """The checked study, with absolute paths and every variant expanded.
+    """Check a study, make its paths absolute, and expand each list of values to vary into one variant per value.
 
     Args:
-        study: as it was written.
-        origin: where it comes from, for errors.
-        folder: where relative paths start.
+        study: the study as it was written.
+        origin: where the study comes from, for errors.
+        folder: folder in which relative paths start.
 
     Raises:
         ConfigError: an unknown or repeated name, or a setting without effect.

@@ -28,8 +28,8 @@ class Outcomes:
     """The results at the end of a run.
 
     Attributes:
-        results: key -> result, for every cell of the grid.
-        computed: number of cells that this run computed; the others were stored.
+        results: cache key of a result -> the result, for every cell of the grid.
+        computed: number of cells that this run computed; the others were stored by earlier runs.
     """
 
     results: dict[str, CellResult]
@@ -37,7 +37,7 @@ class Outcomes:
 
 
 def run(grid: Grid, folder: StudyFolder, pool: Pool, progress: Progress | None = None) -> Outcomes:
-    """Compute what is missing in the folder, which is locked as `STUDY_FOLDER`.
+    """Compute the results that are missing in the folder, which the caller has locked (`output.held`).
 
     An interrupted run continues the next time; the results are the same bit for bit.
 
@@ -45,7 +45,7 @@ def run(grid: Grid, folder: StudyFolder, pool: Pool, progress: Progress | None =
         grid: the cells.
         folder: where results are stored.
         pool: runs the tasks.
-        progress: called with cells done and their total, after each cell.
+        progress: called with the number of cells done and their total, after each cell.
 
     Raises:
         OutputError: the folder cannot be written to.

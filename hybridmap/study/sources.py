@@ -29,12 +29,12 @@ _BLOCK = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class SourceTask:
-    """A task that makes a frozen graph with a reference.
+    """A task that makes a frozen graph with reference poses.
 
     Attributes:
         key: digest of everything that determines the graph and its reference.
         make: makes the graph, with ground truth if known, or raises a `HybridMapError`; it may be sent to another machine.
-        first_nodes: keep only this many of its nodes.
+        first_nodes: keep only this many nodes of the graph, from its start; None: all.
     """
 
     key: str
@@ -44,7 +44,12 @@ class SourceTask:
 
 @dataclass(frozen=True, slots=True)
 class SourceResult:
-    """A frozen graph, packed, with the digest of the code that made it."""
+    """The result of a `SourceTask`.
+
+    Attributes:
+        frozen: the graph with its reference poses, as bytes of `Frozen.pack`.
+        code: digest of the code that made it.
+    """
 
     frozen: bytes
     code: str
@@ -52,11 +57,11 @@ class SourceResult:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """An opened source of a study: files are read once.
+    """An opened source of a study: its files are read once, when it is opened.
 
     Attributes:
-        task: the task for its graph at a setting and seed. Raises a ConfigError if the configuration of a drive is invalid.
-        by_chance: whether the graph depends on the seed at a setting.
+        task: (setting, seed) -> the task that makes the graph. Raises a ConfigError if the configuration of a drive is invalid.
+        by_chance: setting -> whether the graph depends on the seed.
     """
 
     task: Callable[[SettingConfig, int], SourceTask]
@@ -64,7 +69,7 @@ class Source:
 
 
 def prepare(task: SourceTask) -> SourceResult:
-    """Run a task: make the graph, and find its reference. A typed error becomes a frozen failure."""
+    """Run a task: make the graph and find its reference poses. A `HybridMapError` becomes a result without a graph."""
     try:
         frozen = _with_reference(_cut(task.make(), task.first_nodes))
     except HybridMapError as error:
@@ -178,7 +183,7 @@ def _read_session(path: Path | None) -> Frozen:
 
 
 def laps(config: SyntheticConfig, seed: int) -> Frozen:
-    """A drive in circles with white noise on every measurement; node k is joined to node k - per_lap."""
+    """Make a synthetic graph: a drive in circles with noise on every measurement; node k is joined to node k - per_lap."""
     step = np.array([config.step_m, 0.0, 2.0 * np.pi / config.per_lap])
     truth = np.zeros((config.nodes, 3))
     for k in range(1, config.nodes):

@@ -22,12 +22,13 @@ values the bootstrap's limits are the least and the greatest of them, whatever t
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A mean with its confidence interval; both limits are NaN with fewer values than the method needs (`LEAST`).
+    """A mean with its confidence interval.
 
     Attributes:
-        value, low, high: the mean and its limits; NaN without any value.
+        value: the mean; NaN without any value.
+        low, high: limits of the interval; NaN if there are fewer values than the method needs (`LEAST`).
         count: number of values.
-        confidence: of the interval.
+        confidence: confidence level of the interval, e.g. 0.95.
     """
 
     value: float
@@ -43,12 +44,12 @@ class Interval:
 
     @property
     def known(self) -> bool:
-        """Whether there is an interval."""
+        """Whether there were enough values for limits."""
         return math.isfinite(self.low) and math.isfinite(self.high)
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether there is an interval and it does not contain zero."""
+        """Whether the interval has limits and does not contain zero."""
         return self.low > 0.0 or self.high < 0.0
 
 
@@ -57,13 +58,14 @@ class Summary:
     """One measure of one back-end over the seeds of one group (source, setting, kind and rate of false loops).
 
     Attributes:
-        source, setting, kind, rate, backend, measure, unit: what is summarised.
-        cells, solved: number of cells in the group, and of those with the figure; the others are left out.
-        median, mean: over the seeds.
-        baseline: the first back-end.
-        difference: mean over the seeds of this back-end's figure minus the baseline's, if both have one; None for the
-            baseline itself.
-        better: share of these seeds in which this back-end's figure is lower; NaN without any.
+        cell: first cell of the group; all cells of the group share its labels, except for the seed.
+        measure: name of the measure.
+        cells, solved: number of cells in the group, and of those that have the measure; the others are left out.
+        median, mean: median and mean over the seeds.
+        baseline: title of the study's first back-end, with which the others are compared.
+        difference: mean over the seeds of this back-end's measure minus the baseline's, for seeds in which both have one; None
+            for the baseline itself.
+        better: share of these seeds in which this back-end's measure is lower; NaN without any.
     """
 
     cell: Cell
@@ -93,9 +95,9 @@ def summarise(grid: Grid, results: Mapping[str, CellResult]) -> list[Summary]:
 
 
 def mean_of(values: Array, config: StatisticsConfig) -> Interval:
-    """The mean of (N,) values with its confidence interval, by Student's t or the BCa bootstrap; the result is deterministic.
+    """Mean of (N,) values with its confidence interval, by Student's t or the BCa bootstrap; the result is deterministic.
 
-    With fewer values than `LEAST` there is no interval; enough equal values give an interval of zero width.
+    With fewer values than `LEAST` the limits are NaN; if enough values are all equal, the interval has zero width.
     """
     count = len(values)
     mean = float(np.mean(values)) if count else math.nan

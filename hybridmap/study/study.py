@@ -27,14 +27,14 @@ class Study:
     """A finished study.
 
     Attributes:
-        folder: its folder.
-        grid: its cells.
-        results: key -> result.
-        summaries: over the seeds, one per group, back-end and measure.
-        verdicts: of every bar and group.
-        computed: number of cells that this run computed; the others were stored.
-        head: the keys of `metrics.json` besides its list.
-        metrics: the figures.
+        folder: the folder of the study.
+        grid: the cells of the study.
+        results: cache key of a result -> the result, for every cell of the grid.
+        summaries: summaries over the seeds, one per group, back-end and measure.
+        verdicts: one verdict per bar, group and back-end.
+        computed: number of cells that this run computed; the others were stored by earlier runs.
+        head: keys of `metrics.json` besides its list of metrics.
+        metrics: the list of metrics in `metrics.json`.
     """
 
     folder: StudyFolder
@@ -53,7 +53,7 @@ class Study:
 
     @property
     def missed(self) -> list[Verdict]:
-        """Bars that are missed."""
+        """Verdicts of the bars that are missed."""
         return [verdict for verdict in self.verdicts if not verdict.passed]
 
 

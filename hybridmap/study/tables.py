@@ -40,18 +40,18 @@ def cells_csv(cells: Sequence[Cell], results: Mapping[str, CellResult], measures
 
 
 def timings_csv(cells: Sequence[Cell], results: Mapping[str, CellResult]) -> str:
-    """Process time of each cell; in a file of its own, as it differs between runs."""
+    """One line per cell with its process time; a table of its own, as times differ between runs."""
     rows = ((cell, results[cell.key].timings) for cell in cells)
     return _text(TIMING_COLUMNS, ((*_labels(cell), *(shown(spent.get(n)) for n in TIMINGS), cell.key) for cell, spent in rows))
 
 
 def bars_csv(verdicts: Sequence[Verdict]) -> str:
-    """One line per bar and group; the last column has the value of each seed, with a dash if missing."""
+    """One line per bar, group and back-end; the last column holds the value of each seed, with a dash for a missing one."""
     return _text(BAR_COLUMNS, (_bar_row(one) for one in verdicts))
 
 
 def shown(value: float | None) -> str:
-    """A number with all digits, without a decimal point if whole; empty for None."""
+    """A number with all digits, without a decimal point if whole; empty string for None."""
     if value is None:
         return ""
     return str(int(value)) if float(value).is_integer() and abs(value) < 2**53 else repr(float(value))
