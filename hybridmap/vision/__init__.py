@@ -29,27 +29,31 @@ FRONT_ENDS: Table[str | Factory] = Table(
 
 
 def register(name: str, factory: Factory) -> None:
-    """Add a front-end, which `vision.sensor` then takes by its name; packages have entry points `hybridmap.front_ends`.
+    """Add a front-end under a name, so that the setting `vision.sensor` can choose it.
 
-    A new kind of sensor brings its front-end with it, see `streams.sensors.register`.
+    Installed packages can offer one by an entry point of the group `hybridmap.front_ends`. A new kind of sensor brings its
+    front-end with it, see `streams.sensors.register`.
 
     Raises:
-        ConfigError: there is one of this name already.
+        ConfigError: a front-end of this name exists.
     """
     FRONT_ENDS.register(name, factory)
 
 
 def create_front_end(config: VisionConfig, rig: Rig, seed: int, clock: StageClock | None = None) -> FrontEnd | None:
-    """The front-end for a source: `auto` takes that of the first kind of sensor there; None for dead reckoning.
+    """Make the front-end for a source. `auto` chooses that of the first kind of sensor of the source.
 
     Args:
         config: settings of the visual side.
         rig: sensors of the source.
-        seed: for RANSAC.
-        clock: gets the stage `search` of an RGB-D front-end.
+        seed: seed of the RANSAC of an RGB-D front-end.
+        clock: measures the time that an RGB-D front-end spends on its search for candidates (stage `search`).
+
+    Returns:
+        None if no sensor is chosen or the source has none: then the map is made by dead reckoning alone.
 
     Raises:
-        ConfigError: there is no front-end of this name.
+        ConfigError: no front-end has the configured name.
         StreamError: the configuration asks for a sensor that the source does not have.
     """
     if config.sensor == "auto":

@@ -38,7 +38,10 @@ class Belief:
     covariance_from: Callable[[int], Array]
 
     def ways(self, first: Indices, second: Indices) -> RelativePose:
-        """Nodes (P,) seen from nodes (P,), as `agreement.Ways`. Costs a search of the graph for each node in `first`."""
+        """Return the poses of nodes `second` (P,) in the frames of nodes `first` (P,), with covariances.
+
+        Costs a shortest-path search of the graph for each distinct node in `first`.
+        """
         covariance = np.empty((len(first), 3, 3))
         for node in np.unique(first).tolist():
             covariance[first == node] = self.covariance_from(node)[second[first == node]]
@@ -50,10 +53,10 @@ class View:
     """The profile and view template of one frame.
 
     Attributes:
-        stamp_ns: of the frame.
+        stamp_ns: time of the frame.
         profile: (bands, width) float32, normalised as configured.
-        template: number of the view template it matched or founded.
-        new_template: the frame founded the template: its view is new, and stable over several frames.
+        template: number of the view template that the frame matched, or of the new one made from it.
+        new_template: whether a new view template was made from this frame.
     """
 
     stamp_ns: int
@@ -63,41 +66,50 @@ class View:
 
 
 class FrontEnd(Protocol):
-    """Loop closure and registration for one kind of sensor. The mapper calls in this order:
+    """Loop closure and registration for one kind of sensor.
 
-    `observe` for each frame; if it makes a node of the frame, `add_node`, `track` and `close`; at the end `finish`, again
-    while it returns accepted edges.
+    The mapper calls `observe` for each frame. If it makes a node of the frame, it calls `add_node`, `track` and `close`. At the
+    end of the drive it calls `finish`, again and again while that returns accepted edges.
     """
 
     def observe(self, frame: Observation, delta_node_robot: Array) -> View:
         """Take in one frame; `delta_node_robot` (3,) is the integrator's motion since the last node (identity at first)."""
 
     def add_node(self, node: int, view: View) -> None:
-        """Make a node of the frame observed last. Nodes are numbered from 0 without gaps."""
+        """Make a node of the frame that was observed last. Nodes are numbered from 0 without gaps."""
 
     def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
-        """Register the new node to the ones before it; `odometry` is its pose seen from node - 1 (None for the first node)."""
+        """Register the new node to the nodes before it; returns the registrations as proposed edges.
+
+        `odometry` is the pose of the new node in the frame of node - 1 (None for the first node).
+        """
 
     def close(self, node: int, belief: Belief) -> list[Edge]:
-        """Look for loop closures of the new node; may also decide pending proposals."""
+        """Look for loop closures of the new node; returns new edges, and earlier ones whose status changed."""
 
     def finish(self, belief: Belief) -> list[Edge]:
-        """Re-propose on the optimised map; decide what is pending."""
+        """At the end of the drive, decide pending edges and propose loops between nodes near each other on the optimised map.
+
+        Returns the new and the changed edges.
+        """
 
     @property
     def lost_since(self) -> int | None:
-        """First node since a kidnapping or a break of the chain, while the robot is not localised; None otherwise."""
+        """First node after the robot was kidnapped or lost track of its motion; None while it is localised on the map."""
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
-        """What the map file keeps of a node's frame: `profile`, and `ranges_m`, or `color` and `depth_mm` (compact dtypes)."""
+        """Arrays of a node's frame for the map file: `profile`, and `ranges_m` (laser) or `color` and `depth_mm` (RGB-D)."""
 
 
 @runtime_checkable
 class VerifyingFrontEnd(FrontEnd, Protocol):
-    """A front-end that can measure loops again that a back-end gave no weight."""
+    """A front-end that can measure again those loops that a back-end down-weighted as outliers."""
 
     def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
-        """Measure loops again from the map's poses. Each keeps its key; a loop that is not returned stays as it is."""
+        """Measure outlier loops again, starting from the poses of the map.
+
+        Returns the loops that changed, each with its key of before; a loop that is not returned stays as it is.
+        """
 
 
 @runtime_checkable

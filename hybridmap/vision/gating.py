@@ -16,13 +16,13 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """Which older nodes a new one was compared with.
+    """Which older nodes a new node was compared with.
 
     Attributes:
-        radius_m, heading_deg: half-widths.
-        older: how many nodes were old enough.
-        inside: how many of those lay in it.
-        whole_map: the nodes outside were searched as well, since the robot was lost.
+        radius_m, heading_deg: largest difference of position and heading from the new node.
+        older: number of nodes that were old enough to be compared.
+        inside: number of those that lay within the radius and heading.
+        whole_map: whether nodes outside were compared too, because the robot was lost.
     """
 
     radius_m: float
@@ -32,23 +32,23 @@ class Gate:
     whole_map: bool = False
 
     def to_array(self) -> Array:
-        """(5,) as a map file keeps it."""
+        """The five attributes as an array (5,), as a map file stores them."""
         return np.array(astuple(self), dtype=np.float64)
 
     @classmethod
     def of_array(cls, kept: Array) -> Gate:
-        """The gate that `to_array` gave."""
+        """Make a gate from the array (5,) that `to_array` returned."""
         radius_m, heading_deg, older, inside, whole_map = kept.tolist()
         return cls(radius_m, heading_deg, int(older), int(inside), bool(whole_map))
 
 
 def nodes_within(poses: Array, node: int, radius_m: float | Array, turn_rad: float, before: int | None = None) -> Indices:
-    """Earlier nodes near one, of nearly the same heading. Its cost grows with the number of nodes; the loop is compiled.
+    """Find earlier nodes near a node and of nearly the same heading, in time linear in the number of nodes.
 
     Args:
         poses: (N, 3) of all nodes, m and rad.
-        node: the number of the one.
-        radius_m: largest distance, m; one for all, or (before,) one for each.
+        node: number of the node whose neighbours are sought.
+        radius_m: largest distance, m; one for all, or (before,) one for each earlier node.
         turn_rad: largest difference of the headings, rad.
         before: only nodes of lower numbers count; default: `node`.
 

@@ -28,15 +28,15 @@ def image_profile(
     bands: int = 1,
     normalise: Normalise = "z",
 ) -> Profile:
-    """Profile of an RGB-D frame: column sums of intensity, column means of the valid depth pixels, by row band.
+    """Profile of an RGB-D frame: column sums of intensity and column means of the valid depth pixels, for each row band.
 
     With `bands=1` it is the paper's profile, with `bands=4` the four-band profile.
 
     Args:
         grey: (H, W) uint8 intensity.
         depth_m: (H, W) float32, m; 0 where invalid.
-        width: b, columns of the profile.
-        bands: row bands of equal height, top first.
+        width: columns of the profile (b in the paper).
+        bands: number of row bands of equal height, top first.
         normalise: see `normalised`.
 
     Returns:
@@ -58,7 +58,7 @@ def laser_profile(ranges_m: NDArray[np.float32], bearings_rad: Array, width: int
     Args:
         ranges_m: (B,) float32, NaN where invalid.
         bearings_rad: (B,) bearings, monotonic in either direction.
-        width: b, columns of the profile.
+        width: columns of the profile (b in the paper).
         normalise: see `normalised`.
 
     Returns:
@@ -102,7 +102,7 @@ def _cell_means(image: NDArray[np.generic], width: int, bands: int) -> NDArray[n
 
 
 def sees_all_around(rig: Rig) -> bool:
-    """Whether there is a laser whose profiles go full circle."""
+    """Whether the source has a laser whose field of view is a full circle."""
     laser = rig.sensors.get(LASER.sensor_name)
     if laser is None:
         return False

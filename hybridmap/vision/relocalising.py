@@ -36,7 +36,7 @@ KEPT_STEPS = 1000
 
 
 class ChainState(Enum):
-    """Whether the view of a new node fits those before it."""
+    """How certain the motion to a new node is."""
 
     HOLDS = "holds"
     UNCERTAIN = "uncertain"
@@ -44,15 +44,15 @@ class ChainState(Enum):
 
 
 class Whereabouts:
-    """Keeps the evidence of whether a robot is lost.
+    """Keeps the evidence of whether a robot is lost, i.e. whether its pose on the map may be wrong.
 
-    It is lost from each of these on until the next closure: the view of a node fits none before it (the chain is broken); the
-    view fits, but slides along a wall (the chain is uncertain); the robot fails to recognise known places. An uncertain link
-    is forgotten after some nodes.
+    A robot is lost from each of these events on until the next loop closure: the view of a node fits none before it (the motion
+    is broken); the view fits, but the motion is uncertain along a wall; or the robot fails to recognise known places several
+    times. Uncertain motion is forgotten after some nodes.
 
     Args:
-        unrecognised: known places in a row that the robot must fail to recognise to be lost; 0: it never is.
-        uncertain_nodes: nodes after which an uncertain link is forgotten.
+        unrecognised: failures in a row to recognise a known place after which the robot is lost; 0: they do not count.
+        uncertain_nodes: nodes after which uncertain motion is forgotten.
     """
 
     def __init__(self, unrecognised: int, uncertain_nodes: int = 1) -> None:
@@ -68,22 +68,22 @@ class Whereabouts:
 
     @property
     def first_break(self) -> int | None:
-        """First node after a broken or uncertain link since the last closure; None where the chain holds."""
+        """First node after broken or uncertain motion since the last loop closure; None if there is none."""
         return min(self._breaks, default=None)
 
     @property
     def lost_since(self) -> int | None:
-        """First node after a broken link since the last closure; None where there is none."""
+        """First node after broken motion since the last loop closure; None if there is none."""
         return min((at for at, how in self._breaks.items() if how is ChainState.BROKEN), default=None)
 
     def break_before(self, node: int) -> int | None:
-        """Where the chain broke, if the robot is elsewhere at `node`: its last broken link, else its last uncertain one."""
+        """First node after the last broken motion up to `node`, else after the last uncertain one; None if neither exists."""
         before = [at for at in self._breaks if at <= node]
         certain = [at for at in before if self._breaks[at] is ChainState.BROKEN]
         return max(certain or before, default=None)
 
     def tracked(self, node: int, chain: ChainState) -> None:
-        """Note the state of the chain at a new node."""
+        """Note how certain the motion to a new node is."""
         uncertain = [at for at, how in self._breaks.items() if how is ChainState.UNCERTAIN]
         for at in uncertain:
             if node - at > self._uncertain_nodes:
@@ -92,18 +92,18 @@ class Whereabouts:
             self._breaks[node] = chain
 
     def recognised(self) -> None:
-        """A closure localised the robot."""
+        """Note that a loop closure localised the robot."""
         self._breaks.clear()
         self._unrecognised = 0
 
     def unrecognised(self) -> None:
-        """The robot did not recognise a known place."""
+        """Note that the robot failed to recognise a known place."""
         self._unrecognised += 1
 
 
 @dataclass(frozen=True, slots=True)
 class GlobalMatch:
-    """The edge of two views that were compared while the robot was lost, and its mismatch: 0 for a perfect fit."""
+    """The edge between two nodes that were compared while the robot was lost, and its mismatch: 0 for a perfect fit."""
 
     edge: Edge
     mismatch: float = 0.0
@@ -111,12 +111,12 @@ class GlobalMatch:
 
 @dataclass(frozen=True, slots=True)
 class Settlement:
-    """What came of the matches.
+    """What the matches of a lost robot led to.
 
     Attributes:
-        proposals: the edges that changed, those of the chain among them.
+        proposals: new and changed edges of all kinds.
         accepted: the matches that entered the map; empty while the robot is not localised.
-        kidnapped_to: the first node after the kidnapping; None while the robot is not localised, or if there was none.
+        kidnapped_to: the first node after the kidnapping; None while the robot is not localised, or if it was not kidnapped.
     """
 
     proposals: list[Edge]
@@ -125,16 +125,16 @@ class Settlement:
 
 
 class Relocaliser:
-    """Keeps the matches of a lost robot. The newer node is the source of an edge.
+    """Keeps the matches of a lost robot with older nodes. The newer node is the source of an edge.
 
-    Matches are pending until those of `SUPPORT` distinct nodes over `span_m` of travel agree through the chain, and those that
-    contradict them weigh less than half. Then all of them enter the map together. An edge by way of them replaces the odometry
-    edge at which the chain broke, and registrations across the break are retracted. Matches with larger mismatch need more
-    travel, and weigh less than a better match of the same node.
+    Matches are pending until those of `SUPPORT` distinct nodes over `span_m` of travel agree with each other and with the
+    motion between them, and those that contradict them weigh less than half. Then all of them enter the map together. After
+    a kidnapping an edge derived from them replaces the odometry edge across it, and registrations across it are retracted.
+    Matches with larger mismatch need more travel, and weigh less than a better match of the same node.
     """
 
     def __init__(self, whereabouts: Whereabouts, new_key: Callable[[], int], span_m: float) -> None:
-        """Start empty; matches that agree must cover `span_m` of travel."""
+        """Start without matches; matches that agree must cover `span_m` of travel. `new_key` returns the key of a new edge."""
         self.whereabouts = whereabouts
         self._span_m = span_m
         self._new_key = new_key
@@ -143,16 +143,16 @@ class Relocaliser:
         self._steps: deque[Edge] = deque(maxlen=KEPT_STEPS)
 
     def tracked(self, node: int, chain: ChainState, steps: list[Edge]) -> None:
-        """Note how a new node was registered to the ones before it."""
+        """Note the registrations (`steps`) of a new node to the ones before it, and how certain the motion is."""
         self.whereabouts.tracked(node, chain)
         self._steps += [step for step in steps if step.status is Status.ACCEPTED]
 
     def settle(self, found: Sequence[GlobalMatch], belief: Belief) -> Settlement:
-        """Add matches; accept the largest set that agrees through the chain, if it is good enough.
+        """Add matches; accept the largest set that agrees with each other and with the motion between, if it is good enough.
 
         Args:
-            found: what was compared; those with pending edges are matches.
-            belief: the map's; poses on either side of a break are right relative to each other.
+            found: nodes that were compared; those with pending edges are matches.
+            belief: the map; poses on either side of a kidnapping are right relative to each other.
         """
         out = [match.edge for match in found] + self._expired(belief)
         self._waiting += [s for s in found if s.edge.status is Status.PENDING]
@@ -177,21 +177,21 @@ class Relocaliser:
         )
 
     def dismiss(self, lack: Lack = Lack.UNSUPPORTED) -> list[Edge]:
-        """Reject all pending matches."""
+        """Reject all pending matches for the reason `lack`; returns their edges."""
         out = [s.edge.settled(lack=lack) for s in self._waiting]
         self._waiting, self._agree = [], self._agree[:0, :0]
         return out
 
     def reattach(self, broken_at: int, accepted: tuple[Edge, ...], belief: Belief) -> list[Edge]:
-        """Retract registrations across a break, and reattach the node after it at the pose that its matches give.
+        """Retract registrations across a kidnapping, and place the node after it where its matches say.
 
         Args:
-            broken_at: the first node after the break.
-            accepted: matches that agree, from nodes after the break to nodes before it.
-            belief: poses on either side of the break are right relative to each other.
+            broken_at: the first node after the kidnapping.
+            accepted: matches that agree, from nodes after the kidnapping to nodes before it.
+            belief: the map; poses on either side of the kidnapping are right relative to each other.
 
         Returns:
-            The retracted registrations, and the edge from the node before the break to the one after it.
+            The retracted registrations, and an edge from the node before the kidnapping to the one after it.
         """
         crossing = [step for step in self._steps if step.source < broken_at <= step.target]
         return [
@@ -267,7 +267,7 @@ class Relocaliser:
 
 
 def placed_by(matches: Sequence[Edge], at: int, poses: Array) -> Array:
-    """Pose (3,) of a node on the map by the medoid of matches."""
+    """Pose (3,) on the map of the node `at`: each match gives one, and the medoid of these is returned."""
     placed = np.array([_placed(s, at, poses) for s in matches])
     return np.asarray(placed[int(np.argmin(np.abs(placed[:, None, :2] - placed[None, :, :2]).sum(axis=(1, 2))))])
 

@@ -29,7 +29,7 @@ class Nearest:
     Attributes:
         numbers: (k,) numbers of the profiles.
         distance: (k,) weighted mean absolute difference over the overlap, at the shift where it is least.
-        shift: (k,) that shift, columns; positive when things lie farther right in the query.
+        shift: (k,) shift of least distance, columns; positive when things lie farther right in the query.
     """
 
     numbers: Indices
@@ -38,16 +38,16 @@ class Nearest:
 
 
 def full_circle(width: int) -> Indices:
-    """(width,) every shift of a profile that goes full circle, ascending, from half a turn back."""
+    """(width,) every shift of a profile that goes full circle, ascending, beginning with minus half a turn."""
     return np.arange(width) - width // 2
 
 
 class Blocks:
-    """Rows of one length, appended one by one; memory is taken a block at a time and never moved.
+    """An array that grows by rows; memory is taken in blocks and never moved.
 
     Args:
-        row_length: values of a row.
-        dtype: of the values.
+        row_length: number of values in a row.
+        dtype: type of the values.
     """
 
     def __init__(self, row_length: int, dtype: type[np.generic]) -> None:
@@ -60,7 +60,7 @@ class Blocks:
         return self._count
 
     def append(self, row: NDArray[np.generic]) -> None:
-        """Copy a row (row_length,) to the end."""
+        """Append a copy of a row (row_length,)."""
         block, at = divmod(self._count, BLOCK)
         if block == len(self._blocks):
             self._blocks.append(np.empty((BLOCK, self._row_length), dtype=self._dtype))
@@ -68,12 +68,12 @@ class Blocks:
         self._count += 1
 
     def filled(self) -> list[NDArray[np.generic]]:
-        """Views of the blocks (<= BLOCK, row_length), as far as they are filled, in order."""
+        """All rows so far, as views of the blocks (at most BLOCK, row_length), in order."""
         full, rest = divmod(self._count, BLOCK)
         return self._blocks[:full] + ([self._blocks[full][:rest]] if rest else [])
 
     def take(self, numbers: Indices) -> NDArray[np.generic]:
-        """A copy of some rows, (n, row_length)."""
+        """A copy of the rows of the given numbers, (n, row_length)."""
         if len(self._blocks) == 1:
             return self._blocks[0][numbers]
         out = np.empty((len(numbers), self._row_length), dtype=self._dtype)
@@ -85,13 +85,13 @@ class Blocks:
 
 
 class ProfileIndex:
-    """8-bit profiles and their search.
+    """Stores profiles as 8-bit numbers and searches for the nearest ones.
 
-    The weights of the bands lie in the quantisation: a unit of a band with half the weight has half as many steps, so
-    that plain sums of absolute differences are weighted ones. A band of no weight is not stored.
+    The weights of the bands are part of the quantisation: a band of half the weight gets half as many steps a unit, so that
+    plain sums of absolute differences are weighted ones. A band of weight 0 is not stored.
 
     Args:
-        weights: (bands,) of the bands, summing to 1.
+        weights: (bands,) weights of the bands, summing to 1.
         width: columns of a profile.
         max_shift: largest shift tried, columns.
         circular: the profiles go full circle: every shift is tried, and columns wrap around.
@@ -120,15 +120,15 @@ class ProfileIndex:
         return np.asarray(np.clip(np.rint(steps) + 128.0, 1.0, 255.0).astype(np.uint8).ravel())
 
     def nearest(self, query: Profile, count: int, among: Indices | None = None) -> Nearest:
-        """The nearest stored profiles at one shift common to all bands: exact for the 8-bit profiles.
+        """Find the nearest stored profiles, each at its best shift (common to all bands); exact for 8-bit profiles.
 
-        A profile among the `count` nearest of all is among the `count` nearest at its own best shift, for whatever is
-        nearer there is nearer at all; so the `count` nearest of each shift suffice.
+        A profile among the `count` nearest of all is among the `count` nearest at its own best shift; so it is enough to find
+        the `count` nearest of each shift.
 
         Args:
             query: (bands, width).
-            count: how many at most.
-            among: which stored profiles, ascending; all by default.
+            count: number of profiles to return at most.
+            among: numbers of the stored profiles to be compared, ascending; all by default.
         """
         if among is None:
             blocks, firsts = self._rows.filled(), range(0, len(self._rows), BLOCK)

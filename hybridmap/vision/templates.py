@@ -28,11 +28,11 @@ FEWEST = 5
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """Scores of one query against n stored profiles.
+    """Scores of one profile (the query) against n stored profiles.
 
     Attributes:
         indices: (n,) numbers of the stored profiles.
-        score: (n,) G; smaller is a better match in every mode but `literal`, which is inverted as printed.
+        score: (n,) G of eq. 13; smaller is better, except for the mode `literal` (see `combine`), where larger is.
         shift: (n,) best shift c_m, columns; positive when things lie farther right in the query.
     """
 
@@ -45,7 +45,7 @@ _NOTHING = Match(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.
 
 
 class ProfileStore:
-    """Profiles by number, with their differences to a query over all shifts. Grows by blocks, without copies.
+    """Stored profiles, compared with a query over all shifts. Grows by blocks, without copies.
 
     Args:
         max_shift: largest shift tried, columns.
@@ -86,10 +86,10 @@ class ProfileStore:
 
         Args:
             query: (bands, width), Ij of the equation; the stored profiles are Ik.
-            indices: which stored profiles; all by default.
+            indices: numbers of the stored profiles to be compared; all by default.
 
         Returns:
-            (n, bands, S) for the shifts of `shifts`.
+            (n, bands, S), for the S shifts of the property `shifts`.
         """
         numbers = np.arange(len(self)) if indices is None else indices
         stored = self._rows.take(numbers).reshape(len(numbers), *self._shape).transpose(1, 0, 2)
@@ -151,16 +151,17 @@ def band_weights(bands: int, mu_r: float, mu_d: float) -> Floats:
 def combine(
     g: Floats, shifts: Indices, mode: Mode, weights: Floats, g_bar: GBar = "templates", g_bar_of: Floats | None = None
 ) -> tuple[Floats, Indices]:
-    """Score G and best shift of n pairs (eq. 13).
+    """Score G and best shift of n pairs of profiles (eq. 13), in one of several ways (modes).
 
     `literal`: sum mu |g_min - g_bar|, as printed (inverted: a true match lies far from the mean); `ratio`: sum mu g_min/g_bar;
-    `signed`: sum mu (g_min - g_bar); `plain` and `four-band`: sum mu g_min. In all of them each band has its own best shift.
+    `signed`: sum mu (g_min - g_bar); `plain` and `four-band`: sum mu g_min. In all of them each band has its own best shift;
+    g_min is its least difference over the shifts, mu its weight.
 
     Args:
         g: (n, bands, S) differences.
         shifts: (S,) the shifts.
-        mode: the reading of G.
-        weights: (bands,) summing to 1.
+        mode: which of the formulas above is G.
+        weights: (bands,) mu, summing to 1.
         g_bar: `templates`: mean of g_min over the stored templates; `shifts`: mean of g over the shifts of the pair.
         g_bar_of: (m, bands, S) differences to all stored templates, if `g` holds only some of them.
 
@@ -185,14 +186,14 @@ def combine(
 
 
 class Matcher:
-    """A store of profiles with one way of scoring.
+    """Stores profiles and scores a query against them.
 
     Args:
-        mode: the reading of G.
+        mode: formula of the score, see `combine`.
         mu_r, mu_d: weights of intensity and depth.
         max_shift: largest shift tried, columns.
         g_bar: see `combine`.
-        sequence: views in a row that must match (as in SeqSLAM); 1: single views.
+        sequence: number of views in a row that are compared (as in SeqSLAM); 1: single views.
         circular: the profiles go full circle, see `ProfileStore`.
     """
 
@@ -224,7 +225,7 @@ class Matcher:
         return self.store.add(profile)
 
     def score(self, query: Profile, indices: Indices) -> Match:
-        """Score a query against some of the stored profiles; g_bar is over all of them where the mode has one."""
+        """Score a query against some of the stored profiles; a mean over stored profiles (`g_bar`) is over all of them."""
         weights = band_weights(len(query), *self._mu)
         every = self.store.differences(query) if self._mode in RELATIVE and self._g_bar == "templates" else None
         g = self.store.differences(query, indices) if every is None else every[indices]
@@ -232,16 +233,16 @@ class Matcher:
         return Match(np.asarray(indices, dtype=np.int64), score, shift)
 
     def best(self, query: Profile, count: int, among: Indices | None = None, ending_at: int | None = None) -> Match:
-        """The best of the stored profiles, best first.
+        """Find the stored profiles with the best scores, the best first.
 
-        `plain` and `four-band`: an exact search over 8-bit profiles, and G of the nearest in full. The other readings need
-        every G for their mean, or for what lies far from it, and compute them all.
+        In the modes `plain` and `four-band` this is an exact search over 8-bit profiles, then a full score of the nearest. The
+        other modes need the score of every profile and compute them all.
 
         Args:
             query: (bands, width).
-            count: how many at most.
-            among: which stored profiles, ascending; all by default.
-            ending_at: number under which the query itself is stored, for `sequence`; None: matched by itself.
+            count: number of profiles to return at most.
+            among: numbers of the stored profiles to be compared, ascending; all by default.
+            ending_at: number under which the query itself is stored, to compare sequences; None: compare single views.
         """
         numbers = np.arange(len(self.store)) if among is None else among
         if self._index is None or count < 1 or len(numbers) == 0:
@@ -269,18 +270,21 @@ def in_sequence(
     earlier: Callable[[int, Indices], Floats],
     both_ways: bool = False,
 ) -> Floats:
-    """Mean score over the views that end at one, each with the best of three stored ones where its partner should be.
+    """Mean score over the last views, each compared with the stored profiles seen just before (as in SeqSLAM).
+
+    For each view the best of three neighbouring stored profiles counts. Views without a partner, at the beginning of the drive,
+    are left out.
 
     Args:
         scores: (n,) of the last view.
-        indices: (n,) the stored profiles that it was compared with.
+        indices: (n,) numbers of the stored profiles that the last view was compared with.
         ending_at: number of the last view itself.
-        sequence: views in a row.
-        earlier: (how many views back, (m,) numbers, ascending) -> (m,) scores of that view against those.
+        sequence: number of views in a row.
+        earlier: (how many views back, (m,) numbers, ascending) -> (m,) scores of that view against those profiles.
         both_ways: the stored views may also have been seen in the opposite order; the better of the two counts.
 
     Returns:
-        (n,); a view without a partner, at the beginning of the drive, does not count.
+        (n,) mean scores.
     """
     directions = (-1, 1) if both_ways else (-1,)
     means = [_mean_along(scores, indices, ending_at, sequence, earlier, step) for step in directions]
@@ -306,11 +310,11 @@ def _mean_along(
 
 @dataclass(frozen=True, slots=True)
 class Recognition:
-    """The template of a frame.
+    """The view template that a frame was recognised as.
 
     Attributes:
-        template: its number.
-        founded: the frame founded it.
+        template: number of the template.
+        founded: whether a new template was made from this frame.
         difference: mean absolute difference to the best older template; inf for the first one.
     """
 
@@ -327,7 +331,7 @@ STABLE_FRAMES = 3
 
 
 class ViewTemplates:
-    """View templates V; a new one needs a new view in several consecutive frames."""
+    """View templates: profiles of distinct views. A new one is made once several consecutive frames match none."""
 
     def __init__(self, max_shift: int, mu_r: float, mu_d: float) -> None:
         self._matcher = Matcher("plain", mu_r, mu_d, max_shift)
@@ -337,7 +341,10 @@ class ViewTemplates:
         return len(self._matcher.store)
 
     def recognise(self, profile: Profile) -> Recognition:
-        """The template of a profile, or a new one; the nearest template until a new view is stable."""
+        """Recognise a profile as one of the view templates.
+
+        A new template is made from it if it and the frames just before match none; until then the nearest template is returned.
+        """
         if len(self) == 0:
             return Recognition(self._matcher.add(profile), True, float("inf"))
         match = self._matcher.best(profile, 1)

@@ -29,7 +29,7 @@ OFF_MAX_M, OFF_MAX_DEG = 1.0, 10.0
 
 
 def of_step(inliers: float, off_m: float) -> tuple[Check, ...]:
-    """Registration of a new node: share of inliers; only a good one may contradict the odometry."""
+    """Check the registration of a new node: share of inliers; if they are few, also the distance from the odometry."""
     checks: tuple[Check, ...] = (at_least("inliers", inliers, INLIERS_WEAK),)
     if inliers < INLIERS_MIN:
         checks += (at_most("off_odometry_m", off_m, TRANSLATION_MAX_M),)
@@ -37,7 +37,12 @@ def of_step(inliers: float, off_m: float) -> tuple[Check, ...]:
 
 
 def of_way(odometry_sigma: float | None, violation: float) -> tuple[Check, ...]:
-    """Whether the robot drove to a new node; `odometry_sigma` is None where its scan fits nowhere near."""
+    """Check whether the robot can have driven from one node to the next.
+
+    Args:
+        odometry_sigma: distance between registration and odometry, standard deviations; None if the scan fits nowhere nearby.
+        violation: share of the walls of the two scans that lie in each other's free space.
+    """
     seen = at_most("violation", violation, WAY_VIOLATION)
     if odometry_sigma is None:
         return (seen,)
@@ -45,7 +50,13 @@ def of_way(odometry_sigma: float | None, violation: float) -> tuple[Check, ...]:
 
 
 def of_fit(near: float, fit: float, fit_min: float) -> tuple[Check, ...]:
-    """Two submaps: share of points with a partner, and of inliers among those."""
+    """Check the registration of two submaps.
+
+    Args:
+        near: share of the points that have a partner.
+        fit: share of inliers among the points that have a partner.
+        fit_min: least `fit` that passes.
+    """
     return (
         at_least("near", near, NEAR_MIN),
         at_least("fit", fit, fit_min, FIT_MIN),
@@ -53,12 +64,17 @@ def of_fit(near: float, fit: float, fit_min: float) -> tuple[Check, ...]:
 
 
 def of_gate(off_m: float, off_deg: float, radius_m: float, heading_deg: float) -> tuple[Check, ...]:
-    """Pose of a hypothesis: inside the gate."""
+    """Check that a registered pose is near the expected one: at most `radius_m` and `heading_deg` away."""
     return (at_most("off_m", off_m, radius_m), at_most("off_deg", off_deg, heading_deg))
 
 
 def of_place(loosest_m: float, ambiguity: float) -> tuple[Check, ...]:
-    """Certainty of a hypothesis: in a bare corridor it is loose or ambiguous."""
+    """Check that a registration is certain and unique; in a bare corridor it is neither.
+
+    Args:
+        loosest_m: largest standard deviation of the position in any direction.
+        ambiguity: likelihood of the second-best position as a share of the best one's.
+    """
     return (
         at_most("loosest_m", loosest_m, LOOSEST_MAX_M),
         at_most("ambiguity", ambiguity, AMBIGUITY_MAX),
@@ -66,12 +82,20 @@ def of_place(loosest_m: float, ambiguity: float) -> tuple[Check, ...]:
 
 
 def of_free_space(violation: float) -> tuple[Check, ...]:
-    """Walls of either submap: not in the free space of the other."""
+    """Check that at most a small share (`violation`) of the walls of one submap lies in the free space of the other."""
     return (at_most("violation", violation, VIOLATION_MAX),)
 
 
 def of_cluster(probes: int, least: int, span_m: float, least_m: float, rival: float) -> tuple[Check, ...]:
-    """A cluster of hypotheses: its probes, their travel, and the score of its best rival as a share of its own."""
+    """Check a cluster of loop hypotheses that agree with each other.
+
+    Args:
+        probes: number of places along the drive from which the cluster's loops were measured.
+        least: least number of them that passes.
+        span_m: travel between the first and the last of them.
+        least_m: least travel that passes.
+        rival: score of the best contradicting cluster as a share of this cluster's score.
+    """
     return (
         at_least("probes", probes, least),
         at_least("span_m", span_m, least_m),

@@ -46,7 +46,7 @@ class Cloud:
         return len(self.points)
 
     def moved(self, pose_a_b: Array) -> Cloud:
-        """The same cloud in frame a, given in frame b."""
+        """The same cloud in frame a, where this one is given in frame b."""
         cos, sin = np.cos(pose_a_b[2]), np.sin(pose_a_b[2])
         turn = np.array([[cos, sin], [-sin, cos]])
         return Cloud(self.points @ turn + pose_a_b[:2], self.normals @ turn)
@@ -63,7 +63,7 @@ EMPTY = Cloud(np.zeros((0, 2)), np.zeros((0, 2)))
 
 
 def cloud_of_scan(ranges_m: NDArray[np.float32], laser: Laser) -> Cloud:
-    """Points of one scan in `base_link`, merged by cell.
+    """Points of one scan in `base_link`; points that fall into one grid cell are averaged.
 
     Args:
         ranges_m: (B,) ranges, NaN where invalid.
@@ -73,7 +73,7 @@ def cloud_of_scan(ranges_m: NDArray[np.float32], laser: Laser) -> Cloud:
 
 
 def clouds_of_scans(ranges_m: Sequence[NDArray[np.float32]], laser: Laser) -> list[Cloud]:
-    """The same for many scans at once, which is faster."""
+    """Clouds of many scans, as `cloud_of_scan` gives them one by one, but faster."""
     ranges = np.array(ranges_m, dtype=np.float64).reshape(len(ranges_m), -1)
     valid = (ranges >= laser.range_min_m) & (ranges <= min(laser.range_max_m, RANGE_MAX_M))
     valid &= valid.sum(axis=1, keepdims=True) >= 2 * NEIGHBOURS + 1
@@ -90,7 +90,10 @@ def clouds_of_scans(ranges_m: Sequence[NDArray[np.float32]], laser: Laser) -> li
 
 
 def merged(clouds: Iterable[Cloud], cell_m: float = CELL_M) -> Cloud:
-    """All points, those of one cell averaged; the order follows the cells, so it depends on the points alone."""
+    """Merge clouds of one frame; points that fall into one grid cell are averaged.
+
+    The order of the result follows the cells, so it does not depend on the order of the clouds.
+    """
     parts = [c for c in clouds if len(c)]
     if not parts:
         return EMPTY
@@ -99,7 +102,7 @@ def merged(clouds: Iterable[Cloud], cell_m: float = CELL_M) -> Cloud:
 
 
 def merged_at(clouds: Sequence[Cloud], poses: Array, cell_m: float = CELL_M) -> Cloud:
-    """Merge clouds that were taken from poses (N, 3); the points come out in the frame of the poses."""
+    """Merge clouds that were taken from poses (N, 3) into one, in the frame in which the poses are given."""
     counts = [len(c) for c in clouds]
     if sum(counts) == 0:
         return EMPTY
@@ -162,16 +165,17 @@ def _normals(points: Array, reach_m: Array, scan: NDArray[np.int64]) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class LikelihoodField:
-    """A grid about a cloud.
+    """A grid around a cloud that tells the nearest point and the likelihood of any position.
 
     Attributes:
         low: (2,) corner of cell (0, 0), m.
         cell_m: side of a cell.
-        shape: cells in x and y.
-        margin: empty cells at each border, to which look-ups are clipped.
+        shape: number of cells in x and y.
+        margin: number of empty cells at each border, to which look-ups are clipped.
         labels: (cells,) int32, 1 + index of the nearest point of the cloud within reach, 0 for none.
         likelihood: (cells,) uint8, 255 exp(-d^2 / 2 sigma^2) of the distance d to that point.
-        lines: (3, 1 + P) the line through each point: its normal, and its distance from the origin along that; 0 for none.
+        lines: (3, 1 + P) the line through each point: its unit normal, and its distance from the origin along the normal;
+            column 0 is zero and stands for no point.
     """
 
     low: Array
@@ -203,14 +207,14 @@ def build_field(
     sigma_m: float = FIELD_SIGMA_M,
     search_m: float = 0.0,
 ) -> LikelihoodField:
-    """Write every point with a normal into the cells about it, the far cells first, so that the nearest point wins.
+    """Build the likelihood field of a cloud; points without a normal are left out.
 
     Args:
         cloud: P points with normals.
         cell_m: side of a cell.
-        reach_m: how far a point reaches.
-        sigma_m: width of the likelihood.
-        search_m: largest translation of the starts that will be scored on this field.
+        reach_m: largest distance from a point at which it has a likelihood.
+        sigma_m: standard deviation of the likelihood.
+        search_m: largest translation of the poses that will be scored on this field.
     """
     usable = np.flatnonzero(cloud.normals[:, 0] ** 2 + cloud.normals[:, 1] ** 2 > 0.5)
     points, normals = cloud.points[usable].T, cloud.normals[usable].T

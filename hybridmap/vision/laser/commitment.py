@@ -27,7 +27,7 @@ SPAN_PER_EFOLD_M = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """A pending hypothesis and its key."""
+    """A pending loop hypothesis and the key of its proposed edge."""
 
     key: int
     hypothesis: Hypothesis
@@ -35,7 +35,7 @@ class Waiting:
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """A decided hypothesis: the checks of its cluster, or what it lacks."""
+    """A decided loop hypothesis: the checks of its cluster if it is accepted, else what it lacked."""
 
     key: int
     hypothesis: Hypothesis
@@ -44,24 +44,24 @@ class Settled:
 
     @property
     def accepted(self) -> bool:
-        """Whether it enters the map."""
+        """Whether the loop enters the map."""
         return self.lack is None
 
     def proposed(self) -> Edge:
-        """Its edge."""
+        """The edge of the hypothesis, with its new status."""
         return self.hypothesis.proposed(self.key).settled(*self.checks, lack=self.lack)
 
 
 @dataclass(frozen=True, slots=True)
 class Cluster:
-    """Consistent hypotheses, one a probe.
+    """Loop hypotheses that agree with each other, at most one for each place from which loops were measured (probe).
 
     Attributes:
-        members: their positions in the queue.
-        score: sum of their quality.
-        probes: distinct probes.
-        span_m: travel between the outermost of them.
-        sigma_m: median standard deviation of their gates.
+        members: positions of the hypotheses in the queue.
+        score: sum of the quality of the members.
+        probes: number of distinct probes.
+        span_m: travel between the first and the last probe.
+        sigma_m: median uncertainty of the expected position, over the members.
     """
 
     members: tuple[int, ...]
@@ -73,35 +73,38 @@ class Cluster:
 
 @dataclass(frozen=True, slots=True)
 class AcceptedCluster:
-    """A cluster that is accepted, and the checks that it passed."""
+    """An accepted cluster, and the checks that it passed."""
 
     cluster: Cluster
     checks: tuple[Check, ...]
 
 
 class Commitment:
-    """The queue of pending hypotheses."""
+    """The queue of pending loop hypotheses."""
 
     def __init__(self, travel_of: Callable[[int], float]) -> None:
-        """Start empty; `travel_of` gives the travel until a node, m."""
+        """Start with an empty queue; `travel_of` returns the path length (m) up to a node."""
         self._travel = travel_of
         self._queue: list[Waiting] = []
         self._given_up: list[Waiting] = []
         self._consistent: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
 
     def add(self, key: int, hypothesis: Hypothesis) -> None:
-        """Add a hypothesis."""
+        """Add a hypothesis, with the key of its proposed edge."""
         self._queue.append(Waiting(key, hypothesis))
 
     def settle(self, travel_m: float, belief: Belief) -> list[Settled]:
-        """Set aside what has been pending too long; accept the best cluster if it is good enough, with all that agrees."""
+        """Give up hypotheses pending for too long; accept the best cluster if good enough, with all that agree with it.
+
+        `travel_m` is the path length so far. Returns the hypotheses that were decided.
+        """
         out = [Settled(w.key, w.hypothesis, lack=Lack.UNSUPPORTED) for w in self._expire(travel_m)]
         return out + self._commit_all(belief, SPAN_PER_EFOLD_M)
 
     def flush(self, belief: Belief) -> list[Settled]:
-        """At the end: go once more through all that found no cluster, by the rule of a narrow gate.
+        """At the end of the drive, decide all hypotheses that found no cluster, those given up before included.
 
-        What was given up while driving is tried again from the new map; may be called again after the map has changed.
+        May be called again after the map has changed. Returns the hypotheses that were decided.
         """
         fresh = {w.key for w in self._queue}
         again = sorted(self._given_up + self._queue, key=lambda w: (self._travel(w.hypothesis.probe), w.key))

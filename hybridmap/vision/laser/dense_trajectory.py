@@ -33,7 +33,7 @@ NOWHERE_M = 1e6
 
 @dataclass(frozen=True, slots=True)
 class ObservedScan:
-    """A scan, the last node before it, and the integrator's motion (3,) since that node."""
+    """A scan, the number of the last node before it, and the path integrator's motion (3,) since that node."""
 
     scan: LaserScan
     node: int
@@ -41,7 +41,7 @@ class ObservedScan:
 
 
 class DenseTrajectory:
-    """Registers scans to the map, block of nodes by block."""
+    """Registers the scans between nodes to the final map, a block of consecutive nodes at a time."""
 
     def __init__(self, atlas: Atlas, laser: Laser) -> None:
         self._atlas = atlas
@@ -50,11 +50,11 @@ class DenseTrajectory:
     def dense_trajectory(self, scans: Sequence[ObservedScan], steps: Array, poses: Array) -> Anchors:
         """Pose of the robot at every registered scan, seen from the last node before it.
 
-        Scans about a break of the chain are left out: odometry does not show on which side of it they were taken.
+        Scans around a kidnapping are left out: odometry does not show on which side of it they were taken.
 
         Args:
-            scans: every scan since the first node, in order; that of a node has no motion.
-            steps: (N - 1, 3) the integrator's motion from each node to the next.
+            scans: every scan since the first node, in order; the scan of a node itself has zero motion.
+            steps: (N - 1, 3) the path integrator's motion from each node to the next.
             poses: (N, 3) of the nodes in the final map.
         """
         nodes = np.array([s.node for s in scans], dtype=np.int64)

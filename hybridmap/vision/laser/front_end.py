@@ -35,10 +35,10 @@ MOST_BETWEEN = 30
 
 
 class LaserFrontEnd:
-    """Loop closure by registration of submaps, as a `vision.base.DenseFrontEnd`.
+    """Loop closure by registration of laser submaps; implements `vision.base.DenseFrontEnd`.
 
     Attributes:
-        atlas: the scans of the nodes, of which submaps are made.
+        atlas: the scans of the nodes, from which submaps are made.
         localisation: whether the robot is lost, and its global localisation.
     """
 
@@ -83,7 +83,7 @@ class LaserFrontEnd:
         return View(frame.stamp_ns, profile, seen.template, seen.founded)
 
     def add_node(self, node: int, view: View) -> None:
-        """Make a node of the scan observed last."""
+        """Make a node of the scan that was observed last."""
         seen = self._scans.pop()
         self._between = [s for s in self._scans[-MOST_BETWEEN:] if s.node == node - 1 and node > 0]
         if node > 0:
@@ -93,7 +93,7 @@ class LaserFrontEnd:
         self._node = (node, self._cloud(seen.scan), seen.scan)
 
     def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
-        """Register the new node to the submap of the last ones."""
+        """Register the new node to the submap of the nodes just before it."""
         assert self._node is not None
         number, cloud, scan = self._node
         assert number == node
@@ -109,7 +109,10 @@ class LaserFrontEnd:
         return [self.localisation.tracked(self._registration(node, step), broken)]
 
     def close(self, node: int, belief: Belief) -> list[Edge]:
-        """Localise a lost robot on the whole map; probe the old submaps every few metres; decide pending hypotheses."""
+        """Look for loops of the new node, and decide pending ones.
+
+        A lost robot is compared with the whole map; else the last metres are compared with older submaps every few metres.
+        """
         sought = self.localisation.search(node, belief)
         travel_m = self.atlas.travel_m[node]
         if sought.accepted or travel_m - self._last_probe_m < self._config.probes.every_m:
@@ -130,7 +133,7 @@ class LaserFrontEnd:
         return out
 
     def finish(self, belief: Belief) -> list[Edge]:
-        """Probe from the last node and decide all that is pending; then register nodes near each other."""
+        """At the end of the drive, decide all pending loops; then register nodes that are near each other on the map."""
         last, out = len(self.atlas) - 1, []
         if last >= 0 and self.atlas.travel_m[last] - self._last_probe_m > LAST_PROBE_M:
             out = self._probe(last, belief)
@@ -142,22 +145,22 @@ class LaserFrontEnd:
         return out + [hypothesis.proposed(self._next_key()) for hypothesis in near]
 
     def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
-        """Register again, from the map's poses, the nodes of loops that a back-end gave no weight."""
+        """Measure again, from the poses of the map, loops that a back-end down-weighted as outliers."""
         poses = belief.poses_map_node
         return [self._reviser.register(edge.source, edge.target, poses, Search.AGAIN).proposed(edge.key) for edge in outliers]
 
     def dense_trajectory(self, belief: Belief) -> Anchors:
-        """Register every scan to the final map."""
+        """Register every scan to the final map; returns the poses between nodes."""
         scans = [s for s in self._scans if s.node >= 0] if self._config.dense_trajectory else []
         return self._dense_trajectory.dense_trajectory(scans, np.array(self._steps), belief.poses_map_node)
 
     @property
     def lost_since(self) -> int | None:
-        """As `vision.base.FrontEnd`."""
+        """First node after the robot was kidnapped or lost track of its motion; None while it is localised on the map."""
         return self.localisation.lost_since
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
-        """Profile and ranges of a node's scan."""
+        """`profile` and `ranges_m` of a node's scan."""
         return {"profile": self._profiles[node], **LASER.compact(LaserScan(0, self.atlas.ranges[node]))}
 
     def _next_key(self) -> int:
@@ -186,6 +189,6 @@ class LaserFrontEnd:
 
 
 def create(config: VisionConfig, rig: Rig, seed: int, clock: StageClock) -> LaserFrontEnd:
-    """As `vision.Factory`; nothing here is random, and nothing has a stage of its own."""
+    """Make the laser front-end; `seed` and `clock` are not used."""
     del seed, clock
     return LaserFrontEnd(config, rig.sensors[LASER.sensor_name])

@@ -60,16 +60,16 @@ class Hypothesis:
     """A measured candidate of a loop closure.
 
     Attributes:
-        probe: newer node, the frame of the recent submap.
-        anchor: older node, the frame of the old submap.
+        probe: newer node, whose frame is that of the recent submap.
+        anchor: older node, whose frame is that of the old submap.
         relative: pose of the anchor in the frame of the probe.
-        quality: near x fit.
-        sigma_m: standard deviation of the position in the gate.
-        search: how the two submaps came to be compared.
-        checks: of the registration, in their order; it is no hypothesis if one failed.
-        figures: the further figures of the registration.
-        fits: whether the scans fit.
-        misfit: share of points that do not fit, plus share in free space.
+        quality: share of the points that have a partner, times the share of inliers among those.
+        sigma_m: standard deviation of the expected position before the registration.
+        search: why the two submaps were compared.
+        checks: checks of the registration, in their order; the loop is rejected if one failed.
+        figures: further measured values of the registration, by name.
+        fits: whether enough points of the scans fit.
+        misfit: share of points that do not fit, plus share of walls in the other's free space.
     """
 
     probe: int
@@ -85,11 +85,11 @@ class Hypothesis:
 
     @property
     def passed(self) -> bool:
-        """Whether no check failed."""
+        """Whether all checks passed."""
         return passed(self.checks)
 
     def proposed(self, key: int, lack: Lack | None = None) -> Edge:
-        """Its edge, with what it lacks beside checks."""
+        """The hypothesis as an edge, under a key; `lack` says why it is not accepted although all checks passed."""
         return Edge.decided(
             self.probe,
             self.anchor,
@@ -135,7 +135,7 @@ class _Mode:
 
 
 class Prober:
-    """Proposes and measures hypotheses."""
+    """Registers the submap of the last metres (the probe) to old submaps, to find loop closures."""
 
     def __init__(self, config: VisionConfig, atlas: Atlas, laser: Laser) -> None:
         self._gate_sigmas, self._fit_min = config.closing.gate_sigmas, config.laser.probes.fit_min
@@ -144,12 +144,12 @@ class Prober:
         self._anchors: list[int] = []
 
     def probe(self, node: int, belief: Belief, since: int = 0) -> list[Hypothesis]:
-        """Register the last metres before a node to the old submaps inside the gate; failed ones are returned too.
+        """Register the last metres before a node to the old submaps that may be nearby; failed registrations are returned too.
 
         Args:
             node: the newest node of the probe.
-            belief: gives the gate.
-            since: only submaps about this node and later ones are searched.
+            belief: the map, which tells what may be nearby.
+            since: old submaps around earlier nodes than this one are left out.
         """
         atlas = self._atlas
         recent = atlas.along(node, LENGTH_M, 0.0)
@@ -162,13 +162,13 @@ class Prober:
         return _distinct([self._verify(mode, probe, Search.GATE) for mode in modes[: MODES_SURE if sure else MODES]])
 
     def probe_anywhere(self, probe: Submap, anchors: Sequence[int]) -> list[Hypothesis]:
-        """Register a submap to those about some anchors, from any pose."""
+        """Register a submap to the old submaps around the nodes `anchors`, without an expected pose."""
         gates = [_Gate(anchor, IDENTITY, UNKNOWN, np.pi, UNKNOWN) for anchor in anchors]
         modes = self._search(gates, probe)[:MODES_ANYWHERE]
         return _distinct([self._verify(mode, probe, Search.WHOLE_MAP) for mode in modes])
 
     def anchors_before(self, node: int) -> list[int]:
-        """Anchors of submaps wholly before a node."""
+        """Nodes around which there are submaps that lie wholly before a node."""
         self._extend_anchors()
         atlas, half_m = self._atlas, TARGET_HALF_M
         limit = atlas.travel_m[node] - half_m

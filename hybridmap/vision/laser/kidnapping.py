@@ -39,7 +39,7 @@ DECIDED = 3.0
 
 
 class Continuity:
-    """Tests whether the robot can have driven along the chain of the atlas."""
+    """Tests whether the robot can have driven along the registered poses of the nodes, or was carried away (kidnapped)."""
 
     def __init__(self, config: VisionConfig, atlas: Atlas, laser: Laser, tracker: Tracker) -> None:
         self._may_be_lost, self._gate_sigmas = config.relocalising.enabled, config.closing.gate_sigmas
@@ -50,17 +50,17 @@ class Continuity:
     def broken(
         self, node: int, step: Step, odometry: RelativePose, on_the_way: Sequence[tuple[Array, LaserScan]]
     ) -> tuple[Check, ...]:
-        """Failed checks of the way to the newest node of the atlas; empty where the chain holds.
+        """Test the way to the newest node; returns the failed checks, none if the robot can have driven it.
 
-        The chain breaks where three things hold: the registration does not fit, or contradicts the odometry; the walls of the
-        two scans lie in each other's free space; and a scan between the nodes does not fit the one before it. Drop-outs of the
-        wheels, people and doors give the first two, but not the third.
+        The robot counts as kidnapped where three things hold: the registration does not fit, or contradicts the odometry;
+        the walls of the two scans lie in each other's free space; and a scan between the nodes does not fit the one before.
+        Wheel slip, people and doors cause the first two, but not the third.
 
         Args:
             node: the newest node.
-            step: the motion to it by the scans.
-            odometry: the same by the wheels.
-            on_the_way: in order, the motion (3,) since the first node, and the scan, between the two nodes.
+            step: the motion to it by scan matching.
+            odometry: the same motion by the wheels.
+            on_the_way: the scans between the two nodes in order, each with the motion (3,) since the first node.
         """
         if not self._may_be_lost:
             return ()
@@ -75,7 +75,7 @@ class Continuity:
         return checks.of_way(sigmas if step.measured else None, seen)
 
     def contradicted(self, node: int, belief: Belief) -> bool:
-        """Whether the last scans contradict the old ones about the robot's pose on the map, where that pose is certain."""
+        """Whether the last scans contradict the old scans around the robot's pose on the map, where that pose is certain."""
         poses = belief.poses_map_node
         near = nodes_within(poses, node, OLD_M, np.pi, self._old(node))
         if len(near) == 0 or np.trace(belief.covariance_from(node)[near, :2, :2], axis1=1, axis2=2).min() > SURE_M**2:
@@ -85,14 +85,14 @@ class Continuity:
         return violation_both_ways(here, there, IDENTITY, self._atlas.ranges, self._laser) > MAP_VIOLATION
 
     def kidnapped_unnoticed(self, matches: Sequence[Edge], belief: Belief) -> int | None:
-        """First node after a kidnapping that was not noticed, once matches localise the robot; None if the chain only drifted.
+        """Find the first node after a kidnapping that was not noticed; None if the odometry only drifted.
 
-        Scans before that node fit the map better at the poses of the chain; scans after it, at those of the matches. Without
-        old scans to compare with, the chain counts as `checks.INLIERS_MIN`.
+        Scans before that node fit the map better at the poses by dead reckoning; later scans, at those by the loops. If there
+        are no old scans to compare with, the pose by dead reckoning counts as a fair fit (`checks.INLIERS_MIN`).
 
         Args:
-            matches: loops that contradict the chain.
-            belief: the map's, without them.
+            matches: loops that localised the robot and contradict dead reckoning.
+            belief: the map without these loops.
         """
         found, poses = min(s.source for s in matches), belief.poses_map_node
         there = placed_by(matches, found, poses)
@@ -181,8 +181,8 @@ ALIKE = (0.5, 0.5)
 class GlobalLocalisation:
     """Whether a laser robot is lost, and the search for it. The newer node is the source of an edge.
 
-    Where the chain breaks, a new piece of the atlas begins. Its scans are registered to all submaps before it; those that fit
-    are matches, until enough of them agree (`Relocaliser`).
+    After a kidnapping the nodes form a new piece of the atlas. Its scans are registered to all submaps before it; registrations
+    that fit are pending matches, until enough of them agree (see `Relocaliser`).
     """
 
     def __init__(
@@ -209,20 +209,20 @@ class GlobalLocalisation:
 
     @property
     def lost_since(self) -> int | None:
-        """First node after the break of the chain, while the robot is not localised."""
+        """First node after the kidnapping; None while the robot is localised."""
         return self._broken_at
 
     @property
     def since(self) -> int:
-        """First node of the piece of the chain that the robot is on: 0, or the first after the break."""
+        """First node that is joined to the newest one by registrations: 0, or the first after the last kidnapping."""
         return self._broken_at or 0
 
     def tracked(self, registration: Edge, broken_by: tuple[Check, ...]) -> Edge:
-        """Note how the newest node of the atlas was registered; a new piece begins with it if the chain broke.
+        """Note how the newest node was registered; after a kidnapping it begins a new piece of the atlas.
 
         Args:
-            registration: of the newest node to those before it.
-            broken_by: see `Continuity.broken`.
+            registration: edge from the node before to the newest node.
+            broken_by: failed checks of `Continuity.broken`; empty if the robot was not kidnapped.
 
         Returns:
             The registration with these checks.
@@ -239,7 +239,7 @@ class GlobalLocalisation:
         return registration
 
     def probed(self, node: int, hypotheses: Sequence[Hypothesis], belief: Belief) -> None:
-        """Note whether a probe inside the gate recognised its place. One that fits but is ambiguous counts as neither."""
+        """Note from the loop hypotheses of a node whether it recognised its place; an ambiguous fit counts neither way."""
         if self._broken_at is not None:
             return
         if any(h.passed for h in hypotheses):
@@ -252,18 +252,18 @@ class GlobalLocalisation:
             self._whereabouts.unrecognised()
 
     def closed(self) -> list[Edge]:
-        """Loops inside the gate were accepted: the robot is localised, unless the chain is broken."""
+        """Note that loops were accepted: the robot is localised, unless it was kidnapped. Returns the edges that changed."""
         if self._broken_at is not None:
             return []
         self._whereabouts.recognised()
         return self._relocaliser.dismiss(Lack.NOT_LOST)
 
     def finish(self) -> list[Edge]:
-        """At the end of the drive, reject pending matches."""
+        """At the end of the drive, reject all pending matches; returns their edges."""
         return self._relocaliser.dismiss()
 
     def search(self, node: int, belief: Belief) -> Settlement:
-        """While the robot is lost, register its last metres to the whole map; less often after a while."""
+        """While the robot is lost, register its last metres to the whole map: first at each node, later less often."""
         if not self._whereabouts.lost or not self._due(node):
             return Settlement([])
         self._searched_m = self._atlas.travel_m[node]
@@ -282,7 +282,7 @@ class GlobalLocalisation:
         return travel_m - self._searched_m >= self._every_m
 
     def most_similar(self, node: int, anchors: list[int]) -> list[int]:
-        """All anchors if they are few; else those about the nodes with the most similar profiles."""
+        """Of the nodes `anchors`, those whose profiles are most similar to that of `node`; all if they are few."""
         most = SUBMAPS
         if len(anchors) <= most:
             return anchors

@@ -38,7 +38,7 @@ FLOOR_M, FLOOR_DEG = 0.002, 0.025
 
 
 class Reviser:
-    """Rounds of re-proposal."""
+    """Registers nodes that are near each other on the optimised map, in rounds."""
 
     def __init__(self, config: VisionConfig, atlas: Atlas, laser: Laser) -> None:
         self._most_rounds, self._fit_min = config.closing.revisit_rounds, config.laser.probes.fit_min
@@ -48,11 +48,11 @@ class Reviser:
         self._done: set[tuple[int, int]] = set()
 
     def round(self, belief: Belief, since: int = 0) -> list[Hypothesis]:
-        """Register every pair that is due; empty after the configured rounds.
+        """Register every pair of nearby nodes not registered before; an empty list after the configured number of rounds.
 
         Args:
-            belief: where the nodes lie.
-            since: nodes from this one on are not registered to earlier ones.
+            belief: the map, which gives the poses of the nodes.
+            since: nodes from this one on are not paired with earlier ones.
         """
         if self._rounds >= self._most_rounds or len(self._atlas) == 0:
             return []
@@ -87,7 +87,7 @@ class Reviser:
         return [o for o in chosen[:PARTNERS] if (node, o) not in self._done]
 
     def register(self, node: int, other: int, poses: Array, search: Search = Search.NEAR) -> Hypothesis:
-        """Register the scans about a node to those about an older one, from poses (N, 3) on the map."""
+        """Register the scans around a node to those around an older one, starting from the map's poses (N, 3)."""
         target, probe = self._atlas.around(other, TARGET_HALF_M), self._atlas.around(node, PROBE_HALF_M)
         sharp, fine = self._atlas.scoring_field(target, Field.SHARP), self._atlas.fine_field(target)
         expected = between(poses[other], poses[node])

@@ -22,14 +22,14 @@ def score_poses(field: LikelihoodField, points: Array, poses: Array) -> Array:
 
 
 def ambiguity(field: LikelihoodField, points: Array, direction: Array, apart_m: float = 0.4, reach_m: float = 3.0) -> float:
-    """Likelihood of a second mode along a direction, as a share of that of the registered pose.
+    """Likelihood of the second-best position along a direction, as a share of that of the registered pose.
 
     Args:
-        field: the target.
-        points: (P, 2) in the target's frame, registered.
-        direction: (2,) unit vector.
-        apart_m: least shift of a second mode.
-        reach_m: largest shift looked at.
+        field: likelihood field of the target.
+        points: (P, 2) registered points, in the target's frame.
+        direction: (2,) unit vector along which the points are shifted.
+        apart_m: smallest shift that counts as another position.
+        reach_m: largest shift tried.
     """
     side = np.arange(apart_m, reach_m, 0.1)
     shifts = np.concatenate([[0.0, -0.1, 0.1, -0.2, 0.2], -side, side])
@@ -40,14 +40,14 @@ def ambiguity(field: LikelihoodField, points: Array, direction: Array, apart_m: 
 
 
 def score_starts(field: LikelihoodField, points: Array, center: Array, headings_rad: Array, offsets_m: Array) -> Array:
-    """Mean likelihood of points at every start of a grid.
+    """Mean likelihood of points at every pose of a grid.
 
     Args:
-        field: the target.
+        field: likelihood field of the target.
         points: (P, 2) in the moving frame.
-        center: (2,) about which the starts lie, m.
-        headings_rad: (H,) of the moving frame.
-        offsets_m: (T, 2) translations about the centre; at most the field's `search_m`.
+        center: (2,) middle of the grid in the target's frame, m.
+        headings_rad: (H,) headings of the moving frame.
+        offsets_m: (T, 2) translations from the middle; at most the field's `search_m`.
 
     Returns:
         (H, T) in [0, 1].
@@ -83,7 +83,7 @@ class Start:
 
 
 def survivors(wide: LikelihoodField, points: Array, offsets_m: Array, headings_rad: Array) -> list[Start]:
-    """The best starts of a grid, whether separated or not, the best first.
+    """The poses of a coarse grid with the largest likelihood, the best first; they may be neighbours.
 
     Args:
         wide: the target's field with a likelihood as wide as the steps of the grid.
@@ -99,20 +99,20 @@ def survivors(wide: LikelihoodField, points: Array, offsets_m: Array, headings_r
 
 
 def sharpened(sharp: LikelihoodField, points: Array, starts: list[Start], count: int) -> list[Start]:
-    """The best separated poses about some starts.
+    """Refine poses on a field of half the width; returns the best ones that lie apart from each other.
 
     Args:
         sharp: the target's field with half the width of that which found the starts.
         points: (P, 2) in the moving frame.
-        starts: what is left of the grid.
-        count: how many at most.
+        starts: the poses to be refined.
+        count: how many poses to return at most.
     """
     poses = (np.array([start.pose for start in starts])[:, None] + _star()[None]).reshape(-1, 3)
     return separated(poses, score_poses(sharp, points, poses), count)
 
 
 def separated(poses: Array, scores: Array, count: int) -> list[Start]:
-    """The best of scored poses (N, 3), each apart from those before it."""
+    """The best of scored poses (N, 3), at most `count`; poses close to a better one are left out."""
     left, out = scores.copy(), []
     for _ in range(count):
         i = int(np.argmax(left))
@@ -126,7 +126,7 @@ def separated(poses: Array, scores: Array, count: int) -> list[Start]:
 
 
 def spaced(half: float, step: float) -> Array:
-    """Numbers from -half to half, at most `step` apart, 0 among them."""
+    """Evenly spaced numbers from -half to half, at most `step` apart, 0 among them."""
     count = int(np.ceil(half / step))
     return np.linspace(-half, half, 2 * count + 1)
 
@@ -170,7 +170,7 @@ WEAKEST_INFORMATION = (1.0, 1.0, 4.0)
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """Expected pose of the moving frame, (3,) or (K, 3) for K starts, and its standard deviations, m and rad."""
+    """Expected pose of the moving frame in the target's, (3,) or (K, 3) for K starts, and its standard deviations (m, rad)."""
 
     pose: Array
     sigma_m: float
@@ -179,7 +179,7 @@ class Prior:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """K registrations.
+    """K registrations of a cloud, from K starts.
 
     Attributes:
         poses: (K, 3) of the moving frame in the target's.
@@ -187,8 +187,8 @@ class Alignment:
         near: (K,) share of points that have a partner.
         inliers: (K,) share of points whose residual is small.
         fit: (K,) share of inliers among the points that have a partner.
-        rms_m: (K,) of the inliers' residuals.
-        points: how many were registered.
+        rms_m: (K,) root mean square of the inliers' residuals.
+        points: number of points that were registered.
     """
 
     poses: Array
@@ -202,7 +202,7 @@ class Alignment:
     def covariance(self, k: int, floor_m: float, floor_rad: float) -> Array:
         """Covariance (3, 3) of registration k in the moving frame: variance of the residuals times the inverse Hessian.
 
-        The floors stand for errors that residuals do not show, as of a target that is itself bent.
+        The least standard deviations `floor_m` and `floor_rad` stand for errors that residuals do not show (a bent target).
         """
         variance = max(SIGMA_M, float(self.rms_m[k])) ** 2
         trusted = self._without_spurious(k, SPURIOUS)
@@ -229,7 +229,7 @@ class Alignment:
 
 
 def ambiguity_of(field: LikelihoodField, cloud: Cloud, alignment: Alignment, k: int = 0) -> float:
-    """`ambiguity` of registration k along its weakest direction."""
+    """Ambiguity of registration k along its least certain direction; see `ambiguity`."""
     pose = alignment.poses[k]
     weakest = alignment.weakest_direction(k)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
@@ -260,10 +260,10 @@ def align(field: LikelihoodField, cloud: Cloud, starts: Array, prior: Prior | No
     """Register a cloud from K starts: Gauss-Newton on point-to-line residuals with Cauchy weights.
 
     Args:
-        field: the target.
+        field: likelihood field of the target.
         cloud: P points in the moving frame.
         starts: (K, 3) poses of the moving frame in the target's.
-        prior: of the pose; `hessian` leaves it out.
+        prior: expected pose, which joins the solve; the result's `hessian` leaves it out.
     """
     poses = np.array(starts, dtype=np.float64)
     moving = _Moving(*(np.ascontiguousarray(a[..., i]) for a in (cloud.points, cloud.normals) for i in (0, 1)))

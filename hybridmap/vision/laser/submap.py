@@ -27,13 +27,13 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True, slots=True)
 class Submap:
-    """Nodes about an anchor, in the anchor's frame.
+    """The merged scans of some nodes around one node (the anchor), in that node's frame.
 
     Attributes:
-        anchor: node whose frame it is.
-        nodes: its nodes.
-        poses: (N, 3) of them in the anchor's frame.
-        cloud: their points.
+        anchor: the node whose frame it is.
+        nodes: (N,) numbers of the nodes.
+        poses: (N, 3) of the nodes in the anchor's frame.
+        cloud: the merged points of their scans.
     """
 
     anchor: int
@@ -42,13 +42,16 @@ class Submap:
     cloud: Cloud
 
     def viewpoints(self, count: int) -> NDArray[np.int64]:
-        """At most `count` positions in `nodes`, evenly spread."""
+        """Indices into `nodes`, evenly spread, at most `count`."""
         n = len(self.nodes)
         return np.unique(np.linspace(0, n - 1, min(count, n)).round().astype(np.int64))
 
 
 class Field(Enum):
-    """Which likelihood field of a submap: cell, reach and width of the likelihood, m; how many are kept."""
+    """Kinds of likelihood field of a submap.
+
+    The values are: side of a cell, reach and width of the likelihood (all m), and how many such fields are cached.
+    """
 
     WIDE = (0.2, 0.8, 0.4, 800)
     SHARP = (0.1, 0.5, 0.2, 160)
@@ -76,15 +79,15 @@ class _Recent(Generic[Key, Value]):
 
 
 class Atlas:
-    """The clouds of all nodes and the chain of their registered poses; makes submaps.
+    """The clouds of all nodes and the poses that scan matching gives them one after the other; makes submaps.
 
-    A new piece begins where the chain broke; no submap holds nodes of two pieces.
+    A new piece begins after a kidnapping; no submap holds nodes of two pieces.
 
     Attributes:
-        clouds, ranges: of each node's scan, the points in its frame and the ranges (B,) as they came.
-        chain: pose (3,) of each node.
-        scatter: covariance (3, 3), in each node's own frame, of its place in the submap of the nodes about it.
-        travel_m: path length along the chain.
+        clouds, ranges: of each node's scan, the points in its frame, and the ranges (B,) as received.
+        chain: pose (3,) of each node by scan matching from node to node.
+        scatter: covariance (3, 3) of each node's pose relative to the nodes around it, in the node's own frame.
+        travel_m: path length up to each node.
     """
 
     def __init__(self) -> None:
@@ -102,7 +105,7 @@ class Atlas:
         return len(self.clouds)
 
     def add(self, cloud: Cloud, ranges_m: NDArray[np.float32], pose: Array, scatter: Array) -> None:
-        """Append a node by its pose (3,) in the chain and the covariance (3, 3) of that."""
+        """Append a node: its scan, its pose (3,) by scan matching, and the covariance (3, 3) of that relative to its submap."""
         step = float(np.hypot(*(pose - self.chain[-1])[:2])) if self.chain else 0.0
         self.travel_m.append(self.travel_m[-1] + step if self.travel_m else 0.0)
         self.clouds.append(cloud)
@@ -111,9 +114,9 @@ class Atlas:
         self.scatter.append(scatter)
 
     def joining(self, target: int, pose: Array, covariance: Array, probe: int | None = None) -> RelativePose:
-        """The edge that a registration gives: the probe's node in the frame of the target's.
+        """Turn a registration to a submap into a relative pose of two nodes: the probe's node in the frame of the target's.
 
-        The scatter of the nodes in their submaps adds to the covariance of the edge.
+        The uncertainty of each node within its submap adds to the covariance.
 
         Args:
             target: anchor of the submap that was registered to.
@@ -124,50 +127,50 @@ class Atlas:
         return edge if probe is None else compose_relative(edge, RelativePose(IDENTITY, self.scatter[probe]))
 
     def part(self, node: int) -> None:
-        """Begin a new piece of the chain at a node."""
+        """Begin a new piece at a node: the robot was kidnapped before it."""
         insort(self._pieces, node)
 
     def join(self, node: int) -> None:
-        """Rejoin two pieces, the later of which begins at a node."""
+        """Join the piece that begins at a node with the one before it: the robot was not kidnapped there after all."""
         self._pieces.remove(node)
 
     @property
     def pieces(self) -> list[range]:
-        """The nodes of each piece of the chain."""
+        """The node numbers of each piece; pieces are separated by kidnappings."""
         return [range(a, b) for a, b in pairwise([*self._pieces, len(self)])]
 
     def piece(self, node: int) -> range:
-        """The nodes of the piece of a node, which may be the next one to come."""
+        """The node numbers of the piece that contains a node; the node may be the next one to be added."""
         return self.pieces[bisect_right(self._pieces, node) - 1]
 
     def along(self, node: int, before_m: float, after_m: float) -> NDArray[np.int64]:
-        """Nodes of a node's piece that lie at most so much travel before and after it."""
+        """Nodes of the same piece that lie at most `before_m` of travel before a node and at most `after_m` after it."""
         travel, piece = self.travel_m[node], self.piece(node)
         first = int(np.searchsorted(self.travel_m, travel - before_m - 1e-9))
         stop = int(np.searchsorted(self.travel_m, travel + after_m + 1e-9, side="right"))
         return np.arange(max(first, piece.start), min(stop, piece.stop))
 
     def submap(self, anchor: int, nodes: NDArray[np.int64] | Sequence[int] | range) -> Submap:
-        """Merge the clouds of some nodes in the frame of an anchor."""
+        """Merge the clouds of some nodes in the frame of the node `anchor`."""
         numbers = np.asarray(nodes, dtype=np.int64)
         poses = between(self.chain[anchor], np.array([self.chain[i] for i in numbers]).reshape(-1, 3))
         cloud = merged_at([self.clouds[i] for i in numbers.tolist()], poses)
         return Submap(anchor, numbers, poses, cloud)
 
     def around(self, anchor: int, half_m: float) -> Submap:
-        """The submap of the nodes within so many metres of travel of an anchor; cached."""
+        """The submap of the nodes within `half_m` of travel from the node `anchor`; cached."""
         nodes = self.along(anchor, half_m, half_m)
         return self._submaps.get(_span(anchor, nodes), lambda: self.submap(anchor, nodes))
 
     def scoring_field(self, target: Submap, kind: Field) -> LikelihoodField:
-        """A field of a submap on which starts up to `SEARCH_M` from its anchor are scored."""
+        """A likelihood field of a submap, on which poses up to `SEARCH_M` from its anchor can be scored; cached."""
         cell_m, reach_m, sigma_m, _ = kind.value
         return self._scoring[kind].get(
             _span(target.anchor, target.nodes), lambda: build_field(target.cloud, cell_m, reach_m, sigma_m, SEARCH_M)
         )
 
     def fine_field(self, target: Submap) -> LikelihoodField:
-        """The field of a submap to which clouds are registered."""
+        """The likelihood field of a submap to which clouds are registered; cached."""
         return self._fine.get(_span(target.anchor, target.nodes), lambda: build_field(target.cloud))
 
 
@@ -189,13 +192,13 @@ GRAZING = 0.3
 def violation(
     walls: Submap, seers: Submap, pose_seers_walls: Array, ranges: Sequence[NDArray[np.float32]], laser: Laser
 ) -> float:
-    """Share of one submap's visible points that are in the free space of most scans of another that see them.
+    """Share of one submap's visible points that most scans of another submap contradict: they lie in the scans' free space.
 
     Args:
-        walls: the submap of the points.
-        seers: the submap of the scans.
+        walls: the submap whose points are tested.
+        seers: the submap whose scans test them.
         pose_seers_walls: (3,) frame of `walls` in that of `seers`.
-        ranges: (B,) ranges of every node's scan, by node.
+        ranges: (B,) ranges of every node's scan, indexed by node.
         laser: bearings and mounting.
     """
     cloud = walls.cloud.thinned(POINTS).moved(pose_seers_walls)
@@ -210,7 +213,7 @@ def violation(
 def violation_both_ways(
     here: Submap, there: Submap, pose_there_here: Array, ranges: Sequence[NDArray[np.float32]], laser: Laser
 ) -> float:
-    """The larger share of the two, each submap looking at the walls of the other."""
+    """The larger one of `violation(here, there)` and `violation(there, here)`: each submap tests the points of the other."""
     forth = violation(here, there, pose_there_here, ranges, laser)
     return max(forth, violation(there, here, inverse(pose_there_here), ranges, laser))
 

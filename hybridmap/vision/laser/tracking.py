@@ -20,11 +20,11 @@ SUBMAP_NODES = 25
 
 @dataclass(frozen=True, slots=True)
 class SearchWindow:
-    """A grid of starts about the odometry, and the odometry's standard deviations as prior.
+    """A grid of start poses around the odometry, and the standard deviations of the odometry as prior.
 
     Attributes:
         half_m, half_deg: half-widths of the grid.
-        prior_m, prior_deg: these standard deviations.
+        prior_m, prior_deg: standard deviations of the odometry.
     """
 
     half_m: float
@@ -62,11 +62,11 @@ class Step:
     """The motion from one node to the next by scan matching.
 
     Attributes:
-        relative: pose of the new node in the frame of the one before; the odometry's where nothing was measured.
-        checks: of the registration; the motion is the odometry's if one failed.
-        contradicts_odometry: a good registration says that the odometry is wrong.
-        inliers, fit: of the registration.
-        scatter: covariance (3, 3) of the new node's place in the submap.
+        relative: pose of the new node in the frame of the one before; the odometry's if a check failed.
+        checks: checks of the registration.
+        contradicts_odometry: whether a good registration says that the odometry is wrong.
+        inliers, fit: see `Alignment`.
+        scatter: covariance (3, 3) of the new node's pose relative to the submap.
     """
 
     relative: RelativePose
@@ -78,12 +78,12 @@ class Step:
 
     @property
     def measured(self) -> bool:
-        """Whether it comes from a registration."""
+        """Whether the motion comes from the registration and not from the odometry."""
         return passed(self.checks)
 
 
 class Tracker:
-    """Registers each new node to the submap of the last ones."""
+    """Registers each new node to the submap of the nodes just before it."""
 
     def __init__(self, atlas: Atlas) -> None:
         self._atlas = atlas
@@ -93,8 +93,8 @@ class Tracker:
 
         Args:
             cloud: scan of the new node.
-            odometry: its pose in the frame of the last node.
-            between_nodes: gives, in order, the scans between the two: motion since the last node and cloud.
+            odometry: pose of the new node in the frame of the last node, by the wheels.
+            between_nodes: returns the scans between the two nodes in order: motion (3,) since the last node, and cloud.
         """
         field = self._field()
         best = self._search(field, cloud, odometry.delta)
@@ -106,7 +106,7 @@ class Tracker:
         return self._judge(best, odometry)
 
     def pair(self, cloud: Cloud, following: Cloud, odometry: Array) -> Alignment:
-        """Register the next scan to one scan alone, from the odometry (3,)."""
+        """Register one scan (`following`) to the scan before it (`cloud`), starting from the odometry (3,) between them."""
         field = self._field_of(cloud)
         best = self._search(field, following, odometry)
         if self._is_weak(best, odometry):

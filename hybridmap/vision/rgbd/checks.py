@@ -30,7 +30,7 @@ PLAUSIBLE_SIGMA = 16.3**0.5
 
 
 def of_step(depth_inliers: float, slack_m: float, odometry_sigma: float) -> tuple[Check, ...]:
-    """Registration of a new node: its inliers; only a certain one may contradict the odometry."""
+    """Check the depth registration of a new node: share of inliers and, unless it is certain, distance from the odometry."""
     checks = of_depth(depth_inliers)
     if not (depth_inliers > SURE_INLIERS and slack_m < SURE_SLACK_M):
         checks += (at_most("odometry_sigma", odometry_sigma, CONTRADICTION_SIGMA),)
@@ -38,32 +38,38 @@ def of_step(depth_inliers: float, slack_m: float, odometry_sigma: float) -> tupl
 
 
 def of_depth(depth_inliers: float) -> tuple[Check, ...]:
-    """A registration: share of the depth in common view that fits."""
+    """Check a depth registration: share of the points in common view that fit."""
     return (at_least("depth_inliers", depth_inliers, DEPTH_INLIERS_MIN),)
 
 
 def of_profile(profile_G: float, c_t: float) -> tuple[Check, ...]:
-    """A candidate without verification: the difference of its profile."""
+    """Check a loop that is accepted by profile alone: its score (eq. 13) is at most the threshold `c_t`."""
     return (at_most("profile_G", profile_G, c_t, "vision.matching.c_t"),)
 
 
 def of_matches(matches: int, least: int) -> tuple[Check, ...]:
-    """Two views: number of matching features."""
+    """Check that two views have at least `least` matching features."""
     return (at_least("matches", matches, least, _MIN_INLIERS),)
 
 
 def of_pose(feature_inliers: int, least: int) -> tuple[Check, ...]:
-    """A pose by features: number of inliers."""
+    """Check that the pose of the target in the source, estimated from features, has at least `least` inliers."""
     return (at_least("feature_inliers", feature_inliers, least, _MIN_INLIERS),)
 
 
 def of_reverse_pose(feature_inliers_reverse: int, least: int) -> tuple[Check, ...]:
-    """The same in the other direction."""
+    """Check that the pose of the source in the target, estimated from features, has at least `least` inliers."""
     return (at_least("feature_inliers_reverse", feature_inliers_reverse, least, _MIN_INLIERS),)
 
 
 def of_plane(height_m: float, tilt_deg: float, reverse_m: float, reverse_deg: float, held: bool) -> tuple[Check, ...]:
-    """A pose by features: planar, and the same in both directions; `held`: the tilt is measured."""
+    """Check that a pose from features is planar, and agrees with the pose estimated in the reverse direction.
+
+    Args:
+        height_m, tilt_deg: height and tilt of the pose, which should be 0.
+        reverse_m, reverse_deg: difference of the two directions.
+        held: the camera's tilt was measured and not taken from the mounting; then the limits are wider.
+    """
     height, tilt = (HELD_HEIGHT, HELD_TILT) if held else (1.0, 1.0)
     return (
         at_most("height_m", height_m, MAX_HEIGHT_M * height),
@@ -74,7 +80,7 @@ def of_plane(height_m: float, tilt_deg: float, reverse_m: float, reverse_deg: fl
 
 
 def of_refinement(off_m: float, off_deg: float, depth_inliers: float) -> tuple[Check, ...]:
-    """Depth registered from the features' pose: distance from that pose, and fit."""
+    """Check a depth registration that started from a pose by features: distance from that pose, and share of inliers."""
     return (
         at_most("off_features_m", off_m, REFINED * REVERSE_M),
         at_most("off_features_deg", off_deg, REFINED * REVERSE_DEG),
@@ -83,12 +89,19 @@ def of_refinement(off_m: float, off_deg: float, depth_inliers: float) -> tuple[C
 
 
 def of_features_alone(feature_inliers_both: int) -> tuple[Check, ...]:
-    """A pose by features without depth in common view: more inliers, in both directions."""
+    """Check a pose from features where depth cannot confirm it: it needs more feature inliers, in both directions."""
     return (at_least("feature_inliers_both", feature_inliers_both, MIN_INLIERS_ALONE),)
 
 
 def of_depth_alone(depth_inliers: float, overlap: float, points: int, slack_m: float) -> tuple[Check, ...]:
-    """Depth registered from the map's pose, without features."""
+    """Check a depth registration that started from the map's pose and has no features to confirm it.
+
+    Args:
+        depth_inliers: share of the points in common view that fit.
+        overlap: share of the points that are in the other frame's view.
+        points: number of matched points.
+        slack_m: standard deviation in the loosest direction.
+    """
     return (
         at_least("depth_inliers", depth_inliers, MAP_INLIERS),
         at_least("overlap", overlap, MAP_OVERLAP),
@@ -98,10 +111,10 @@ def of_depth_alone(depth_inliers: float, overlap: float, points: int, slack_m: f
 
 
 def of_map(map_sigma: float) -> tuple[Check, ...]:
-    """A loop that contradicts the map: whether the map's covariance allows it."""
+    """Check that a loop differs from the map's relative pose by no more than the map's covariance allows."""
     return (at_most("map_sigma", map_sigma, PLAUSIBLE_SIGMA),)
 
 
 def of_support(supporting: int) -> tuple[Check, ...]:
-    """A measured loop: another one near it must agree."""
+    """Check that at least one other measured loop nearby agrees with a loop."""
     return (at_least("supporting", supporting, 1),)

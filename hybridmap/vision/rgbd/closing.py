@@ -49,10 +49,10 @@ SURE = 4.0
 
 
 class LoopCloser:
-    """Finds loops for one camera. The newer node is the source of an edge.
+    """Finds loop closures for one camera. The newer node is the source of an edge.
 
     Attributes:
-        support: the measured loops, and which of them agree.
+        support: the measured loops, and which of them agree with each other.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class LoopCloser:
         self._matcher.add(profile)
 
     def close(self, node: int, belief: Belief) -> list[Edge]:
-        """Look for loops of one node, and decide what was pending."""
+        """Look for loops of one node, and decide pending ones; returns new and changed edges."""
         since_m = self._travel_at_closure
         gated = self._gate(node, belief)
         changed = self._try_candidates(node, self._ranked(node, gated), belief) if len(gated) else []
@@ -123,16 +123,19 @@ class LoopCloser:
         return out
 
     def tracked(self, node: int, steps: list[Edge]) -> None:
-        """Note how a new node was registered to the ones before it."""
+        """Note the registrations (`steps`) of a new node to the ones before it."""
         self._relocaliser.tracked(node, chain_state(steps) if self._may_be_lost else ChainState.HOLDS, steps)
 
     @property
     def lost_since(self) -> int | None:
-        """As `vision.base.FrontEnd`."""
+        """First node after the robot was kidnapped or lost track of its motion; None while it is localised on the map."""
         return self._relocaliser.whereabouts.lost_since
 
     def note(self, node: int) -> dict[str, Array]:
-        """What the map file keeps of the newest node's search: `gate` (see `Gate`), `ranked` (n, 3): node, G, shift."""
+        """What the map file keeps of the newest node's search for loops; empty for other nodes.
+
+        Keys: `gate` (5,), see `Gate.to_array`; `ranked` (n, 3), the best candidates: node, score G (eq. 13), shift in columns.
+        """
         if node != self._noted:
             return {}
         return {"gate": self._gate_of_newest.to_array(), "ranked": self._ranking}
@@ -158,7 +161,7 @@ class LoopCloser:
         return found.proposals
 
     def finish(self, belief: Belief) -> list[Edge]:
-        """Re-propose pairs that are near each other on the optimised map; then decide all that is pending."""
+        """At the end of the drive, compare nodes near each other on the optimised map; then decide all pending loops."""
         out: list[Edge] = []
         if self._rounds_left > 0 and not self._unverified:
             self._rounds_left -= 1
@@ -172,7 +175,7 @@ class LoopCloser:
         return [*out, *self.support.give_up(before=len(self._keyframes))]
 
     def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
-        """Measure outliers again; `belief` is that of the map without them."""
+        """Measure outlier loops again; `belief` is the map without them. Returns the loops that changed."""
         if self._unverified:
             return []
         out = []

@@ -22,12 +22,12 @@ a cell is known where this share of its pixels is."""
 
 
 def cell_px(width_px: int) -> int:
-    """Side of a cell at a working width, pixels."""
+    """Side of a grid cell, in pixels, for images of a given width."""
     return max(2, min(GRID_PX, width_px // GRID_COLUMNS))
 
 
 def reduced(camera: Camera, factor: int) -> Camera:
-    """The same camera with pixels `factor` times as large."""
+    """The pinhole of an image reduced by a whole factor: pixels are `factor` times as large."""
     return replace(
         camera,
         width_px=camera.width_px // factor,
@@ -41,14 +41,14 @@ def reduced(camera: Camera, factor: int) -> Camera:
 
 @dataclass(frozen=True, slots=True)
 class DepthGrid:
-    """Points and normals in the camera's optical frame.
+    """Points and normals on a coarse grid over a depth image, in the camera's optical frame.
 
     Attributes:
-        camera: pinhole of the grid: one pixel a cell.
+        camera: pinhole of the grid: one pixel is one cell.
         points: (R, C, 3) float64, m; where not `valid`, meaningless but finite.
         normals: (R, C, 3) float64, unit, towards the camera.
-        valid: (R, C) a point with a normal.
-        sigma_m: (R, C) standard deviation along the normal.
+        valid: (R, C) whether the cell has a point with a normal.
+        sigma_m: (R, C) standard deviation of the point along its normal, m.
     """
 
     camera: Camera
@@ -60,13 +60,13 @@ class DepthGrid:
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """A depth grid in the robot's frame.
+    """The points of a depth grid in the robot's frame.
 
     Attributes:
-        grid: where it comes from.
-        stance: how the camera was held at that keyframe.
-        T_camera_base: (4, 4) inverse of its pose.
-        rows: (7, N) valid points in `base_link`, m; below them their normals and the standard deviation along these, m.
+        grid: the grid that the points come from.
+        stance: pose of the camera on the robot at that keyframe.
+        T_camera_base: (4, 4) robot's base in the camera's frame.
+        rows: (7, N) of the valid points: position in `base_link` (m), normal, standard deviation along the normal (m).
         number: (R, C) int32, index of a cell's point; -1 for none.
     """
 
@@ -93,12 +93,12 @@ class Surface:
 
 
 def make_grid(depth_m: NDArray[np.float32], camera: Camera, cell_px: int, depth_sigma: float) -> DepthGrid:
-    """Average depth over cells and take normals from neighbouring cells.
+    """Average a depth image over cells, and take normals from neighbouring cells.
 
     Args:
         depth_m: (H, W) float32, m along the optical axis; 0 where invalid.
-        camera: its pinhole.
-        cell_px: side of a cell.
+        camera: pinhole of the image.
+        cell_px: side of a cell, pixels.
         depth_sigma: noise of one pixel at 1 m, m; it grows with the square of the distance.
     """
     coarse = reduced(camera, cell_px)

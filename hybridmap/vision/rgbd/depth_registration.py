@@ -76,20 +76,20 @@ class _Prior:
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Outcome of a registration.
+    """Result of a depth registration.
 
     Attributes:
-        T_fixed_moving: (4, 4) between the bases as their stances had them.
-        level: the same between levelled bases.
-        relative: planar part of it, with the covariance that the residuals alone give (the prior is taken out), each point
-            erring by itself; see `noise_level` for what it really is.
-        slack_m: standard deviation in the loosest direction if `correlation` points counted as one: says whether the surfaces
-            hold each other, whatever the noise.
-        points: matched points.
+        T_fixed_moving: (4, 4) moving base in the fixed one, the bases as their stances had them.
+        level: the same after both bases are levelled.
+        relative: planar part of `level`, with the covariance that the residuals alone give (the prior is taken out), points
+            erring independently; see `noise_level` for what it really is.
+        slack_m: standard deviation in the loosest direction if every `correlation` points counted as one: it says whether the
+            surfaces hold each other, whatever the noise.
+        points: number of matched points.
         inliers: share of the points in common view that fit.
         residual_m: root mean square point-to-plane distance of the inliers.
         overlap: share of the moving points that are in the fixed frame's view.
-        height_m, tilt_rad: what is left out of the plane.
+        height_m, tilt_rad: height and tilt of the pose, which its planar part leaves out.
     """
 
     T_fixed_moving: Array
@@ -111,16 +111,16 @@ def register(
     prior: RelativePose | None,
     pairs: PointPairs | None = None,
 ) -> Registration | None:
-    """Register the moving robot to the fixed one.
+    """Register the depth of the moving robot to that of the fixed one.
 
     Args:
         fixed, moving: surfaces in their own bases.
         start: (4, 4) first guess of the moving base in the fixed one.
         prior: planar prior (wheel odometry) of the solve; taken out of the result's covariance.
-        pairs: keypoints that join the solve.
+        pairs: matched keypoints that join the solve.
 
     Returns:
-        None where too few points match.
+        None if too few points match.
     """
     T, stride = start.copy(), max(1, moving.rows.shape[1] // COARSE_POINTS)
     known = _Prior.of(fixed.stance, moving.stance, prior)
@@ -224,15 +224,17 @@ NEAREST_M = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Pairing:
-    """Points of a moving surface beside those in whose cells of a fixed one they fall, along the axes of the fixed base.
+    """Points of a moving surface, each paired with the point of a fixed surface in whose grid cell it falls.
+
+    All vectors are along the axes of the fixed base.
 
     Attributes:
         normal, turned: (3, n) unit normals of the fixed and of the moving points.
         arm: (3, n) moving points seen from the moving base, m.
         residual: (n,) point-to-plane distances, m.
-        variance: (n,) that the sensor's model gives them, m^2; infinite where the two do not match.
-        matched: how many do.
-        looked_at: how many moving points were projected; n of them fell on a known cell.
+        variance: (n,) of the residuals by the sensor's model, m^2; infinite where the two points do not match.
+        matched: number of pairs that match.
+        looked_at: number of moving points that were projected; n of them fell on a cell with a point.
     """
 
     normal: Array
@@ -245,11 +247,11 @@ class Pairing:
 
     @property
     def in_view(self) -> int:
-        """How many moving points fell on a known cell: n."""
+        """Number of moving points that fell on a cell with a point (n)."""
         return len(self.residual)
 
     def mean(self, values: Array) -> float:
-        """Mean over the points that match, of values (n,)."""
+        """Mean of values (n,) over the pairs that match."""
         return float(values[np.isfinite(self.variance)].sum()) / max(self.matched, 1)
 
     def terms(self) -> tuple[Array, Array]:
@@ -260,11 +262,11 @@ class Pairing:
 
 
 def associate(fixed: Surface, moving: Array, T: Array) -> Pairing:
-    """Pair each moving point with the one in whose cell of the fixed grid it falls.
+    """Pair each moving point with the fixed point in whose grid cell it falls.
 
     Args:
         fixed: the surface in its own base.
-        moving: (7, N) rows of the other surface, or some of their columns.
+        moving: (7, N) `Surface.rows` of the other surface, or some of their columns.
         T: (4, 4) the moving base in the fixed one.
     """
     camera, turn = fixed.grid.camera, T[:3, :3]

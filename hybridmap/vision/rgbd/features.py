@@ -37,19 +37,19 @@ class Features:
 
 @dataclass(frozen=True, slots=True)
 class Correspondences:
-    """Indices of matches, (M,) each; no keypoint occurs twice."""
+    """Indices (M,) of matching keypoints in the first and in the second keyframe; no keypoint occurs twice."""
 
     first: NDArray[np.int64]
     second: NDArray[np.int64]
 
 
 def detect(grey: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: Camera) -> Features:
-    """Find keypoints and give each its point in space; those without depth, or on a depth edge, are dropped.
+    """Find keypoints and their points in space; keypoints without depth, or on a depth edge, are dropped.
 
     Args:
         grey: (H, W) uint8.
         depth_m: (H, W) float32, m; 0 where invalid.
-        camera: pinhole of both.
+        camera: pinhole of both images.
     """
     import cv2
 
@@ -63,7 +63,10 @@ def detect(grey: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: Camera
 
 
 def match(a: Features, b: Features) -> Correspondences:
-    """Best descriptor of b for each of a that passes Lowe's ratio; of several that claim one of b the nearest keeps it."""
+    """Match each keypoint of a with its nearest descriptor in b, by Lowe's ratio test.
+
+    Where several keypoints of a have the same partner in b, only the nearest one is kept.
+    """
     import cv2
 
     none = np.zeros(0, dtype=np.int64)

@@ -36,18 +36,18 @@ from hybridmap.vision.templates import ViewTemplates
 
 
 class RgbdFrontEnd:
-    """Scanline profiles, depth registration of consecutive nodes, loops verified by features and depth.
+    """The RGB-D front-end: profiles, depth registration of consecutive nodes, loops verified by features and depth.
 
     Implements `vision.base.VerifyingFrontEnd`.
 
     Args:
         config: settings of the visual side.
         camera: pinhole and mounting of the frames.
-        seed: for RANSAC.
-        clock: gets the stage `search`.
+        seed: seed of RANSAC.
+        clock: measures the time of the search for candidates (stage `search`).
 
     Attributes:
-        keyframes: of the nodes, in their order.
+        keyframes: of all nodes, by node number.
         verifier: measures the relative pose of two keyframes.
         closer: finds loops.
     """
@@ -80,7 +80,7 @@ class RgbdFrontEnd:
         self._image: WorkingImage | None = None
 
     def observe(self, frame: Observation, delta_node_robot: Array) -> View:
-        """Profile one frame and recognise its template.
+        """Compute the profile of one frame and recognise its view template.
 
         Raises:
             StreamError: not an RGB-D frame, or its size is not the camera's.
@@ -99,7 +99,7 @@ class RgbdFrontEnd:
         return View(frame.stamp_ns, profile, seen.template, seen.founded)
 
     def add_node(self, node: int, view: View) -> None:
-        """Keep features, surface and images of the frame observed last."""
+        """Make a node of the frame observed last: keep its features, surface and images."""
         if self._frame is None or self._image is None or node != len(self.keyframes):
             raise ValueError(f"node {node} cannot be made here: {len(self.keyframes)} nodes so far, observe a frame first")
         rgbd = self._config.rgbd
@@ -121,25 +121,26 @@ class RgbdFrontEnd:
         return self.closer.close(node, belief)
 
     def finish(self, belief: Belief) -> list[Edge]:
-        """Re-propose on the optimised map; decide what is pending."""
+        """At the end of the drive, compare nodes near each other on the optimised map, and decide all pending loops."""
         return self.closer.finish(belief)
 
     def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
-        """Measure again, from the map's poses, loops that a back-end gave no weight."""
+        """Measure again, from the poses of the map, loops that a back-end down-weighted as outliers."""
         return self.closer.verify(outliers, belief)
 
     @property
     def lost_since(self) -> int | None:
-        """As `vision.base.FrontEnd`."""
+        """First node after the robot was kidnapped or lost track of its motion; None while it is localised on the map."""
         return self.closer.lost_since
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
-        """`profile` float32, the frame in its compact form, `T_base_camera` (4, 4) as it was then.
+        """Arrays of a node's frame for the map file.
 
-        Of the newest node also what its search for loops found, see `LoopCloser.note`.
+        Keys: `profile` float32, `color` and `depth_mm`, and `T_base_camera` (4, 4), the camera on the robot at that time. The
+        newest node has the keys of `LoopCloser.note` too.
 
         Raises:
-            StreamError: the node is not one of the newest `held_images`; the map file has what it had.
+            StreamError: the node's images are no longer held (see `held_images`); the map file has them.
         """
         kept = self.keyframes[node]
         held = [frame for number, frame in self._images if number == node]
@@ -162,5 +163,5 @@ class RgbdFrontEnd:
 
 
 def create(config: VisionConfig, rig: Rig, seed: int, clock: StageClock) -> RgbdFrontEnd:
-    """As `vision.Factory`."""
+    """Make the RGB-D front-end for the camera of a rig."""
     return RgbdFrontEnd(config, rig.sensors[RGBD.sensor_name], seed, clock)

@@ -25,7 +25,7 @@ RANKED = 6
 
 
 class GlobalSearch:
-    """Candidates outside the gate: the nodes of the most similar profiles, verified by features."""
+    """Finds where a lost robot is: nodes anywhere on the map with the most similar profiles, verified by features."""
 
     def __init__(
         self,
@@ -40,7 +40,7 @@ class GlobalSearch:
         self._new_key = new_key
 
     def search(self, node: int, elsewhere: Indices) -> list[Edge]:
-        """Compare a node, the source, with older nodes (n,), ascending. Verified edges are pending."""
+        """Compare a node with the older nodes `elsewhere` (n,), ascending; verified edges are pending."""
         return [self._measured(node, target, candidate) for target, candidate in self._candidates(node, elsewhere).items()]
 
     def _candidates(self, node: int, targets: Indices) -> dict[int, Candidate]:
@@ -59,7 +59,7 @@ class GlobalSearch:
 
 
 def chain_state(steps: Sequence[Edge]) -> ChainState:
-    """State of the chain at a node, from its registrations. Without any, the odometry holds the chain."""
+    """How certain the motion to a node is, from its registrations; without any, the odometry counts as certain."""
     if not steps:
         return ChainState.HOLDS
     accepted = [step.relative for step in steps if step.status is Status.ACCEPTED and step.relative is not None]

@@ -18,11 +18,11 @@ NEAREST_M, FARTHEST_M = 1e-6, 1e6
 
 @dataclass(frozen=True, slots=True)
 class WorkingImage:
-    """A frame at the working width.
+    """A frame reduced to the width at which features and depth are processed (the working width).
 
     Attributes:
         grey: (H, W) uint8.
-        depth_m: (H, W) float32, 0 where invalid.
+        depth_m: (H, W) float32, m; 0 where invalid.
     """
 
     grey: NDArray[np.uint8]
@@ -31,7 +31,7 @@ class WorkingImage:
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """A node's frame: profile, features and surface."""
+    """A node's frame: profile, features, and surface of the depth image."""
 
     profile: Profile
     features: Features
@@ -39,22 +39,25 @@ class Keyframe:
 
     @property
     def held(self) -> bool:
-        """The camera's tilt was measured at this keyframe and not taken from the mounting."""
+        """Whether the camera's tilt was measured at this keyframe, and not taken from the mounting."""
         return self.surface.stance.held
 
 
 def working_factor(camera: Camera, max_width_px: int) -> int:
-    """Whole factor by which images are reduced."""
+    """Least whole factor by which images are reduced so that they are at most `max_width_px` wide."""
     return max(1, -(-camera.width_px // max_width_px))
 
 
 def working_camera(camera: Camera, max_width_px: int) -> Camera:
-    """Pinhole at the working width."""
+    """Pinhole of the images after they are reduced by `working_factor`."""
     return reduced(camera, working_factor(camera, max_width_px))
 
 
 def working_image(frame: RgbdFrame, factor: int) -> WorkingImage:
-    """Grey by area averaging, depth by taking the pixel in the middle (averaging would invent surfaces at edges)."""
+    """Reduce a frame by a whole factor.
+
+    Grey is averaged over areas. Depth is taken from the pixel in the middle: averaging would invent surfaces at edges.
+    """
     import cv2
 
     grey = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)

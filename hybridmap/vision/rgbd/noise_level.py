@@ -22,25 +22,25 @@ ENOUGH = 15
 
 
 class NoiseLevel:
-    """A factor on the covariance that the residuals of a registration give.
+    """Learns a factor by which the covariance that a registration's residuals give must be multiplied.
 
-    Residuals do not show errors that a whole surface shares (calibration, bias of depth, blur), and which make real edges
-    several times worse than simulated ones. The factor is the squared error of the ring k-2 to k-1, k-1 to k and k-2 to k,
-    relative to its covariance.
+    Residuals do not show errors that a whole surface shares (calibration, bias of depth, blur), which make real errors several
+    times larger than simulated ones. The factor comes from rings of three registrations (k-2 to k-1, k-1 to k, and k-2 to k):
+    it is the squared error with which a ring closes, relative to its covariance.
     """
 
     def __init__(self, initial: float = NOISE_FACTOR) -> None:
-        """Begin with the factor that holds until there are enough rings."""
+        """Start; `initial` is the factor until enough rings have been observed."""
         self._factor = initial
         self._squared: deque[float] = deque(maxlen=REMEMBERED)
 
     @property
     def factor(self) -> float:
-        """Factor on covariances; 1 or more."""
+        """The factor on covariances; at least 1."""
         return self._factor
 
     def observe(self, first: RelativePose, second: RelativePose, across: RelativePose) -> None:
-        """Add a ring: k-2 to k-1, k-1 to k, and k-2 to k, with the residuals' covariances."""
+        """Add a ring of registrations (k-2 to k-1, k-1 to k, and k-2 to k), with the covariances that their residuals give."""
         around = compose_relative(first, second)
         error = log(between(around.delta, across.delta))
         self._squared.append(float(error @ np.linalg.solve(around.covariance + across.covariance, error)))
@@ -48,6 +48,6 @@ class NoiseLevel:
             self._factor = max(1.0, SHARED * float(np.quantile(np.array(self._squared), QUANTILE)) / CHI2_QUANTILE)
 
     def applied(self, relative: RelativePose, translation_floor_m: float, rotation_floor_deg: float) -> RelativePose:
-        """The same measurement with the factor on its covariance, and a floor under its standard deviations."""
+        """The same registration with its covariance times the factor, plus the squares of the floors (standard deviations)."""
         floor = np.diag([translation_floor_m**2, translation_floor_m**2, np.deg2rad(rotation_floor_deg) ** 2])
         return RelativePose(relative.delta, self.factor * relative.covariance + floor)

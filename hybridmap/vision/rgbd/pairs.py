@@ -19,13 +19,13 @@ AGREEING = 11.3
 
 @dataclass(frozen=True, slots=True)
 class PointPairs:
-    """Keypoints seen in both frames. Each carries its information across the ray of sight, and more or less along it.
+    """Keypoints seen in both frames of a registration, each with its position's information (inverse variance).
 
     Attributes:
         fixed, moving: (K, 3) points in the base of either frame, m.
-        ray: (K, 3) unit vectors, the lines of sight in the fixed base.
-        across: (K,) information in every direction, m^-2.
-        excess: (K,) what is to be added to it along the ray, m^-2 (negative: depth is the less certain).
+        ray: (K, 3) unit vectors along the lines of sight, in the fixed base.
+        across: (K,) information across the line of sight, m^-2.
+        excess: (K,) information along the line of sight less that across, m^-2 (negative: depth is the less certain).
     """
 
     fixed: Array
@@ -38,12 +38,15 @@ class PointPairs:
         return len(self.fixed)
 
     def agreeing(self, T_fixed_moving: Array) -> int:
-        """How many lie where a pose (4, 4) has them, as well as they are known."""
+        """Number of pairs whose two points coincide, within their uncertainty, under a pose (4, 4) of the moving base."""
         error = apply(T_fixed_moving, self.moving) - self.fixed
         return int(np.count_nonzero(self._squared(error, np.einsum("ki,ki->k", self.ray, error)) < AGREEING))
 
     def near(self, T_fixed_moving: Array, reach_m: float) -> PointPairs | None:
-        """The pairs that a guess (4, 4) brings within `reach_m` of each other; None where fewer than three."""
+        """The pairs whose two points are within `reach_m` of each other under a pose (4, 4).
+
+        Returns None if they are fewer than three.
+        """
         gap = np.linalg.norm(apply(T_fixed_moving, self.moving) - self.fixed, axis=1)
         keep = np.flatnonzero(gap < reach_m)
         if len(keep) < 3:
@@ -95,13 +98,13 @@ def point_pairs(
     focal_px: float,
     depth_sigma: float,
 ) -> PointPairs | None:
-    """Matched keypoints as pairs of points; None where there are fewer than three.
+    """Turn matched keypoints into pairs of points in space. Returns None if they are fewer than three.
 
-    Each carries the information of one pixel (1 sigma) sideways and of its depth along the ray.
+    A keypoint is uncertain by one pixel (1 sigma) across the line of sight, and by the noise of depth along it.
 
     Args:
         fixed, moving: the keyframes.
-        matches: `first` of the fixed, `second` of the moving one.
+        matches: `first` are keypoints of the fixed, `second` of the moving keyframe.
         focal_px: focal length at the working width.
         depth_sigma: noise of depth at 1 m, m.
     """

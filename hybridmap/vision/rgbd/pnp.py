@@ -27,11 +27,11 @@ REPROJECTION_PX = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Pnp:
-    """A pose and its support.
+    """A pose estimated by PnP and its inliers.
 
     Attributes:
         T_image_points: (4, 4) the camera that gave the points, seen from the camera that gave the image.
-        inliers: which matches agree.
+        inliers: indices of the matches that agree with the pose.
     """
 
     T_image_points: Array
@@ -39,7 +39,7 @@ class Pnp:
 
 
 class PnpSolver:
-    """PnP-RANSAC for one camera; its random draws are seeded anew for every call."""
+    """PnP-RANSAC for one camera; the random generator is seeded again in every call, so results repeat."""
 
     def __init__(self, camera: Camera, min_inliers: int, seed: int) -> None:
         self._matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1.0]])
@@ -47,11 +47,14 @@ class PnpSolver:
         self._seed = seed % 2**31
 
     def solve(self, points: Features, image: Features, of_points: NDArray[np.int64], of_image: NDArray[np.int64]) -> Pnp | None:
-        """Points of one keyframe in the image of another; None without enough support.
+        """Estimate the pose between two keyframes from the points of one and the image of the other.
 
         Args:
             points, image: features of the two keyframes.
-            of_points, of_image: (M,) which keypoints match.
+            of_points, of_image: (M,) indices of matching keypoints in either.
+
+        Returns:
+            None if too few matches agree.
         """
         import cv2
 
@@ -93,12 +96,12 @@ GUESSED = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """Why two views are compared.
+    """Why two views are compared as a possible loop.
 
     Attributes:
-        search: how they were found.
+        search: by which search the pair was found.
         shift: columns by which the older view is shifted against the newer one.
-        figures: of the search.
+        figures: values measured by the search, by name.
     """
 
     search: Search
@@ -108,14 +111,14 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """Outcome: the pose of the target in the source's frame, and the record of the decision.
+    """Result of comparing two keyframes: the pose of the target in the source's frame, and why it is accepted or not.
 
     Attributes:
-        relative: the pose; None where a check failed, or something was lacking.
-        method: what it was measured by.
-        checks: in the order in which they were asked.
-        lack: what it lacked beside checks, if anything.
-        figures: further figures.
+        relative: the pose; None if a check failed or something else was lacking.
+        method: what the pose was measured by.
+        checks: the checks, in the order in which they were made.
+        lack: what was lacking beside checks; None if nothing was.
+        figures: further measured values, by name.
     """
 
     relative: RelativePose | None
@@ -125,7 +128,7 @@ class Verification:
     figures: Mapping[str, float] = field(default_factory=dict)
 
     def proposed(self, source: int, target: int, key: int, candidate: Candidate, lack: Lack | None = None) -> Edge:
-        """Its edge, with what it lacks where all checks passed."""
+        """Make the edge from source to target, under a key; `lack` says why it is not accepted even if all checks passed."""
         return Edge.decided(
             source,
             target,
@@ -142,7 +145,7 @@ class Verification:
 
 
 class Verifier:
-    """Verifies pairs of keyframes of one camera."""
+    """Measures the relative pose of two keyframes of one camera, with checks."""
 
     def __init__(
         self,
@@ -158,7 +161,7 @@ class Verifier:
         self._level = level
 
     def verify(self, source: Keyframe, target: Keyframe) -> Verification:
-        """Measure the target's pose in the source's frame."""
+        """Measure the target's pose in the source's frame: by features, then by depth from there."""
         pairs = match(source.features, target.features)
         asked = checks.of_matches(len(pairs.first), self._min_inliers)
         if not passed(asked):
@@ -181,7 +184,7 @@ class Verifier:
         return self._refined(source, target, flat, pairs.first[both], pairs.second[both], asked)
 
     def verify_on_map(self, source: Keyframe, target: Keyframe, guess: RelativePose) -> Verification:
-        """Measure by depth alone, from the map's pose: for views that share surfaces but no features.
+        """Measure the target's pose by depth alone, from the map's pose: for views that share surfaces but no features.
 
         Args:
             source, target: the keyframes.
@@ -196,7 +199,7 @@ class Verifier:
         return Verification(self._calibrated(fit.relative, source, target), Method.DEPTH, asked)
 
     def verify_near(self, source: Keyframe, target: Keyframe, guess: RelativePose) -> Verification:
-        """Measure from the map's pose: by depth and the features that match there, else by depth alone.
+        """Measure the target's pose from the map's pose: by depth and the features that match there, else by depth alone.
 
         Args:
             source, target: the keyframes.

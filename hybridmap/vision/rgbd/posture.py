@@ -46,7 +46,7 @@ MIN_FOLLOWED = 15
 
 
 class Posture:
-    """Estimates the stance of the camera at each keyframe."""
+    """Estimates the camera's pose on a level robot (its stance) at each keyframe."""
 
     def __init__(self, mode: Literal["auto", "level", "floor"], T_base_camera: Array, solver: PnpSolver) -> None:
         self._mounting = T_base_camera
@@ -59,7 +59,7 @@ class Posture:
         self._unwatched = 0
 
     def stance(self, grid: DepthGrid, features: Features, last: Keyframe | None) -> Stance:
-        """Stance of the camera at the keyframe after `last`."""
+        """Estimate the camera's stance at a new keyframe; `last` is the keyframe before it, None at the first."""
         if not self._held and not self._looks():
             return self._as_mounted
         found = self._on_floor(grid)
@@ -126,12 +126,12 @@ MIN_SHARE_BELOW = 0.03
 
 @dataclass(frozen=True, slots=True)
 class Floor:
-    """The floor in the camera's frame.
+    """The floor plane in the camera's optical frame.
 
     Attributes:
-        up: (3,) unit vector, the vertical in the optical frame.
-        height_m: of the camera above the floor.
-        cells: grid cells that lie on it.
+        up: (3,) unit vector, the vertical.
+        height_m: height of the camera above the floor.
+        cells: number of grid cells that lie on the floor.
     """
 
     up: Array
@@ -140,7 +140,7 @@ class Floor:
 
 
 def find_floor(grid: DepthGrid, up_nominal: Array, height_nominal_m: float, tolerance_m: float, min_cells: int) -> Floor | None:
-    """Find the floor: the plane of most cells that faces up at about the nominal height, with few points below it.
+    """Find the floor: the plane with most grid cells that faces up at about the nominal height, with few points below it.
 
     Hypotheses are the planes of evenly spread grid cells; nothing is random.
 
@@ -148,8 +148,11 @@ def find_floor(grid: DepthGrid, up_nominal: Array, height_nominal_m: float, tole
         grid: depth of the frame.
         up_nominal: (3,) the vertical in the optical frame if the camera sat as mounted.
         height_nominal_m: mounting height.
-        tolerance_m: the height may differ by this much.
-        min_cells: fewest cells of a floor.
+        tolerance_m: largest difference from the mounting height.
+        min_cells: least number of cells of a floor.
+
+    Returns:
+        None if no plane has these properties.
     """
     points, normals = grid.points[grid.valid], grid.normals[grid.valid]
     sigma = grid.sigma_m[grid.valid]
@@ -175,7 +178,7 @@ def find_floor(grid: DepthGrid, up_nominal: Array, height_nominal_m: float, tole
 
 
 def vertical_of_structure(normals: Array, guesses: Array) -> Array:
-    """Vertical (3,) of an indoor scene, of upright and flat surfaces, near one of some guesses.
+    """Vertical (3,) of an indoor scene from the normals of its walls and level surfaces, near one of some guesses.
 
     Each guess is refined by least squares over the normals of such surfaces. The result with most agreeing normals wins, less
     a penalty for guesses far from the first.

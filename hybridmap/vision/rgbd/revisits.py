@@ -19,18 +19,24 @@ MAP_SIGMA_M, MAP_SIGMA_DEG = 0.15, 3.0
 
 
 class Revisits:
-    """The nodes between two closures. Those that the later one moved may now lie near old nodes."""
+    """Nodes to be compared again after a loop closure: it has moved them on the map, so they may now lie near old nodes."""
 
     def __init__(self) -> None:
         self._waiting: list[tuple[int, Array]] = []
 
     def closed(self, node: int, since_m: float, belief: Belief) -> None:
-        """A node closed a loop after `since_m` of travel without one; `belief` is that of the map before the closure."""
+        """Note that a node closed a loop.
+
+        Args:
+            node: the node.
+            since_m: path length at the loop closure before; only nodes made after that may have moved.
+            belief: the map before the new closure.
+        """
         behind = np.flatnonzero(belief.travel_m[:node] > since_m)
         self._waiting += [(int(n), belief.poses_map_node[n].copy()) for n in behind]
 
     def next_moved(self, belief: Belief) -> int | None:
-        """Take the newest node that has moved; None if there is none left."""
+        """Remove and return the newest node that the closure moved; None if there is none left."""
         while self._waiting:
             node, before = self._waiting.pop()
             now = belief.poses_map_node[node]
@@ -41,14 +47,14 @@ class Revisits:
 
 
 class Reverification:
-    """Measures loops again that a back-end holds for outliers.
+    """Measures loops again that a back-end treats as outliers.
 
-    If the views fit at the map's pose, the loop takes the new measurement. If they fit at another pose only, it stays where
-    the covariance of the map without outliers allows that pose, and is retracted where not, or where the views do not fit.
+    If the views fit at the map's pose, the loop takes the new measurement. If they fit at another pose only, the loop is kept
+    if the covariance of the map without outliers allows that pose. In all other cases the loop is retracted.
     """
 
     def __init__(self, keyframes: Sequence[Keyframe], verifier: Verifier, map_covariance: Array) -> None:
-        """`map_covariance` (3, 3): how far the map may be off between nodes that lie side by side, m and rad."""
+        """`map_covariance` (3, 3): error of the map's relative pose of nodes that lie side by side, m and rad."""
         self._keyframes = keyframes
         self._verifier = verifier
         self._map_covariance = map_covariance

@@ -12,12 +12,12 @@ from hybridmap.geometry import Array
 
 @dataclass(frozen=True, slots=True)
 class Stance:
-    """The camera in the base.
+    """Pose of the camera on the robot at one keyframe.
 
     Attributes:
-        T_base_camera: (4, 4), the base being level.
+        T_base_camera: (4, 4) the camera in the robot's base, the base being level.
         tilt_sigma_rad, height_sigma_m: standard deviations of roll and pitch, and of the height.
-        held: measured at this keyframe (hand-held); False: taken from the mounting.
+        held: whether the pose was measured at this keyframe (hand-held camera) and not taken from the mounting.
     """
 
     T_base_camera: Array
@@ -28,7 +28,7 @@ class Stance:
 
 @dataclass(frozen=True, slots=True)
 class LevelPair:
-    """Two stances made consistent with the measured pose between the two cameras.
+    """The pose between two bases after both are levelled by one vertical.
 
     Attributes:
         delta: (3,) moving base in the fixed one, m and rad.
@@ -40,13 +40,13 @@ class LevelPair:
 
 
 def camera_on(up: Array, height_m: float, T_base_camera_nominal: Array) -> Array:
-    """Pose (4, 4) of the camera in a level base, of given tilt and height and of nominal position and heading.
+    """Pose (4, 4) of a camera in a level base, given its tilt and height; position and heading are the nominal ones.
 
     The heading is that of the optical axis; of the image's x axis for a camera that looks straight up or down.
 
     Args:
         up: (3,) the vertical in the optical frame, unit length.
-        height_m: of the camera above the floor.
+        height_m: height of the camera above the floor.
         T_base_camera_nominal: (4, 4) mounting, or the pose at another keyframe.
     """
     nominal = T_base_camera_nominal[:3, :3]
@@ -68,12 +68,12 @@ def camera_on(up: Array, height_m: float, T_base_camera_nominal: Array) -> Array
 
 
 def level_pair(T_fixed_moving: Array, fixed: Stance, moving: Stance) -> LevelPair:
-    """Level a measured transform between two bases: a planar pose, with one vertical for both cameras.
+    """Level a measured transform between two bases, so that it becomes a planar pose with one vertical for both cameras.
 
     The measured pose between the cameras is kept. The vertical is the mean of the stances', weighted by inverse variances.
 
     Args:
-        T_fixed_moving: (4, 4) between the bases of the stances.
+        T_fixed_moving: (4, 4) moving base in the fixed one, the bases as their stances have them.
         fixed, moving: the stances.
     """
     T_cameras = inverse_rigid(fixed.T_base_camera) @ T_fixed_moving @ moving.T_base_camera
@@ -89,11 +89,11 @@ def level_pair(T_fixed_moving: Array, fixed: Stance, moving: Stance) -> LevelPai
 
 @dataclass(frozen=True, slots=True)
 class FloorPose:
-    """A rigid transform between two bases: its planar part, and height and tilt, which should be 0.
+    """A transform between two bases, split into its planar part, and height and tilt, which should be 0.
 
     Attributes:
         delta: (3,) x, y in m and yaw in rad.
-        height_m: dz.
+        height_m: difference of the heights.
         tilt_rad: angle between the two vertical axes.
     """
 
@@ -137,9 +137,10 @@ def rotation_of(rotvec: Array) -> Array:
 
 
 def wrenches(arm: Array, direction: Array) -> Array:
-    """Directions (3, N) over their moments about the origin, (6, N).
+    """Stack directions (3, N) and their moments about the origin, (6, N).
 
-    They are the derivatives of the distance of a point at `arm` (3, N) along its direction by a shift and a turn.
+    Each column is the derivative of the displacement of a point at `arm` (3, N) along its direction, by a shift (3) and a small
+    turn (3).
     """
     out = np.empty((6, arm.shape[1]))
     ax, ay, az = arm

@@ -19,11 +19,11 @@ SUPPORT_NODES = 12
 
 @dataclass(slots=True)
 class MeasuredLoop:
-    """A measured edge, waiting for support or accepted.
+    """A loop that was measured and is pending or accepted.
 
     Attributes:
         proposal: the edge, with its present status.
-        relative: what was measured.
+        relative: the measured pose of the target in the frame of the source.
     """
 
     proposal: Edge
@@ -41,7 +41,7 @@ class MeasuredLoop:
 
 
 class Support:
-    """Keeps measured loops by their source; accepts those that agree with each other."""
+    """Keeps measured loops by their source node, and accepts those that agree with each other."""
 
     def __init__(self) -> None:
         self._of_source: defaultdict[int, list[MeasuredLoop]] = defaultdict(list)
@@ -53,15 +53,18 @@ class Support:
         return (source, target) in self._filed
 
     def join(self, source: int, target: int) -> None:
-        """Note that the two nodes have an edge from elsewhere."""
+        """Note that two nodes have an edge that is kept elsewhere."""
         self._filed.add((source, target))
 
     def accepted(self, source: int) -> int:
-        """How many edges of a node are accepted."""
+        """Number of accepted loops of a source node."""
         return sum(h.proposal.status is Status.ACCEPTED for h in self._of_source.get(source, ()))
 
     def file(self, new: MeasuredLoop, belief: Belief) -> list[Edge]:
-        """Add a loop. If another one agrees, accept it and those that it supports. Its own edge comes first."""
+        """Add a loop. If another loop agrees with it, accept it and the pending ones that agree with it.
+
+        Returns the edge of the new loop, then those whose status changed.
+        """
         near = [h for h in self._beside(new) if h.proposal.status in (Status.PENDING, Status.ACCEPTED)]
         loops = Loops.measured([(h.source, h.target, h.relative) for h in (new, *near)])
         agreeing = [near[i] for i in np.flatnonzero(agrees(loops, 0, np.arange(1, len(near) + 1), belief.ways)).tolist()]
@@ -78,7 +81,7 @@ class Support:
         return [h.proposal for h in changed]
 
     def replace(self, proposal: Edge) -> None:
-        """Replace a loop that was measured again."""
+        """Replace the edge of a loop that was measured again."""
         of_source = self._of_source[proposal.source]
         kept = [h for h in of_source if h.proposal.key != proposal.key]
         if proposal.relative is not None and len(kept) < len(of_source):
@@ -86,7 +89,7 @@ class Support:
         self._of_source[proposal.source] = kept
 
     def give_up(self, before: int) -> list[Edge]:
-        """Reject the pending loops of nodes before `before`."""
+        """Reject the pending loops whose source node is older than `before`; returns their edges."""
         self._pending = [h for h in self._pending if h.proposal.status is Status.PENDING]
         late = [h for h in self._pending if h.source < before]
         for h in late:

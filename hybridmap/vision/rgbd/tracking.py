@@ -34,7 +34,7 @@ STRAIGHTENED_M = 0.01
 
 
 class Tracker:
-    """Registers node k to nodes k-1, k-2, ...; keeps the odometry between consecutive nodes."""
+    """Registers node k to the nodes k-1, k-2, ... before it."""
 
     def __init__(
         self,
@@ -54,7 +54,10 @@ class Tracker:
         self._refined: list[Array] = []
 
     def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
-        """Proposals `registration` from earlier nodes to this one; `odometry` is its pose seen from node - 1."""
+        """Register a new node to the ones before it; returns proposed edges from these to the new node.
+
+        `odometry` is the pose of the new node in the frame of node - 1 (None for the first node).
+        """
         if odometry is None or node == 0:
             return []
         self._steps.append(odometry)
