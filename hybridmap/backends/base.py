@@ -17,7 +17,7 @@ ODOMETRY = "odometry"
 class SolveStatus(StrEnum):
     """Why a solver stopped. After `diverged`, `singular` and `failed` the poses are the initial ones.
 
-    `waiting`: the update only placed new nodes; loops and registrations wait for a loop closure or the end of the drive.
+    `waiting`: the update only placed new nodes; the solver takes the new edges at a loop closure or at the end of the drive.
     """
 
     CONVERGED = "converged"
@@ -30,7 +30,7 @@ class SolveStatus(StrEnum):
 
     @property
     def has_map(self) -> bool:
-        """Whether the poses are a result of the solver."""
+        """Whether the solver itself computed the poses, i.e. they are not just the initial ones."""
         return self not in (SolveStatus.DIVERGED, SolveStatus.SINGULAR, SolveStatus.FAILED)
 
 
@@ -39,13 +39,13 @@ class Outcome:
     """The result of a solver, before the figures common to all back-ends are added.
 
     Attributes:
-        poses: (N, 3) of every node, m and rad.
-        status, message, iterations: why the solver stopped, and after how many iterations.
+        poses: (N, 3) poses of all nodes, m and rad.
+        status, message: why the solver stopped; one line for people.
+        iterations: number of iterations (sweeps for relaxation).
         weights: loop edge id -> final weight.
-        rejected: ids of the loops treated as outliers.
-        values: the poses in the solver's own form, for a warm start.
-        calibrated: the graph with the odometry calibration that the solver estimated.
-        figures: further figures that only this solver knows, by the name of their measure in `metrics.FIGURES`.
+        rejected: edge ids of the loops treated as outliers.
+        values: the poses in the solver's own form, for a warm start; None if it needs none.
+        calibrated: the graph with the odometry calibration that the solver estimated; None if it estimates none.
     """
 
     poses: Array
@@ -69,22 +69,23 @@ class SolveReport:
 
     Attributes:
         backend: name of the back-end.
-        status: why it stopped.
+        status: why the solver stopped.
         message: one line for people.
-        iterations: of the solver (sweeps for relaxation).
-        chi2_initial, chi2: over all edges, by `backends.objective.chi2` for every back-end; never the solver's own cost.
-        cpu_s: process time spent.
-        rejected_edge_ids: outlier loops: those of weight zero (GNC), or with a residual beyond the gate (kernels).
+        iterations: number of iterations (sweeps for relaxation).
+        chi2_initial, chi2: chi2 over all edges before and after, by `backends.objective.chi2` for every back-end; never the
+            solver's own cost.
+        cpu_s: process time spent, s.
+        rejected_edge_ids: edge ids of the loops treated as outliers: those of weight zero (graduated non-convexity), or with
+            a residual beyond the gate (robust kernels).
         weights: loop edge id -> final weight in [0, 1]; empty for back-ends without a robust kernel.
-        chi2_odometry: share of `chi2` from edges that are not loops. A large share with rejected loops means a wrong map.
+        chi2_odometry: part of `chi2` from edges that are not loops. A large part with rejected loops means a wrong map.
         unit_variance: chi2 of the inlier edges per degree of freedom; 1 if the stated covariances are right.
         rejected_clusters: groups of rejected loops that agree with each other, the largest first: either rejected true
             loops, or one place mistaken for another. Only if a whole graph was solved.
         inconsistent_edge_ids: the rejected loops that the pre-filter (`judging.prefilter`) removed before solving.
-        weak_edges: down-weighted odometry and registration edges -> weight, if the kernel `backends.robust.odometry` leaves
-            less than a tenth. They are excluded from the unit variance.
+        weak_edges: edge id -> weight, for odometry and registration edges that the kernel `backends.robust.odometry` gave a
+            weight below a tenth. They are excluded from the unit variance.
         hanging_nodes: number of nodes that only down-weighted edges and rejected loops join to node 0.
-        figures: further figures that only this solver knows, by the name of their measure.
 
     If the back-end calibrates odometry, its estimate applies to odometry chi2, unit variance, clusters and down-weighted edges.
     """
@@ -108,7 +109,7 @@ class SolveReport:
 
     @property
     def doubt(self) -> str:
-        """A warning about rejected loops that agree with each other; empty if there are none."""
+        """A warning about rejected loops that agree with each other; empty string if there are none."""
         together, groups = sum(map(len, self.rejected_clusters)), len(self.rejected_clusters)
         if not groups:
             return ""
@@ -118,16 +119,16 @@ class SolveReport:
 
     @property
     def summary(self) -> str:
-        """The message, with the warning about rejected loops."""
+        """The message of the solver, with the warning about rejected loops that agree with each other."""
         return "; ".join(filter(None, (self.message, self.doubt)))
 
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Poses of every node in `map`, with the report.
+    """Poses of every node, with the report.
 
     Attributes:
-        poses: (N, 3) m and rad; node 0 keeps its pose of the graph's `initial`.
+        poses: (N, 3) poses in the map frame, m and rad; node 0 keeps its pose of the graph's `initial`.
         report: how the solution was reached.
     """
 
@@ -136,18 +137,21 @@ class Solution:
 
 
 class SupportsPoseGraph(Protocol):
-    """An object that gives a frozen graph, such as the experience map."""
+    """An object that can be turned into a frozen graph, such as the experience map."""
 
     def pose_graph(self) -> PoseGraph:
-        """The accepted edges as arrays."""
+        """Nodes and accepted edges as arrays."""
 
 
 class Backend(Protocol):
-    """A back-end. `update` follows a growing graph while driving; `solve` solves a whole graph from its `initial`."""
+    """Interface of a back-end.
+
+    `update` follows a growing graph while driving; `solve` solves a whole graph from its `initial`.
+    """
 
     @property
     def name(self) -> str:
-        """The name by which `create` knows it."""
+        """The name from which `registry.create` makes this back-end."""
 
     def update(self, graph: PoseGraph) -> Solution:
         """Follow the graph as it has grown (or lost edges) since the last call, by a cheap warm start.

@@ -25,7 +25,7 @@ Progress = Callable[[int, int], None]
 
 
 class Way(StrEnum):
-    """How a back-end gets the graph: `batch`, whole, from its initial poses; `incremental`, node by node, as in a drive."""
+    """How a back-end gets the graph: `batch`, the whole graph at once; `incremental`, node by node, as in a drive."""
 
     BATCH = "batch"
     INCREMENTAL = "incremental"
@@ -36,14 +36,14 @@ class Row:
     """Result of one back-end on the graph.
 
     Attributes:
-        backend: its name.
-        solution: None if the back-end failed.
-        failure: the error; empty if it did not fail.
-        certificate: what was proved about its solution on the inlier edges; None if no proof was asked for.
-        way: how it got the graph.
+        backend: name of the back-end.
+        solution: its solution; None if the back-end failed.
+        failure: message of the error; empty string if the back-end did not fail.
+        certificate: what was proved about the solution on the inlier edges; None if no proof was asked for.
+        way: how the back-end got the graph.
         title: unique name of the row: that of the back-end, with the way if the back-end has two rows.
-        curve: (K, 2) convergence, empty if not traced. Batch: iterations (or sweeps) and chi2 over the edges that were
-            inliers at the end. Incremental: nodes, and unit variance of the inliers at the time.
+        curve: (K, 2) convergence; None if not asked for. Batch: iterations (or sweeps) and chi2 over the edges that were
+            inliers at the end. Incremental: number of nodes, and unit variance of the inliers at that time.
     """
 
     backend: str
@@ -56,22 +56,22 @@ class Row:
 
     @property
     def status(self) -> str:
-        """Status in one word."""
+        """Status of the solver in one word, for people."""
         return str(SolveStatus.FAILED if self.solution is None else self.solution.report.status)
 
     @property
     def has_map(self) -> bool:
-        """Whether the back-end has a result of its own, beyond its initial poses."""
+        """Whether the back-end computed poses of its own, beyond the initial ones."""
         return self.solution is not None and self.solution.report.status.has_map
 
     @property
     def message(self) -> str:
-        """One line for people."""
+        """Message of the solver or of the error, in one line."""
         return self.failure if self.solution is None else self.solution.report.summary
 
     @property
     def verdict(self) -> str:
-        """The message, and why the solution is not certified."""
+        """Message of the solver, and why the solution is not certified, if that was asked for."""
         doubt = "" if self.certificate is None or self.certificate.certified else self.certificate.message
         return "; ".join(filter(None, (self.message, doubt)))
 
@@ -90,12 +90,12 @@ def compare(
 
     Args:
         graph: the graph.
-        backends: names, or back-ends in a fresh state, in the order of the rows.
+        backends: names, or back-ends that have solved nothing yet, in the order of the rows.
         config: settings of the back-ends given by name.
-        ways: how each gets the graph; dead reckoning is the same in every way and gets only the first.
+        ways: ways of giving the graph to each; dead reckoning is the same in every way and gets only the first.
         certified: try to prove each solution optimal (`backends.judging.certificate`).
         traced: compute convergence curves, which makes batch solvers about three times slower.
-        progress: called with the units done and their total.
+        progress: called with the number of finished parts of the work and their total.
 
     Raises:
         GraphError: the graph is malformed.
@@ -129,15 +129,15 @@ def compare(
 
 
 def convergence(graph: PoseGraph, name: str, config: BackendsConfig, final: Solution) -> Array:
-    """Iterations and chi2 (K, 2) over the inlier edges of `final`, from the graph's initial poses to `final`.
+    """Convergence of a back-end: iterations and chi2 (K, 2) over the inlier edges of `final`.
 
     Each point is a separate run with that limit, at Fibonacci numbers of iterations or sweeps; together they take about two
     and a half times as long as one run. Back-ends that do not iterate on one objective get only the first and last point.
 
     Args:
-        graph: what was solved.
-        name, config: the back-end.
-        final: its solution.
+        graph: the graph that was solved.
+        name, config: name and settings of the back-end.
+        final: its solution of the graph.
     """
     kept = graph.with_edges(~np.isin(graph.edge_ids, final.report.rejected_edge_ids))
     given = graph.with_edges(~np.isin(graph.edge_ids, final.report.inconsistent_edge_ids))
@@ -191,7 +191,7 @@ def _own_figure(measure: str, title: str, value: float) -> Metric:
 
 
 def metrics_of(rows: Sequence[Row]) -> list[Metric]:
-    """Figures `<measure>/<title>` of the rows with a solution."""
+    """Metrics of the rows with a solution, named `<measure>/<title of the row>`."""
     metrics = []
     for row in rows:
         if row.solution is None:

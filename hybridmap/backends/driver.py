@@ -1,6 +1,6 @@
-"""The driver of every solver: it follows a growing graph. `Ensemble` runs several back-ends on one graph.
+"""`Driver` makes a back-end of a solver: it follows a growing graph. `Ensemble` runs several back-ends on one graph.
 
-A solver is a function from (graph, start) to an outcome.
+A solver is a function from (graph, initial poses) to an outcome.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Extend = Callable[[PoseGraph, Array], Array]
 
 
 class Works(Enum):
-    """When an update calls the solver: if the graph closes a loop (`Change.closes`), at every growth, or never."""
+    """When `Driver.update` calls the solver: if the graph closes a loop (`Change.closes`), whenever it grows, or never."""
 
     ON_CLOSURES = "on closures"
     ON_GROWTH = "on growth"
@@ -41,8 +41,8 @@ class Works(Enum):
 class Driver:
     """A back-end made of a solver: follows a growing graph, solves a whole one, and reports on both.
 
-    Between two loop closures the cost of an update grows with the new part of the graph only. An exception leaves the state
-    before the call.
+    Between two loop closures the cost of an update grows with the new part of the graph only. If a call raises, the state
+    is as before the call.
     """
 
     def __init__(
@@ -86,15 +86,23 @@ class Driver:
 
     @property
     def name(self) -> str:
-        """The name by which `create` knows it."""
+        """The name from which `registry.create` makes this back-end."""
         return self._name
 
     def update(self, graph: PoseGraph) -> Solution:
-        """See `Backend.update`."""
+        """Follow the graph as it has grown (or lost edges) since the last call.
+
+        Raises:
+            BackendError: the graph cannot be solved, or has fewer nodes than before.
+        """
         return self._advance(graph, None)
 
     def finish(self, graph: PoseGraph) -> Solution:
-        """See `Backend.finish`."""
+        """Compute the final solution at the end of a drive.
+
+        Raises:
+            BackendError: the graph cannot be solved.
+        """
         if self._last is not None:
             return self._advance(graph, self._last)
         if self._onward is not None:
@@ -102,7 +110,12 @@ class Driver:
         return self.solve(graph)
 
     def solve(self, graph: PoseGraph | SupportsPoseGraph) -> Solution:
-        """See `Backend.solve`."""
+        """Solve a whole graph, independently of earlier calls.
+
+        Raises:
+            GraphError: the graph is malformed.
+            BackendError: the solver failed.
+        """
         frozen = graph if isinstance(graph, PoseGraph) else graph.pose_graph()
         return self._whole(frozen, self._solve, frozen.initial)
 
@@ -227,7 +240,9 @@ class Driver:
 
 
 def replay(backend: Backend, graph: PoseGraph) -> Iterator[Solution]:
-    """Give a graph to `update` node by node, as the robot made it; an edge enters once both of its nodes exist.
+    """Give a graph to `Backend.update` node by node, as the robot made it; yields the solution after every node.
+
+    An edge enters once both of its nodes exist.
 
     Raises:
         GraphError: the graph is malformed, or a node is joined to later ones only.
@@ -246,13 +261,13 @@ log = logging.getLogger(__name__)
 
 
 class Ensemble:
-    """Gives every back-end the same graph. One that fails is reported and keeps its last poses.
+    """Gives the same graph to several back-ends. A back-end that fails is reported and keeps its last poses.
 
     Attributes:
-        names: of the back-ends, in order.
-        primary: name of the first.
-        solutions: latest of each, by name.
-        failures: latest error of each back-end that failed, by name.
+        names: names of the back-ends, in order.
+        primary: name of the first back-end, whose map the mapper uses.
+        solutions: name -> latest solution of the back-end.
+        failures: name -> latest error, for the back-ends that failed.
     """
 
     def __init__(self, config: BackendsConfig, clock: StageClock, backends: Sequence[str | Backend] | None = None) -> None:
@@ -277,7 +292,10 @@ class Ensemble:
         self.primary = self.names[0]
 
     def poses(self, graph: PoseGraph, name: str | None = None) -> Array:
-        """(N, 3) latest poses of a back-end (default: the primary); newer nodes are placed by their consecutive edges."""
+        """Latest poses (N, 3) by the back-end of this name (None: the primary).
+
+        Nodes newer than its solution are placed by the edges between consecutive nodes.
+        """
         solution = self.solutions.get(name or self.primary)
         return extend(graph, solution.poses if solution is not None else graph.initial[:1])
 

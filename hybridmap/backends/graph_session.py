@@ -32,14 +32,14 @@ _EMPTY = PoseGraph(
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A state to return to; its arrays are never changed.
+    """The state of a `GraphSession`, to which it can return; its arrays are never changed.
 
     Attributes:
         rows: node -> its row in `graph`, in the order in which they were added.
-        graph: `initial` (N, 3) holds the latest poses, m and rad; NaN for a node without a pose.
-        fixed: the node that is held fixed.
+        graph: the graph; its `initial` (N, 3) holds the latest poses, m and rad; NaN for a node without a pose.
+        fixed: the node that is held fixed; None if there are no nodes.
         next_edge: least number that a new edge may have.
-        solution: the latest one.
+        solution: the latest solution; None before the first.
     """
 
     rows: dict[int, int] = field(default_factory=dict)
@@ -50,9 +50,9 @@ class Snapshot:
 
 
 class GraphSession:
-    """A graph that is edited, and a back-end that follows it.
+    """A graph that is edited step by step, and a back-end that follows it.
 
-    The caller numbers nodes and edges: nodes by any integers, edges by increasing ones. An exception leaves the session
+    The caller numbers nodes and edges: nodes by any integers, edges by increasing ones. If a call raises, the session stays
     exactly as it was.
     """
 
@@ -92,10 +92,10 @@ class GraphSession:
     def add_edge(
         self, edge: int, source: int, target: int, delta: ArrayLike, information: ArrayLike, kind: EdgeKind = EdgeKind.LOOP
     ) -> None:
-        """Add a measured pose (3,) of the target in the frame of the source, with its information (3, 3).
+        """Add an edge: the measured pose (3,) of the target in the frame of the source, m and rad, with its information (3, 3).
 
         Raises:
-            BackendError: the number is not above all earlier ones.
+            BackendError: the number `edge` is not above all earlier ones.
             GraphError: an unknown node, or an invalid measurement.
         """
         state = self._state
@@ -114,7 +114,7 @@ class GraphSession:
 
         Raises:
             BackendError: there is no such edge.
-            GraphError: a node would be left without a path to the fixed one.
+            GraphError: a node would be left without a path to the fixed node.
         """
         graph = self._state.graph
         kept = graph.edge_ids != edge
@@ -124,11 +124,15 @@ class GraphSession:
         self._state = replace(self._state, graph=graph.with_edges(kept))
 
     def remove_node(self, node: int, mode: Literal["drop", "bridge"] = "drop") -> None:
-        """Remove a node and its edges; with `bridge` its neighbours in the chain are joined by the composition of their edges.
+        """Remove a node and its edges.
+
+        Args:
+            node: the node.
+            mode: `drop`; or `bridge`: join its two neighbours in the chain by one edge, composed of the two edges between them.
 
         Raises:
-            BackendError: there is no such node, it is the fixed one, or it is at an end of the chain.
-            GraphError: another node would be left without a path to the fixed one.
+            BackendError: there is no such node, it is the fixed one, or, for `bridge`, it is at an end of the chain.
+            GraphError: another node would be left without a path to the fixed node.
         """
         state = self._state
         if node not in state.rows or node == state.fixed:
@@ -149,7 +153,7 @@ class GraphSession:
         self._backend = self._fresh()
 
     def fix(self, node: int) -> None:
-        """Hold another node fixed.
+        """Hold this node fixed from now on, instead of the present one.
 
         Raises:
             BackendError: there is no such node, or it has no pose yet.
@@ -160,10 +164,11 @@ class GraphSession:
         self._state = replace(self._state, fixed=node)
 
     def step(self, budget: int = 1) -> Solution:
-        """Follow the changes: run up to this many updates of the back-end, fewer if it converges.
+        """Solve the changed graph: run up to `budget` updates of the back-end, fewer if it converges.
 
         Raises:
-            GraphError, BackendError: as `Backend.update`.
+            GraphError: the graph is malformed.
+            BackendError: the budget is below 1, or the graph cannot be solved.
         """
         if budget < 1:
             raise BackendError(f"step: found a budget of {budget}, expected 1 or more")
@@ -175,24 +180,25 @@ class GraphSession:
         return self._adopt(solution)
 
     def solve(self) -> Solution:
-        """Solve the whole graph from the start.
+        """Solve the whole graph anew, independently of earlier solutions.
 
         Raises:
-            GraphError, BackendError: as `Backend.solve`.
+            GraphError: the graph is malformed.
+            BackendError: the session has no node, or the solver failed.
         """
         return self._adopt(self._backend.solve(_graph(self._state)))
 
     def poses(self) -> Array:
-        """(N, 3) latest poses in the order of the nodes; edges place the nodes newer than the last solution."""
+        """Latest poses (N, 3) in the order in which nodes were added; edges place the nodes newer than the last solution."""
         return _graph(self._state).initial.copy()
 
     def edge_weights(self) -> dict[int, float]:
-        """Final weight of each loop in the latest solution; empty without a robust kernel."""
+        """Loop edge id -> its final weight in the latest solution; empty if the back-end has no robust kernel."""
         solution = self._state.solution
         return {} if solution is None else dict(solution.report.weights)
 
     def marginal(self, node: int) -> Array:
-        """Covariance (3, 3) of a node relative to the fixed one, in its own frame, at the latest poses.
+        """Covariance (3, 3) of a node relative to the fixed one, in the node's own frame, at the latest poses.
 
         Raises:
             BackendError: there is no such node, or the graph is singular.
@@ -205,7 +211,7 @@ class GraphSession:
         return np.asarray(covariances.relative(np.array([fixed]), np.array([rows[node]]))[0])
 
     def snapshot(self) -> Snapshot:
-        """The present state."""
+        """The present state, for `restore`."""
         return self._state
 
     def restore(self, snapshot: Snapshot) -> None:

@@ -26,19 +26,19 @@ _NAMED = (
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Gains with their uncertainty.
+    """Systematic errors of wheel odometry, estimated from pieces of the drive ("legs"), with their uncertainty.
 
     Attributes:
-        gains: the estimate.
+        gains: the estimated gain, turn gain and heading bias.
         delay_s: delay of the odometry clock: odometry of stamp t gives the pose at t + delay_s. Estimated together with the
             gains, as a delay would otherwise look like an error of the turn gain.
-        covariance: (4, 4) of gain, turn gain, bias and delay, from the information matrix and the unit variance. An
-            unobservable value has infinite variance, and is neutral.
-        leg_m: length of the legs.
-        legs: number of independent legs, i.e. travel over length.
-        travel_m: path length that was used.
+        covariance: (4, 4) covariance of gain, turn gain, heading bias and delay, scaled by the unit variance. A value that the
+            drive leaves open has infinite variance, and is neutral (gain 1, turn gain 1, bias 0, delay 0).
+        leg_m: length of the legs, m.
+        legs: number of independent legs, i.e. travel divided by length.
+        travel_m: path length that was used, m.
         unit_variance: mean squared residual of a leg, in units of the assumed variance.
-        downweighted: share of legs with a weight below one half (drop-outs).
+        downweighted: share of legs that the robust fit gave a weight below one half, e.g. where wheels slipped.
     """
 
     gains: Gains
@@ -52,7 +52,7 @@ class Estimate:
 
     @property
     def sigmas(self) -> Array:
-        """(4,) standard deviations of gain (1), turn gain (1), heading bias (rad/m) and delay (s)."""
+        """(4,) standard deviations of gain (1), turn gain (1), heading bias (rad/m) and delay (s); infinite if unobservable."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
@@ -65,7 +65,7 @@ class Estimate:
         return Gains.from_array(np.where(self.measured[:3], self.gains.to_array(), in_use.to_array()))
 
     def off(self, other: Gains = NEUTRAL) -> Array:
-        """(3,) distance of gain, turn gain and bias from other values, in standard deviations; 0 if unobservable."""
+        """(3,) distance of gain, turn gain and heading bias from `other`, in standard deviations; 0 if unobservable."""
         difference = self.gains.to_array() - other.to_array()
         return np.asarray(difference / np.maximum(self.sigmas[:3], 1e-12))
 
@@ -75,12 +75,12 @@ class Estimate:
         return bool(abs(self.delay_s) > SIGNIFICANT_SIGMAS * self.sigmas[3])
 
     def differs(self, other: Gains = NEUTRAL) -> bool:
-        """Whether any of the three gains differs significantly from other values."""
+        """Whether gain, turn gain or heading bias differs significantly from that of `other`."""
         return bool(np.any(np.abs(self.off(other)) > SIGNIFICANT_SIGMAS))
 
 
 def metrics_of(estimate: Estimate, in_use: Gains) -> list[Metric]:
-    """Each gain with its standard deviation and distance from the value in use (NaN if unobservable); then the data used."""
+    """Each gain with its standard deviation and distance from the value in use (NaN if unobservable), and the data used."""
     rows: list[Metric] = []
     told, sigmas, off = estimate.measured, estimate.sigmas, estimate.off(in_use)
     values = np.append(estimate.gains.to_array(), estimate.delay_s)
@@ -104,7 +104,7 @@ def metrics_of(estimate: Estimate, in_use: Gains) -> list[Metric]:
 
 
 def changes(estimate: Estimate, in_use: Gains) -> bool:
-    """Whether the estimate changes a configuration: a gain differs from that in use, or the delay from zero."""
+    """Whether the estimate changes a configuration: a gain differs significantly from that in use, or the delay from zero."""
     return estimate.differs(in_use) or estimate.delay_differs
 
 
@@ -129,10 +129,10 @@ def verdict(estimate: Estimate, in_use: Gains) -> str:
 
 
 def calibrated(config_tree: dict[str, Any], estimate: Estimate, in_use: Gains) -> str:
-    """A configuration (the nested mapping of its file) with the estimate, as YAML that `Config.load` reads.
+    """Put the estimate into a configuration (the nested mapping of its file); returns YAML that `Config.load` reads.
 
     If one gain differs significantly, all observable gains change together, as each is estimated given the others. The delay
-    is decided separately; the estimate is what remained of the delay in use, so it is added to that.
+    is decided separately. The drive was mapped with the delay in use, so the estimated delay is added to it.
 
     Raises:
         ConfigError: the result is not a valid configuration of this version, e.g. a delay beyond its limit.

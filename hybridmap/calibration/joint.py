@@ -55,10 +55,10 @@ class Joint:
     """A map and the calibration estimated with it.
 
     Attributes:
-        poses: (N, 3) of the nodes.
+        poses: (N, 3) poses of the nodes, m and rad.
         estimate: the calibration.
-        cost: the objective, robust in odometry and loops; the lowest of the starts.
-        bias_start_rad_m: initial bias of this solution.
+        cost: value of the robust objective, the lowest over all initial biases that were tried.
+        bias_start_rad_m: initial heading bias that led to this solution, rad/m.
     """
 
     poses: Array
@@ -73,12 +73,12 @@ def solve(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config
     Args:
         graph: nodes and accepted edges.
         motion: raw odometry.
-        stamps_ns: (N,) of the nodes.
-        config: settings of the relaxation and the kernels.
+        stamps_ns: (N,) stamps of the nodes.
+        config: settings of the relaxation and the robust kernels.
 
     Raises:
         EvaluationError: turn gain and heading bias are unobservable, or the result is out of range.
-        BackendError: no start led to a solution.
+        BackendError: GTSAM failed from every initial bias.
     """
     require_told_by(Sighting(motion, stamps_ns, graph.initial))
     problem = Problem(graph, motion, stamps_ns, config)
@@ -94,7 +94,7 @@ def solve(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config
         if len(found) == _AGREEING_STARTS and np.ptp([one.estimate.gains.heading_bias_rad_m for one in found]) < _SAME_RAD_M:
             break  # the starts on either side of zero lead to the same map
     if not found:
-        raise BackendError("calibration: GTSAM solved the graph from none of the starts of the heading bias")
+        raise BackendError("calibration: GTSAM failed from every initial heading bias; use `alternating` or a reference")
     best = min(found, key=lambda one: one.cost)
     variable = np.append(best.estimate.gains.to_array(), best.estimate.delay_s)
     scale = problem.scale(best.poses, variable)
@@ -104,15 +104,15 @@ def solve(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config
 
 
 def told_by_the_drive(estimate: Estimate) -> Estimate:
-    """The estimate without a gain or delay that only the prior determined.
+    """Make a gain or delay neutral, with infinite variance, if the drive says less about it than the prior does.
 
     Raises:
-        NotToldError: only the prior determined turn gain or heading bias.
+        NotToldError: the drive says less than the prior about turn gain or heading bias.
     """
     open_ = np.diag(estimate.covariance) > _OPEN * estimate.unit_variance * PRIOR**2
     if open_[1] or open_[2]:
         raise NotToldError(
-            "calibration: the drive and its loops determine neither turn gain nor heading bias better than was known before; "
+            "calibration: the drive says too little about turn gain or heading bias; "
             "expected a drive that turns and closes loops"
         )
     values = np.where(open_, _NEUTRAL, np.append(estimate.gains.to_array(), estimate.delay_s))
@@ -123,7 +123,7 @@ def told_by_the_drive(estimate: Estimate) -> Estimate:
 
 
 class Problem:
-    """One graph with its calibration variable, to be solved from several starts."""
+    """The optimisation of one graph and its calibration, to be solved from several initial values."""
 
     def __init__(self, graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config: BackendsConfig) -> None:
         self.graph, self.config = graph, config
@@ -134,12 +134,12 @@ class Problem:
         self._evaluated: tuple[bytes, Array, Array] | None = None
 
     def open_way(self) -> float:
-        """Share of the travel on which only odometry joins consecutive nodes."""
+        """Share of the travel where consecutive nodes are joined by odometry only."""
         only = self.terms.components == 3
         return float(np.sum(self.terms.legs.travel_m[only])) / max(float(self.motion.travel_m[-1]), 1e-9)
 
     def grown(self, start: Gains) -> Array:
-        """Poses (N, 3) by incremental relaxation, with odometry calibrated by this start."""
+        """Initial poses (N, 3): the graph grown node by node with incremental relaxation, on odometry calibrated by `start`."""
         graph = chain(corrected(self.graph, self.motion, self.stamps_ns, start))
         poses = graph.initial
         for solution in backends.replay(backends.create(RELAXATION, self.config), graph):
@@ -147,7 +147,14 @@ class Problem:
         return poses
 
     def solve(self, poses: Array, variable: Array, scale: float, bias_start_rad_m: float) -> Joint | None:
-        """Solve from given poses (N, 3) and calibration (4,); None if GTSAM fails or the poses are not finite."""
+        """Solve from given poses (N, 3) and calibration (4,); None if GTSAM fails or the result is not finite.
+
+        Args:
+            poses: initial poses, m and rad.
+            variable: initial gain, turn gain, heading bias (rad/m) and delay (s).
+            scale: factor on the assumed standard deviations of odometry.
+            bias_start_rad_m: initial heading bias of this attempt, for the log and the result.
+        """
         gains = Gains.from_array(variable[:3])
         self.terms = terms_of(self.graph, self.motion, self.stamps_ns, gains).scaled(scale)
         self._evaluated = None
@@ -165,13 +172,13 @@ class Problem:
         return self._result(solved, np.asarray(marginal), float(nonlinear.error(solved)), bias_start_rad_m)
 
     def scale(self, poses: Array, variable: Array) -> float:
-        """Ratio of the odometry residuals to their assumed size, by the median."""
+        """Median ratio of the odometry residuals to their assumed size, at given poses (N, 3) and calibration (4,)."""
         norms = np.linalg.norm(self._residuals(poses, variable), axis=1)
         expected = np.array([_MEDIAN_OF_NORM[rows] for rows in self.terms.components])
         return max(float(np.median(norms / expected)), 1e-3)
 
     def require_held(self, poses: Array) -> None:
-        """Refuse a map that rejected nearly all edges that could contradict its calibration.
+        """Refuse poses (N, 3) that contradict nearly all edges besides odometry, as nothing then checks the calibration.
 
         Raises:
             NotToldError: fewer than three edges besides odometry have a weight of at least one half.
@@ -189,7 +196,10 @@ class Problem:
         return np.asarray(np.einsum("eij,ej->ei", self.terms.whiten, compose(inverse(predicted), apart)))
 
     def evaluate(self, variable: Array) -> tuple[Array, Array]:
-        """Displacements (E, 3) of all terms and their derivatives (E, 3, 4), computed once per value of the variable."""
+        """Displacements (E, 3) of all odometry terms, and their derivatives (E, 3, 4) by the calibration.
+
+        Both are computed once per value of the calibration `variable` (4,).
+        """
         mark = variable.tobytes()
         if self._evaluated is None or self._evaluated[0] != mark:
             gains, delay_s = Gains.from_array(variable[:3]), float(variable[3])
@@ -229,7 +239,10 @@ class Problem:
 
 
 def leg_error(problem: Problem, terms: OdometryTerms, index: int) -> Callable[[Any, Any, Any], Array]:
-    """Whitened error (3,) of one term: the pose of the target relative to its prediction by calibrated odometry."""
+    """Make the error function of odometry term `index` for a GTSAM custom factor.
+
+    The error (3,) is the target's pose relative to its prediction by calibrated odometry, divided by standard deviations.
+    """
     source, target = int(terms.sources[index]), int(terms.targets[index])
     whiten, key = terms.whiten[index], problem.key
 

@@ -1,4 +1,4 @@
-"""Legs: stretches of raw odometry between known poses, and the derivative of their displacement by the calibration."""
+"""Legs: pieces of raw odometry between known poses, and the derivative of their displacement by the calibration."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _DELAY_STEP_S = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Raw odometry over a recording.
+    """Raw odometry over a recording, as S steps.
 
     Attributes:
         stamps_ns: (S + 1,) int64, strictly increasing.
@@ -49,7 +49,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Legs:
-    """Stretches of raw odometry between pairs of times, on the clock of the poses at their ends.
+    """Pieces of raw odometry between pairs of times, given on the clock of the sensor that gave the poses.
 
     Attributes:
         motion: the odometry.
@@ -74,7 +74,7 @@ class Legs:
         return self._difference(self.motion.turned_rad, 0.0)
 
     def select(self, kept: NDArray[np.bool_] | NDArray[np.int64]) -> Legs:
-        """A subset of the legs."""
+        """The legs chosen by a mask (L,) or by indices."""
         return Legs(self.motion, self.first_ns[kept], self.last_ns[kept])
 
     def predict(self, gains: Gains, delay_s: float = 0.0) -> Array:
@@ -82,14 +82,14 @@ class Legs:
 
         Args:
             gains: the calibration.
-            delay_s: odometry of stamp t gives the pose at t + delay_s on the legs' clock.
+            delay_s: delay of the odometry clock: odometry of stamp t gives the pose at t + delay_s.
         """
         path = self.motion.poses(gains)
         first, last = self._at(path, self.first_ns, delay_s), self._at(path, self.last_ns, delay_s)
         return between(first, last)
 
     def jacobian(self, gains: Gains, delay_s: float = 0.0) -> Array:
-        """Derivative (L, 3, 4) of `predict` by (gain, turn gain, bias, delay), as a right perturbation.
+        """Derivative (L, 3, 4) of `predict` by gain, turn gain, heading bias and delay, as a right perturbation.
 
         The heading of step k is the sum of the calibrated turns before it and half of its own; its derivatives are the same
         sums of raw turn and of raw forward travel. The chord of step k shortens as its own turn grows. The derivative by the
@@ -127,7 +127,15 @@ class Legs:
 
 
 def corrected(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], gains: Gains, delay_s: float = 0.0) -> PoseGraph:
-    """The graph with its odometry edges recomputed from calibrated odometry; their information is unchanged."""
+    """Copy of the graph with odometry edges recomputed from calibrated odometry; their information is unchanged.
+
+    Args:
+        graph: nodes and accepted edges.
+        motion: raw odometry.
+        stamps_ns: (N,) stamps of the nodes.
+        gains: the calibration.
+        delay_s: delay of the odometry clock: odometry of stamp t gives the pose at t + delay_s.
+    """
     own, deltas = own_odometry(graph), graph.deltas.copy()
     legs = Legs(motion, stamps_ns[graph.sources[own]], stamps_ns[graph.targets[own]])
     deltas[own] = legs.predict(gains, delay_s)

@@ -1,7 +1,7 @@
-"""The odometry terms of the joint graph, and their covariances.
+"""The odometry terms of the joint calibration, and their covariances.
 
-Where registrations join all nodes, the map does not need odometry. There long, overlapping legs are used, by their heading
-and length, for the reasons given in `regression.py`. Elsewhere every consecutive pair of nodes keeps its odometry edge.
+Where registrations join all nodes, the map does not need odometry. There the terms are long, overlapping pieces of the drive
+("legs"), compared by heading and length, for the reasons given in `regression.py`. Elsewhere each odometry edge is a term.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _OVERLAP = 4
 
 @dataclass(frozen=True, slots=True)
 class OdometryTerms:
-    """Odometry between pairs of nodes.
+    """E measurements of odometry between pairs of nodes.
 
     Attributes:
-        legs: (E,) the odometry.
-        sources, targets: (E,) nodes at their ends.
-        whiten: (E, 3, 3) maps the pose of the target relative to its prediction to a residual of unit variance.
-        components: (E,) number of components of the residual.
-        overlap: number of terms that cover each part of the drive; their information is divided by it.
+        legs: raw odometry of each of the E terms.
+        sources, targets: (E,) nodes at the start and end of each term.
+        whiten: (E, 3, 3) matrix that turns the target's pose relative to its prediction into a residual of unit variance.
+        components: (E,) number of components of the residual: 2 for a long leg, 3 for an odometry edge.
+        overlap: number of long legs that cover each part of the drive; their information is divided by it.
     """
 
     legs: Legs
@@ -42,19 +42,18 @@ class OdometryTerms:
     overlap: float
 
     def scaled(self, scale: float) -> OdometryTerms:
-        """The terms with standard deviations multiplied by a factor."""
+        """Copy of the terms with all standard deviations multiplied by `scale`."""
         return replace(self, whiten=self.whiten / scale)
 
 
 def terms_of(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], gains: Gains) -> OdometryTerms:
-    """The odometry terms of a graph.
+    """Make the odometry terms of a graph.
 
     Args:
         graph: nodes and accepted edges.
         motion: raw odometry.
-        stamps_ns: (N,) of the nodes.
-        gains: used for the direction of a long leg's chord.
-        consecutive: use one term for every odometry edge, whether there are registrations or not.
+        stamps_ns: (N,) stamps of the nodes.
+        gains: calibration that predicts the direction of a long leg's chord.
     """
     own = own_odometry(graph)
     carried = np.zeros(graph.n_nodes, dtype=bool)  # node k: joined to k + 1 by a registration

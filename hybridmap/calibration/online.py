@@ -25,12 +25,12 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class GainChange:
-    """New gains, in use from a stamp on.
+    """New gains of odometry, in use from a stamp on.
 
     Attributes:
-        stamp_ns: of the last step with the old gains.
+        stamp_ns: stamp of the last odometry step with the old gains.
         gains: the new gains.
-        estimate: the estimate behind them.
+        estimate: the estimate that led to them.
     """
 
     stamp_ns: int
@@ -49,9 +49,9 @@ class GainChange:
 
 
 class OnlineCalibration:
-    """Collects raw odometry, and at intervals regresses it on the map. Does nothing if online calibration is off.
+    """Collects raw odometry, and from time to time estimates its gains from the map. Does nothing if it is switched off.
 
-    Existing odometry edges do not change; new gains apply to the rest of the drive.
+    Odometry edges that exist do not change; new gains apply to the rest of the drive.
     """
 
     def __init__(self, gains: Gains) -> None:
@@ -65,7 +65,7 @@ class OnlineCalibration:
         self._due_m = FIRST_M
 
     def observe(self, stamp_ns: int, delta_robot: Array) -> None:
-        """Add a raw step (3,) that ends at a stamp; a second step with the same stamp must be zero."""
+        """Add a raw odometry step (3,), m and rad, that ends at a stamp; a second step with the same stamp must be zero."""
         if self._stamps_ns and stamp_ns <= self._stamps_ns[-1]:
             return
         if self._stamps_ns:
@@ -74,12 +74,12 @@ class OnlineCalibration:
         self._stamps_ns.append(stamp_ns)
 
     def follow(self, stamp_ns: int, graph: Callable[[], PoseGraph], poses: Callable[[], Array]) -> GainChange | None:
-        """Called when a node was made: the change of gains to apply, or None.
+        """Take note of a new node; returns the change of gains to apply, None if there is none.
 
         Args:
-            stamp_ns: of the node.
-            graph: returns nodes and accepted edges, with the new node. Called only if an estimate is due, as is
-            poses: returns (N, 3) of all nodes on the map.
+            stamp_ns: stamp of the new node.
+            graph: called for nodes and accepted edges, with the new node, only if the next estimate is due.
+            poses: called for the poses (N, 3) of all nodes on the map, only if the next estimate is due.
         """
         self._node_stamps_ns.append(stamp_ns)
         if self._travel_m < self._due_m or not np.any(graph().kinds != EdgeKind.ODOMETRY):

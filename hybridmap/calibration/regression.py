@@ -1,8 +1,8 @@
 """Regression of odometry on known poses: a robust estimate of gain, turn gain, heading bias and delay.
 
-It differs from plain least squares in two ways. Legs are long and overlap: the drift grows with a leg, while the noise of its
-end poses does not. The delay between odometry and the sensor is estimated as well: a scan with a stamp 0.1 s late looks like
-an error of 10 deg in heading at each end of a fast turn.
+It compares pieces of the drive ("legs"), and differs from plain least squares in two ways. Legs are long and overlap: the
+drift grows with a leg, while the noise of its end poses does not. The delay between odometry and the sensor is estimated as
+well: a scan with a stamp 0.1 s late looks like an error of 10 deg in heading at each end of a fast turn.
 
 Only two components of a leg are used: the heading at its end, linear in turn gain, bias and delay, and its length along the
 measured chord, linear in the gain. The lateral component depends on the sensor's mounting and on *where* on the leg the
@@ -83,11 +83,11 @@ class _Drive:
 
 
 def regress(sightings: Sequence[Sighting], leg_m: float | None = None) -> Estimate:
-    """Estimate one calibration from one or more drives.
+    """Estimate one calibration from one or more drives, by comparing pieces of them ("legs") with the known poses.
 
     Args:
         sightings: drives of one robot (or of robots of one kind).
-        leg_m: length of the legs, m, `SHORTEST_M` or more; default: a sixteenth of the mean drive, within `LEG_M`.
+        leg_m: length of the legs, m, `SHORTEST_M` or more; None: a sixteenth of the mean drive, within the limits `LEG_M`.
 
     Raises:
         EvaluationError: too little travel between known poses, unobservable turn gain or heading bias, or an estimate out
@@ -103,26 +103,26 @@ def regress(sightings: Sequence[Sighting], leg_m: float | None = None) -> Estima
     if total < 4.0 * length or count < 8:
         raise EvaluationError(
             f"calibration: found {total:.1f} m of odometry between known poses, expected at least {4.0 * length:.1f} m; "
-            f"give a longer drive, or shorter legs"
+            f"give a longer drive, or a smaller --leg"
         )
     return _solve(drives, length, total)
 
 
 def require_leg(leg_m: float) -> None:
-    """Check a length of legs, m.
+    """Check a length of the pieces of a drive that are compared, m.
 
     Raises:
-        EvaluationError: it is not finite or below `SHORTEST_M`.
+        EvaluationError: the length is not finite or below `SHORTEST_M`.
     """
     if not SHORTEST_M <= leg_m < math.inf:
-        raise EvaluationError(f"calibration: found legs of {leg_m:g} m, expected {SHORTEST_M:g} m or more")
+        raise EvaluationError(f"calibration: --leg: found {leg_m:g} m, expected {SHORTEST_M:g} m or more")
 
 
 def require_told_by(sighting: Sighting) -> None:
     """Refuse a drive whose odometry alone shows that turn gain and heading bias are unobservable, whatever the poses.
 
     Raises:
-        NotToldError: as `require_told`.
+        NotToldError: the drive hardly turns, or turn gain and heading bias have the same effect on all of it.
     """
     way = _travel_at(sighting)
     legs = cut(sighting, way, leg_length(float(way[-1] - way[0]))).legs
@@ -130,7 +130,7 @@ def require_told_by(sighting: Sighting) -> None:
 
 
 def leg_length(travel_m: float) -> float:
-    """Length of the legs for a drive of a given travel, m."""
+    """Length of the pieces in which a drive of this travel is compared, m."""
     return float(np.clip(travel_m / INDEPENDENT_LEGS, *LEG_M))
 
 
@@ -142,7 +142,11 @@ def leg_sigmas(legs: Legs) -> tuple[Array, Array]:
 
 
 def cut(sighting: Sighting, travel_m: Array, leg_m: float) -> _Drive:
-    """Legs of a given length from every known pose; a leg that a gap between known poses makes twice as long is left out."""
+    """Cut a drive into legs that start at every known pose and end at the first known pose `leg_m` or more further on.
+
+    A leg of twice that length or more, because known poses are missing, is left out. `travel_m` (N,) is the path length by raw
+    odometry at each known pose.
+    """
     last = np.searchsorted(travel_m, travel_m + leg_m)
     first = np.flatnonzero(last < len(travel_m))
     last = last[first]
@@ -279,11 +283,11 @@ def _weights(residual: Array) -> Array:
 
 
 class NotToldError(EvaluationError):
-    """A requested parameter is unobservable in the drive."""
+    """The drive does not determine a calibration value that was asked for."""
 
 
 def require_told(slope: Array) -> None:
-    """Refuse legs whose headings leave the parameters unobservable, so that such a value is never reported.
+    """Refuse legs whose headings leave the calibration unobservable, so that such a value is never reported.
 
     On a circle at constant speed the turn per metre is known, but not whether turn gain or heading bias causes its error. The
     noise of odometry still separates the two columns of the fit, which would then fit noise.
@@ -297,22 +301,22 @@ def require_told(slope: Array) -> None:
     turn = float(np.sqrt(np.mean(slope[:, 0] ** 2)))
     if not turn >= MIN_TURN:
         raise NotToldError(
-            f"calibration: the drive does not tell the turn gain: found legs that turn by {turn:.1f} standard deviations of "
-            f"their heading where it takes {MIN_TURN:g}; expected one that turns"
+            f"calibration: the drive does not determine the turn gain: found turns of {turn:.1f} standard deviations of "
+            f"the heading, expected {MIN_TURN:g} or more; give a drive that turns"
         )
     condition = condition_number(slope)
     if not condition <= MAX_CONDITION:
         raise NotToldError(
             f"calibration: the drive does not tell turn gain and heading bias apart: found a condition number of "
-            f"{condition:.2g}, expected at most {MAX_CONDITION:g}; give one that goes straight as well as it turns"
+            f"{condition:.2g}, expected at most {MAX_CONDITION:g}; give a drive with straight parts and turns"
         )
 
 
 def require_delay(delay_s: float) -> float:
-    """Check that a delay is possible for a sensor's clock, and return it.
+    """Check that a delay is within what a sensor's clock can have; returns it.
 
     Raises:
-        EvaluationError: it is beyond `DELAY_LIMIT_S`.
+        EvaluationError: the delay is beyond `DELAY_LIMIT_S`.
     """
     if abs(delay_s) <= DELAY_LIMIT_S:
         return delay_s
@@ -323,7 +327,7 @@ def require_delay(delay_s: float) -> float:
 
 
 def condition_number(slope: Array) -> float:
-    """Condition number of the information matrix of a slope (L, K), each parameter scaled by its own information."""
+    """Condition number of the information matrix J'J of derivatives J (L, K), with each parameter scaled to information 1."""
     norms = np.linalg.norm(slope, axis=0)
     if not (np.isfinite(norms).all() and np.all(norms > 0.0)):
         return float("inf")

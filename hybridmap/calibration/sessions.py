@@ -43,14 +43,14 @@ class Drive:
     """The data of a session that a calibration needs.
 
     Attributes:
-        name: the folder.
+        name: name of the session's folder.
         motion: raw odometry, without the gains of the session's configuration.
-        graph: the accepted edges.
-        stamps_ns: (N,) of the nodes.
-        poses: (N, 3) of the nodes by the primary back-end.
+        graph: nodes and accepted edges.
+        stamps_ns: (N,) stamps of the nodes.
+        poses: (N, 3) poses of the nodes by the primary back-end, m and rad.
         config: the part of the session's configuration that a calibration needs: gains, delay and back-ends.
         config_tree: the whole configuration, as stored in the map file.
-        sensors: the session's sensors, in words.
+        sensors: description of the session's sensors, for people.
     """
 
     name: str
@@ -67,9 +67,9 @@ def read_drive(folder: Path) -> Drive:
     """Read a session folder.
 
     Raises:
-        StoreError: no session there.
-        ConfigError: its gains, delay or back-ends are invalid.
-        EvaluationError: it holds no odometry.
+        StoreError: the folder holds no session.
+        ConfigError: gains, delay or back-ends of its configuration are invalid.
+        EvaluationError: the session holds no odometry.
     """
     SessionFolder(folder).require()
     with MapStore.open(folder) as store:
@@ -99,10 +99,10 @@ def estimate_of(
     Drives with other sensors than the first are accepted with a warning, as they may be of another kind of robot.
 
     Args:
-        drives: of one robot, or of robots of one kind, with the same gains and delay.
-        references: none, or one per drive.
+        drives: drives of one robot, or of robots of one kind, with the same gains and delay in use.
+        references: one ground truth per drive, or none.
         estimator: `alternating` (also None) or `joint`; only without references.
-        leg_m: length of the legs, m; None: chosen from the drive. Not for `joint`.
+        leg_m: length of the pieces of the drive that are compared, m; None: chosen from the drive. Not for `joint`.
 
     Raises:
         EvaluationError: an invalid option or combination of options, a wrong number of references, a drive given twice,
@@ -130,27 +130,33 @@ def estimate_of(
 
 
 def require_options(sessions: int, references: int, estimator: str | None, leg_m: float | None) -> None:
-    """Check the options before anything is read.
+    """Check the options of a calibration (see `estimate_of`) before anything is read.
+
+    Args:
+        sessions: number of sessions.
+        references: number of references.
+        estimator: name of the estimator, or None.
+        leg_m: length of the pieces of the drive that are compared, m, or None.
 
     Raises:
-        EvaluationError: as `estimate_of`.
+        EvaluationError: an invalid option or combination of options, or a wrong number of references.
     """
     if estimator is not None and estimator not in ESTIMATORS:
         raise EvaluationError(f"unknown estimator {estimator!r}; there are {', '.join(ESTIMATORS)}")
     if estimator is not None and references:
-        raise EvaluationError(f"the estimator {estimator!r} is for sessions without a reference; give the one or the other")
+        raise EvaluationError(f"estimator {estimator!r} and a reference are given; leave out --estimator or --reference")
     if references and references != sessions:
         raise EvaluationError(f"found {references} references for {sessions} sessions, expected one each")
     if estimator == "joint" and sessions != 1:
         raise EvaluationError(f"the joint estimator takes one session, found {sessions}; use `alternating` for several")
     if estimator == "joint" and leg_m is not None:
-        raise EvaluationError("the joint estimator takes legs of its own; give --leg with `alternating` or a reference")
+        raise EvaluationError("--leg cannot be used with the estimator `joint`; leave it out")
     if leg_m is not None:
         require_leg(leg_m)
 
 
 def require_one_calibration(drives: Sequence[Drive]) -> None:
-    """Refuse a recording given twice, and drives with different calibrations in use.
+    """Refuse a recording given twice, and drives that were mapped with different gains or delays.
 
     Raises:
         EvaluationError: two drives are of one recording, or their gains or delays in use differ.
@@ -164,15 +170,15 @@ def require_one_calibration(drives: Sequence[Drive]) -> None:
                 if found != value:
                     raise EvaluationError(
                         f"{drive.name}: was mapped with {key} {found:g}, {other.name} with {value:g}; expected one calibration "
-                        f"in use, calibrate them one by one or map them alike"
+                        f"in use; calibrate them one by one, or map both with the same values"
                     )
 
 
 def common_tree(drives: Sequence[Drive]) -> dict[str, Any]:
-    """The configuration shared by all drives.
+    """The configuration that all drives share, as a nested mapping.
 
     Raises:
-        EvaluationError: they differ; the message names the first difference.
+        EvaluationError: two configurations differ; the message names the first difference.
     """
     first = _flat(drives[0].config_tree)
     for drive in drives[1:]:
@@ -181,7 +187,7 @@ def common_tree(drives: Sequence[Drive]) -> dict[str, Any]:
             if first.get(key) != other.get(key):
                 raise EvaluationError(
                     f"{drive.name}: its configuration has {key} {other.get(key)!r}, that of {drives[0].name} "
-                    f"{first.get(key)!r}; expected one configuration for --out to change, leave it out or map them alike"
+                    f"{first.get(key)!r}; expected equal ones; leave out --out or map both alike"
                 )
     return drives[0].config_tree
 
@@ -190,7 +196,7 @@ def alternating(drives: Sequence[Drive], leg_m: float | None = None) -> Estimate
     """Calibrate drives on their own maps: alternately regress odometry on the map, and optimise the map with the calibration.
 
     Raises:
-        EvaluationError: a map of odometry alone, or too little travel.
+        EvaluationError: a map has only odometry edges, or the drives are too short.
         BackendError: a map cannot be optimised.
     """
     poses = [drive.poses for drive in drives]

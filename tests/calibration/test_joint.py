@@ -89,7 +89,7 @@ def test_what_the_drive_leaves_open_is_the_prior_and_not_reported():
     assert estimate.measured.tolist() == [False, True, True, False]
     assert (estimate.gains, estimate.delay_s) == (Gains(1.0, 1.01, 0.01), 0.0)
     open_ = np.diag(joint.PRIOR**2 * [0.01, 0.01, 0.9, 0.01])
-    with pytest.raises(EvaluationError, match="determine neither turn gain nor heading bias"):
+    with pytest.raises(EvaluationError, match="too little about turn gain or heading bias"):
         joint.told_by_the_drive(Estimate(Gains(1.02, 1.01, 0.01), 0.05, open_, 4.0, 20.0, 80.0, 1.0, 0.0))
 
 

@@ -76,7 +76,7 @@ def test_a_drive_that_never_turns_says_nothing_of_turns():
     one = sighting(drive(np.random.default_rng(0), gains=Gains()))
     still = np.tile([0.05, 0.0, 0.0], (len(one.motion.steps), 1))
     straight = Sighting(type(one.motion)(one.motion.stamps_ns, still), one.stamps_ns, np.zeros_like(one.poses))
-    with pytest.raises(EvaluationError, match="expected one that turns"):
+    with pytest.raises(EvaluationError, match="give a drive that turns"):
         regress([straight])
 
 
@@ -93,7 +93,7 @@ def test_a_circle_tells_turn_gain_and_bias_not_apart(step_m, turn_rad, noise):
 def test_turns_that_are_noise_tell_no_turn_gain():
     """A straight line whose odometry errs by a degree or two: regressing on that gave a turn gain of -0.02 +- 0.11."""
     rng = np.random.default_rng(0)
-    with pytest.raises(EvaluationError, match=r"found legs that turn by 0\.\d standard deviations.*expected one that turns"):
+    with pytest.raises(EvaluationError, match=r"found turns of 0\.\d standard deviations.*give a drive that turns"):
         regress([sighting(along(rng, [(0.05, 0.0, 0.0)] * 2000), rng)])
 
 
@@ -135,7 +135,7 @@ def test_a_delay_beyond_what_can_be_set_is_refused():
 
 @pytest.mark.parametrize("leg_m", [0.0, -1.0, 0.01, float("nan"), float("inf")])
 def test_a_leg_that_is_none_is_refused(leg_m):
-    with pytest.raises(EvaluationError, match=rf"found legs of {leg_m:g} m, expected 0\.1 m or more"):
+    with pytest.raises(EvaluationError, match=rf"--leg: found {leg_m:g} m, expected 0\.1 m or more"):
         regress([sighting(drive(np.random.default_rng(0), laps=1))], leg_m)
 
 

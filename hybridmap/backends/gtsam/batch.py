@@ -29,7 +29,13 @@ _STUCK = 1e4  # Levenberg-Marquardt's lambda where it gave up rather than arrive
 
 
 def create(name: str, config: BackendsConfig, method: str) -> Driver:
-    """A least-squares back-end: `lm` (which computes its own start, and falls back on Dogleg), `gn` or `dogleg`."""
+    """A least-squares back-end.
+
+    Args:
+        name: name of the back-end.
+        config: its settings.
+        method: `lm` (which computes initial poses of its own, and falls back on Dogleg), `gn` or `dogleg`.
+    """
 
     def solve(graph: PoseGraph, initial: Array) -> Outcome:
         start = best_start(graph, initial)
@@ -57,8 +63,8 @@ def run(
     Args:
         method: `lm`, `gn` or `dogleg`.
         graph: a `gtsam.NonlinearFactorGraph` over keys 0..N-1.
-        start: (N, 3) poses.
-        max_iterations: the limit.
+        start: (N, 3) initial poses.
+        max_iterations: largest number of iterations.
         initial: the same poses as `gtsam.Values`, if they exist already.
         tolerance: relative decrease of the cost at which an optimiser has converged.
         rescue: whether Dogleg may follow.

@@ -48,7 +48,10 @@ class _Found:
 
 
 def with_calibrated_odometry(graph: PoseGraph, gains: Gains) -> PoseGraph:
-    """The graph with calibrated odometry. Its noise grows with the gains; otherwise a smaller map would always fit better."""
+    """Copy of the graph with calibrated odometry edges.
+
+    Their noise grows with the gains; otherwise a smaller map would always fit better.
+    """
     own = own_odometry(graph)
     deltas, information = graph.deltas.copy(), graph.information.copy()
     deltas[own] = apply(deltas[own], gains)
@@ -63,7 +66,15 @@ def create(name: str, config: BackendsConfig) -> Driver:
 
 
 def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outcome:
-    """The solution with the lowest truncated cost over several heading biases, until two agree without rejected clusters."""
+    """Solve with several initial heading biases; returns the solution with the lowest truncated cost.
+
+    It stops early if two of them agree and no rejected loops agree with each other.
+
+    Args:
+        graph: the graph, with uncalibrated odometry.
+        config: settings of the back-end.
+        driven: (N, 3) poses reached while driving, as a further start; None if there are none.
+    """
     found: list[_Found] = []
     for bias in BIAS_STARTS_RAD_M:
         one = _from(graph, config, np.array([1.0, 1.0, bias]), driven if bias == 0.0 else None)

@@ -20,12 +20,12 @@ _EXPECTED = 0.999  # quantile of the innovation up to which a loop is expected
 
 
 def expected_loops(graph: PoseGraph, poses: Array, loops: NDArray[np.int64], variance: float) -> NDArray[np.bool_]:
-    """Test loops against a map made without them: the innovation must fit the covariance of loop and map.
+    """Test loops against a map made without them: (L,) whether the innovation fits the covariance of loop and map.
 
     Args:
         graph: edges of the map, and these loops.
-        poses: (N, 3) of the map, m and rad.
-        loops: (L,) indices of edges.
+        poses: (N, 3) poses of the map, m and rad.
+        loops: (L,) indices of the loops among the edges of the graph.
         variance: unit variance of the map; if below 1, the covariances of map and loops are scaled by it.
 
     Raises:
@@ -61,7 +61,7 @@ class Covariances:
             raise BackendError(f"covariance: the graph is singular ({error})") from error
 
     def marginal(self, node: int) -> Array:
-        """Covariance (3, 3) of a node relative to node 0, in its own frame; zero for node 0.
+        """Covariance (3, 3) of a node relative to node 0, in the node's own frame; zero for node 0.
 
         Raises:
             BackendError: there is no such node.
@@ -71,7 +71,7 @@ class Covariances:
         return np.asarray(self._projected(np.eye(3)[None], np.array([node]), np.zeros((1, 3, 3)), np.array([0]))[0])
 
     def relative(self, sources: NDArray[np.int64], targets: NDArray[np.int64]) -> Array:
-        """Covariances (L, 3, 3) of targets seen from sources, in the targets' frames."""
+        """Covariances (L, 3, 3) of the poses of targets (L,) relative to sources (L,), in the targets' frames."""
         carried = -adjoint(between(self._poses[targets], self._poses[sources]))
         out = np.empty((len(sources), 3, 3))
         for first in range(0, len(sources), _AT_ONCE):
@@ -81,7 +81,7 @@ class Covariances:
         return out
 
     def solve(self, columns: Array) -> Array:
-        """H^-1 times columns (3N - 3, K), in the order of the nodes from node 1 on."""
+        """Inverse of the Hessian times `columns` (3N - 3, K); the rows are x, y, yaw of each node from node 1 on."""
         return np.asarray(self._factor.solve(columns))
 
     def _projected(self, at_first: Array, first: NDArray[np.int64], at_second: Array, second: NDArray[np.int64]) -> Array:

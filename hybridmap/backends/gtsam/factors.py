@@ -50,7 +50,7 @@ class NoiseModels:
         return self._model(information.tobytes(), information, loop=loop, motion=motion)
 
     def of(self, graph: PoseGraph) -> list[Any]:
-        """The noise models of all edges, in the graph's order."""
+        """The noise model of every edge of a graph, in its order."""
         information = np.ascontiguousarray(graph.information)
         keys = information.reshape(-1, 9).view("V72").ravel().tolist()  # the bytes of all matrices in one call
         rows = zip(keys, information, graph.is_loop.tolist(), graph.is_motion.tolist(), strict=True)
@@ -70,12 +70,12 @@ class NoiseModels:
 
 
 def loop_kernel(name: str, config: RobustConfig) -> Any:
-    """The kernel for loops with a given name."""
+    """The GTSAM kernel for loops of this name."""
     return _LOOP[name](config)
 
 
 def noise_models(config: RobustConfig, loop: Any = None) -> NoiseModels:
-    """Noise models with a kernel on loops (None: quadratic) and the configured one on odometry and registration edges."""
+    """Noise models with the kernel `loop` on loops (None: quadratic), and the configured one on other edges."""
     motion = None if config.odometry == "none" else _MOTION[config.odometry].Create(ODOMETRY_SCALE)
     return NoiseModels(loop, motion)
 
@@ -88,7 +88,7 @@ def factors(graph: PoseGraph, models: NoiseModels) -> list[Any]:
 
 
 def anchor(initial: Array) -> Any:
-    """The prior that fixes node 0 at `initial` (3,)."""
+    """The prior factor that holds node 0 at the first pose of `initial`."""
     noise = gtsam.noiseModel.Isotropic.Sigma(3, _PRIOR_SIGMA)
     return gtsam.PriorFactorPose2(0, gtsam.Pose2(*initial), noise)
 
@@ -99,7 +99,7 @@ def factor_graph(graph: PoseGraph, models: NoiseModels) -> Any:
 
 
 def collected(parts: Iterable[Any]) -> Any:
-    """Factors as a `NonlinearFactorGraph`."""
+    """Make a `NonlinearFactorGraph` of single factors."""
     out = gtsam.NonlinearFactorGraph()
     for part in parts:
         out.add(part)  # of the two names for it the one without overloads, a fifth of the cost

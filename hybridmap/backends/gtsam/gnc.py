@@ -46,13 +46,13 @@ Whole = Callable[[PoseGraph, BackendsConfig, Array | None], Outcome]
 
 @dataclass(frozen=True, slots=True)
 class Truncated:
-    """Result of an annealing run.
+    """Result of a run of graduated non-convexity.
 
     Attributes:
-        poses: (N, 3).
-        kept: (L,) which loops are inliers.
-        rounds: steps and iterations taken.
-        bound: final squared residual beyond which a loop was an outlier.
+        poses: (N, 3) poses, m and rad.
+        kept: (L,) whether each loop is an inlier.
+        rounds: number of annealing steps and of iterations after them.
+        bound: squared residual beyond which a loop was an outlier at the end.
     """
 
     poses: Array
@@ -92,7 +92,13 @@ class _Problem:
 
 
 def truncated_weights(squared: Array, mu: float, bound: float) -> Array:
-    """Weights of the truncated-least-squares surrogate at control parameter mu (Yang et al., eq. 14)."""
+    """Weights (L,) of the surrogate of truncated least squares at control parameter mu (Yang et al., eq. 14).
+
+    Args:
+        squared: (L,) squared residuals.
+        mu: control parameter; small: nearly convex; large: close to the truncated cost.
+        bound: squared residual at which the cost is truncated.
+    """
     between_ = np.sqrt(bound * mu * (mu + 1.0) / np.maximum(squared, 1e-300)) - mu
     inside, outside = squared <= bound * mu / (mu + 1.0), squared >= bound * (mu + 1.0) / mu
     return np.asarray(np.where(inside, 1.0, np.where(outside, 0.0, np.clip(between_, 0.0, 1.0))))
@@ -102,9 +108,9 @@ def graduate(graph: PoseGraph, start: Array, config: BackendsConfig, negligible:
     """Anneal from a nearly convex to the truncated cost, one optimiser step per round; then solve until the inliers are stable.
 
     Args:
-        graph: connected by its known inliers.
-        start: (N, 3) poses.
-        config: schedule, gate, most iterations of each full solve at the end.
+        graph: a graph that odometry and registration edges connect.
+        start: (N, 3) initial poses.
+        config: settings of the outlier test and the largest number of iterations of each full solve at the end.
         negligible: loops of smaller weight are left out of a round. A small limit uses far loops from the first round; a
             larger one begins with loops that nearly agree. Neither is better on every graph.
     """
@@ -130,7 +136,7 @@ def graduate(graph: PoseGraph, start: Array, config: BackendsConfig, negligible:
 
 
 def trusting(graph: PoseGraph, config: BackendsConfig) -> Truncated | None:
-    """Least squares with all loops, then with the loops within the gate; None if too many loops are outside."""
+    """Least squares with all loops, then with those that are no outliers; None if too many loops are outliers."""
     bound = gate_of(config)
     poses, rounds = best_start(graph, graph.initial), 0
     if _share(squared_norms(graph, poses)[graph.is_loop] <= _ROUGHLY * bound) < _MOSTLY:
@@ -161,7 +167,7 @@ def _rejected(graph: PoseGraph, result: Truncated) -> tuple[int, ...]:
 
 
 def on_probation(graph: PoseGraph, result: Truncated, config: BackendsConfig) -> Truncated:
-    """Remove loops without support by an accepted neighbour; then re-admit those consistent with the map without them.
+    """Remove accepted loops without an accepted neighbour; then re-admit those consistent with the map made without them.
 
     If a graph overstates its noise, false loops may happen to be consistent. Each removed loop is tested by its innovation
     under the covariance of loop and map, scaled by the unit variance of the map without the loop.
@@ -225,7 +231,10 @@ def _step(factor_graph: Any, poses: Array, current: Any) -> tuple[Array, Any]:
 
 
 def grow(graph: PoseGraph, config: BackendsConfig, negligible: float) -> Truncated:
-    """Solve the graph chunk by chunk, extended by odometry; rejected loops are considered again in every chunk."""
+    """Solve the graph part by part, in the order of the drive, each part begun by odometry from the last solution.
+
+    Rejected loops are considered again in every part. Loops of a weight below `negligible` are left out of an annealing round.
+    """
     poses, rounds = graph.initial[:1], 0
     for end in range(CHUNK_NODES, graph.n_nodes, CHUNK_NODES):
         part = prefix(graph, end)
@@ -236,7 +245,7 @@ def grow(graph: PoseGraph, config: BackendsConfig, negligible: float) -> Truncat
 
 
 def create(name: str, config: BackendsConfig, whole: Whole | None = None) -> Driver:
-    """A back-end with Cauchy's kernel on loops while driving, and graduated non-convexity (or `whole`) on a whole graph."""
+    """A back-end with Cauchy's kernel on loops while driving, and the solver `whole` (None: `best`) for a whole graph."""
     solve = whole or best
 
     def anew(graph: PoseGraph, initial: Array) -> Outcome:
@@ -250,11 +259,11 @@ def create(name: str, config: BackendsConfig, whole: Whole | None = None) -> Dri
 
 
 def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outcome:
-    """Run the configured starts until a result convinces; if none does, take the one with the lowest truncated cost.
+    """Run the configured attempts until a result convinces; if none does, take the one with the lowest truncated cost.
 
-    A result convinces if no rejected loops agree with each other, or if two different starts lead to it. With a kernel on
-    odometry, which false loops may tear, every loop must fit as well. The map of the drive (N, 3) may be bent by false loops:
-    if a run from it rejects loops, it only competes with the next convincing result.
+    A result convinces if no rejected loops agree with each other, or if two different attempts lead to it. With a kernel on
+    odometry, which false loops may tear, every loop must fit as well. The map of the drive `driven` (N, 3) may be bent by false
+    loops: if a run from it rejects loops, it only competes with the next convincing result.
     """
     results: dict[str, Truncated] = {}
     unconfirmed: dict[str, Truncated] = {}
@@ -279,7 +288,13 @@ def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outc
 
 
 def attempts(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> dict[str, Callable[[], Truncated | None]]:
-    """The configured starts by name, in the order in which they are tried."""
+    """Name -> function that makes the attempt, for the configured attempts in the order in which they are tried.
+
+    Args:
+        graph: the graph.
+        config: settings of the back-end.
+        driven: (N, 3) poses reached while driving; None if there are none.
+    """
 
     def whole(negligible: float) -> Truncated:
         return graduate(graph, trusted_start(graph, graph.initial, gate_of(config)), config, negligible)

@@ -74,11 +74,11 @@ class Isam2:
 
     @property
     def is_robust(self) -> bool:
-        """Whether any edge has a kernel."""
+        """Whether loops or odometry edges have a robust kernel."""
         return self._kernel is not None or self._config.robust.odometry != "none"
 
     def follow(self, graph: PoseGraph, start: Array) -> Outcome:
-        """Run an update, which may delay loop closures."""
+        """Solve a grown graph from poses `start` (N, 3); loop closures that would hardly move the map may be delayed."""
         if self._smoother is not None:
             shift = _largest_shift(graph, self._smoother.lacks(graph), start)
             if shift <= PATIENCE:
@@ -87,7 +87,7 @@ class Isam2:
         return self._kept(*self._brought_up(graph, start), graph)
 
     def conclude(self, graph: PoseGraph, start: Array) -> Outcome:
-        """Run the last update: nothing is delayed, and every node is linearised anew."""
+        """Solve the graph at the end of a drive from poses `start` (N, 3): nothing waits, and every node is linearised anew."""
         return self._kept(*self._polished(*self._brought_up(graph, start), graph), graph)
 
     def _brought_up(self, graph: PoseGraph, start: Array) -> tuple[Smoother, int]:
@@ -173,7 +173,7 @@ def _closing_nodes(graph: PoseGraph) -> list[int]:
 
 
 class Smoother:
-    """An ISAM2 that follows a graph. After an exception it may be half changed and must be discarded.
+    """An ISAM2 object that follows a graph. After an exception it may be half changed and must be discarded.
 
     Attributes:
         isam: the GTSAM object.
@@ -207,7 +207,7 @@ class Smoother:
         return self._graph is None
 
     def lacks(self, graph: PoseGraph) -> Change:
-        """The difference between a graph and what the smoother knows."""
+        """The difference between a graph and the edges that the smoother holds."""
         return difference(self._graph, graph)
 
     def follow(self, graph: PoseGraph, start: Array, change: Change) -> None:
@@ -215,8 +215,8 @@ class Smoother:
 
         Args:
             graph: the graph.
-            start: (N, 3); the poses of new nodes are used.
-            change: the difference between the graph and what the smoother knows.
+            start: (N, 3) poses; those of new nodes are used.
+            change: the difference between the graph and the edges that the smoother holds (`lacks`).
         """
         known = len(self._point)
         new = graph.with_edges(change.added)
@@ -229,7 +229,7 @@ class Smoother:
         self._graph = graph
 
     def settle(self) -> int:
-        """Run empty updates until nothing is relinearised, at most `SETTLE_UPDATES`; returns how many."""
+        """Run updates without new factors until nothing is relinearised, at most `SETTLE_UPDATES`; returns their number."""
         for done in range(1, SETTLE_UPDATES + 1):
             if self._update().getVariablesRelinearized() == 0:
                 return done

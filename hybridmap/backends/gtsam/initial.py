@@ -18,9 +18,9 @@ _NEAR = 100.0  # mean squared Mahalanobis residual from which another start is l
 
 
 def best_start(graph: PoseGraph, given: Array) -> Array:
-    """The rotation averaging start or the given one (N, 3), whichever has the lower chi2; (N, 3).
+    """Initial poses (N, 3): those of `angular_start` or the given ones (N, 3), whichever have the lower chi2.
 
-    If the given start fits the edges within some standard deviations, it is taken directly: a chain with a wrong winding
+    If the given poses fit the edges within some standard deviations, they are taken directly: a chain with a wrong winding
     would not fit.
     """
     own = chi2(graph, given)
@@ -31,9 +31,10 @@ def best_start(graph: PoseGraph, given: Array) -> Array:
 
 
 def trusted_start(graph: PoseGraph, given: Array, bound: float) -> Array:
-    """The given start (N, 3) or the chain of the most certain consecutive edges, by chi2 with loops truncated at `bound`.
+    """Initial poses (N, 3) for back-ends that must not trust loops.
 
-    For back-ends that must not trust loops. In a map `initial` is odometry alone, and registrations are more accurate.
+    They are the given ones (N, 3), or the chain of the most certain consecutive edges, whichever have the lower chi2 with
+    loops truncated at `bound`. In a map `initial` is odometry alone, and registrations are more accurate.
     """
     chained = extend(graph, graph.initial[:1])
     return min((given, chained), key=lambda poses: truncated_cost(graph, poses, bound))

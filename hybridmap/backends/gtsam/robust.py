@@ -30,7 +30,7 @@ def create(name: str, config: BackendsConfig, kernel: str) -> Driver:
 
 
 def judged(outcome: Outcome, kernel: Any, graph: PoseGraph, gate: float) -> Outcome:
-    """The outcome with the weight of each loop; loops with a squared residual beyond the gate are rejected."""
+    """Copy of the outcome with the weight of each loop; loops with a squared residual beyond the gate are rejected."""
     loops = graph.is_loop
     ids, squared = graph.edge_ids[loops], squared_norms(graph, outcome.poses)[loops]
     weights = {int(edge): float(kernel.weight(distance)) for edge, distance in zip(ids, np.sqrt(squared), strict=True)}
@@ -38,7 +38,7 @@ def judged(outcome: Outcome, kernel: Any, graph: PoseGraph, gate: float) -> Outc
 
 
 def with_kernel(name: str, graph: PoseGraph, start: Array, config: BackendsConfig) -> Outcome:
-    """Levenberg-Marquardt with a kernel on loops, from given poses (N, 3)."""
+    """Run Levenberg-Marquardt with the kernel `name` on loops, from poses `start` (N, 3)."""
     kernel = loop_kernel(name, config.robust)
     outcome = run("lm", factor_graph(graph, noise_models(config.robust, kernel)), start, config.max_iterations)
     return judged(outcome, kernel, graph, gate_of(config))
