@@ -12,7 +12,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """The folder of recordings: `$HYBRIDMAP_DATA`, else `shared/data` beside the checkout; skips where it is absent."""
+    """Return the folder of recordings: `$HYBRIDMAP_DATA`, else `shared/data` beside the checkout. Skip if there is none."""
     for candidate in (os.environ.get("HYBRIDMAP_DATA"), REPOSITORY.parent / "shared" / "data"):
         if candidate and Path(candidate).is_dir():
             return Path(candidate)

@@ -1,4 +1,4 @@
-"""Helpers for values whose type allows more than the case that a test has made."""
+"""Helpers that narrow the type of a value for the type checker."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ T = TypeVar("T")
 
 
 def known(value: T | None) -> T:
-    """The value, which the test knows to be there."""
+    """Return the value. The test fails if it is None."""
     assert value is not None
     return value
 
 
 def as_a(kind: type[T], value: object) -> T:
-    """The value, which the test knows to be of this kind."""
+    """Return the value. The test fails if it is of another type."""
     assert isinstance(value, kind)
     return value

@@ -1,4 +1,4 @@
-"""Streams made by hand, for tests of what comes after them."""
+"""Small streams for the tests of the mapper and of the parts behind it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hybridmap.streams.laser import Laser, LaserScan
 from hybridmap.trajectory import NS_PER_S, Trajectory
 
 BEARINGS = np.deg2rad(np.arange(-135.0, 135.1, 1.5))
-WALLS = np.array(  # x0, y0, x1, y1: a room with a niche, a pillar and a slanted wall, so that no two places look alike
+WALLS = np.array(  # x0, y0, x1, y1; a niche, a pillar and a slanted wall make all places look different
     [
         [-3, -2, 5, -2], [5, -2, 5, 3], [5, 3, 1.5, 3], [1.5, 3, 1.5, 4], [1.5, 4, 0.5, 4], [0.5, 4, 0.5, 3],
         [0.5, 3, -2, 3], [-2, 3, -3, 1.5], [-3, 1.5, -3, -2], [3.2, 0.2, 3.8, 0.2], [3.8, 0.2, 3.8, 0.8], [3.8, 0.8, 3.2, 0.8],
@@ -24,7 +24,7 @@ WALLS = np.array(  # x0, y0, x1, y1: a room with a niche, a pillar and a slanted
 
 
 def scan(pose: np.ndarray) -> np.ndarray:
-    """Ranges (B,) from a pose in the room."""
+    """Return the ranges (B,) that a laser measures from a pose in the room."""
     angle = pose[2] + BEARINGS
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)[:, None]
     start, along = WALLS[:, :2] - pose[:2], WALLS[:, 2:] - WALLS[:, :2]
@@ -38,7 +38,7 @@ def scan(pose: np.ndarray) -> np.ndarray:
 
 @dataclass
 class RoomDrive:
-    """Laps on a circle in the room, with a heading bias in the odometry; scans at 5 Hz, odometry at 10 Hz."""
+    """A stream of laps on a circle in the room. Scans come at 5 Hz, odometry with a heading bias at 10 Hz."""
 
     laps: float = 3.0
     bias_rad_per_m: float = 0.03

@@ -139,12 +139,8 @@ def main() -> None:
     """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bands", type=int, default=4, help="number of bands of a profile")
-    parser.add_argument(
-        "--sizes", type=int, nargs="+", default=[1000, 10_000, 100_000], help="numbers of stored profiles to measure"
-    )
-    parser.add_argument(
-        "--numpy-up-to", type=int, default=100_000, help="largest number of stored profiles for the slow numpy search"
-    )
+    parser.add_argument("--sizes", type=int, nargs="+", default=[1000, 10_000, 100_000], help="numbers of stored profiles")
+    parser.add_argument("--numpy-up-to", type=int, default=100_000, help="largest map for the slow search in numpy")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)

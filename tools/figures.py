@@ -1,6 +1,8 @@
 """Draw the picture of the README from a session of the demo.
 
-python tools/figures.py [--session DIR] [--out docs/images/demo.png]
+    python tools/figures.py [--session DIR] [--out docs/images/demo.png]
+
+Without `--session` the demo is run first.
 """
 
 from __future__ import annotations

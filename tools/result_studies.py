@@ -1,4 +1,4 @@
-"""What stands behind `docs/results.md`: commands, the figures taken from them with their bars, and the page's questions."""
+"""The topics of `docs/results.md`: the commands to run, the figures to record with their bars, and the lines of the page."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of a command's `--json`; `PRIMARY` in its name stands for the session's primary back-end.
+    """A figure to record from the `--json` output of a command.
 
     Attributes:
-        name: of the metric.
-        bar: what it is held against.
-        at_least: the bar is a lower one.
+        name: name of the metric. `PRIMARY` in it stands for the primary back-end of the session.
+        bar: limit that the figure is held against; None for none.
+        at_least: True if the figure must be at least its bar; else it must be at most its bar.
     """
 
     name: str
@@ -25,13 +25,13 @@ class Step:
     """One command.
 
     Attributes:
-        command: as one would type it; `$HYBRIDMAP_DATA` is the folder of recordings.
-        figures: taken from its `--json`.
-        own_bars: every figure that the command itself holds against a bar is taken.
-        study: folder whose `bars.csv` is read instead.
-        wall_bar_s: its wall time is a figure, held against this.
-        holds: what is shown by the command's success; without it a failing command is an error.
-        same_graph: the graph must be that of the steps before.
+        command: the command line. `$HYBRIDMAP_DATA` in it stands for the folder of recordings.
+        figures: figures to record from its `--json` output.
+        wall_bar_s: bar of its wall time, which is then recorded as well.
+        holds: name of a figure that is 1 if the command succeeds, else 0. Without it, a command that fails is an error.
+        same_graph: True if the graph must equal that of the steps before.
+        own_bars: True to record also each figure that the command itself holds against a bar.
+        study: output folder of a study. The figures are then read from its `bars.csv`.
     """
 
     command: str
@@ -45,7 +45,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Question:
-    """A line of the page: words, and patterns of the figures that it sums up."""
+    """A line of the page: its text, and patterns for the names of the figures that it sums up."""
 
     what: str
     figures: tuple[str, ...]
@@ -53,7 +53,15 @@ class Question:
 
 @dataclass(frozen=True)
 class Topic:
-    """Steps that are run one after the other in one empty folder, and what they answer."""
+    """Steps that run one after the other in one empty folder, and the questions that their figures answer.
+
+    Attributes:
+        name: name for `--only`.
+        title: text on the page.
+        steps: the commands.
+        questions: the lines of the page.
+        needs: file in the folder of recordings without which the topic is left out.
+    """
 
     name: str
     title: str
@@ -93,7 +101,7 @@ _OF_LOG = _asked(
     ("relation error of odometry", "relation_trans_mean/odometry"),
     ("relation error of the map", "relation_trans_mean/gtsam-gnc"),
     ("of that, loops of more than 60 s", "relation_loop_trans_mean/gtsam-gnc"),
-    ("process time a minute", "cpu_s_per_min"),
+    ("CPU time per minute of the recording", "cpu_s_per_min"),
 )
 _OFFICE = (Figure("ate_rmse/PRIMARY", 0.20),)
 _GRAPHS = (
@@ -107,7 +115,7 @@ _GRAPHS = (
 TOPICS = (
     Topic(
         "demo",
-        "demo, a simulated laboratory, RGB-D",
+        "demo: a simulated laboratory, RGB-D",
         (
             Step(
                 "hybridmap demo --out demo",
@@ -125,13 +133,13 @@ TOPICS = (
             ("ATE of odometry", "ate_rmse/odometry"),
             ("ATE of relaxation", "ate_rmse/relaxation-ratslam"),
             ("ATE of the map", "ate_rmse/gtsam-gnc"),
-            ("share of the loops that are right", "loop_precision/graph"),
+            ("share of accepted loops that are true", "loop_precision/graph"),
             ("wall time", "wall_time"),
         ),
     ),
     Topic(
         "fr079",
-        "fr079, a real office building, laser, badly drifting wheels",
+        "fr079: a real office building, laser, wheels that drift badly",
         _log(
             "fr079",
             "fr079.mcap",
@@ -143,14 +151,14 @@ TOPICS = (
     ),
     Topic(
         "aces",
-        "aces, a real building of corridors, laser, few loops",
+        "aces: a real building with long corridors, laser, few loops",
         _log("aces", "aces.bag", (0.040, 0.060)),
         _OF_LOG,
         needs="real/aces/aces.bag",
     ),
     Topic(
         "office",
-        "two laps of a simulated office, from a stream, two kinds of bag and a TUM folder",
+        "office: two laps of a simulated office, RGB-D; mapped live, from two kinds of bag and from a TUM folder",
         (
             Step(
                 "hybridmap map office --out live",
@@ -171,7 +179,7 @@ TOPICS = (
     ),
     Topic(
         "hololens",
-        "a real office, RGB-D, hand-held",
+        "hololens: a real office, hand-held RGB-D camera",
         (
             Step(
                 "hybridmap map $HYBRIDMAP_DATA/real/hololens_office --out hololens",
@@ -186,9 +194,9 @@ TOPICS = (
             Step("hybridmap export hololens --format ply --out hololens.ply", holds="the merged cloud is written"),
         ),
         _asked(
-            ("ATE of made-up odometry", "ate_rmse/odometry"),
+            ("ATE of the synthetic odometry", "ate_rmse/odometry"),
             ("ATE of the map", "ate_rmse/gtsam-gnc"),
-            ("process time a minute", "cpu_s_per_min"),
+            ("CPU time per minute of the recording", "cpu_s_per_min"),
         ),
         needs="real/hololens_office/rgb.txt",
     ),
@@ -201,29 +209,29 @@ TOPICS = (
             ("ATE of the map, laboratory", "ate_m/lab/*"),
             ("recall of revisits", "loop_recall/*"),
             ("false loops kept", "false_kept/*"),
-            ("errors of the loops, median", "loop_median_m/*"),
-            ("errors of the loops, 95 %", "loop_p95_m/*"),
-            ("turns of the loops, median", "loop_median_deg/*"),
-            ("turns of the loops, 95 %", "loop_p95_deg/*"),
-            ("errors of the loops over what they claim", "loop_chi2_ratio/*"),
-            ("errors of the registrations over what they claim", "registration_chi2_ratio/*"),
+            ("position error of the loops, median", "loop_median_m/*"),
+            ("position error of the loops, 95th percentile", "loop_p95_m/*"),
+            ("heading error of the loops, median", "loop_median_deg/*"),
+            ("heading error of the loops, 95th percentile", "loop_p95_deg/*"),
+            ("squared error of the loops over that expected from their covariances", "loop_chi2_ratio/*"),
+            ("squared error of the registrations over that expected", "registration_chi2_ratio/*"),
         ),
     ),
     Topic(
         "rgbd-cost",
         "simulated office, 320 x 240 at 10 Hz, `gtsam-isam2`",
         (_study("rgbd-cost"),),
-        _asked(("process time a frame", "cpu_ms_per_view/*")),
+        _asked(("CPU time per frame", "cpu_ms_per_view/*")),
     ),
     Topic(
         "rgbd-robustness",
-        "simulated laboratory with worse cameras and wheels",
+        "simulated laboratory with degraded cameras and wheels",
         (_study("rgbd-robustness"),),
         _asked(("ATE of the map, held against that of odometry", "ate_m/*"), ("false loops kept", "false_kept/*")),
     ),
     Topic(
         "laser-robustness",
-        "fr079 and aces with worse lasers, wheels and clocks",
+        "fr079 and aces with degraded lasers, wheels and clocks",
         (_study("laser-robustness"),),
         _asked(
             ("relation error of fr079, held against odometry's", "relation_m/fr079/*"),
@@ -233,37 +241,39 @@ TOPICS = (
     ),
     Topic(
         "kidnapped",
-        "a robot is put down 20 m away in a known place",
+        "kidnapped robot, put down 20 m away in a known place",
         (_study("kidnapped"),),
         _asked(
-            ("way driven until it is found, by laser", "found_m/office by laser/*"),
-            ("way driven until it is found, by RGB-D", "found_m/office by RGB-D/*"),
+            ("distance driven until the robot is localised, by laser", "found_m/office by laser/*"),
+            ("distance driven until the robot is localised, by RGB-D", "found_m/office by RGB-D/*"),
             ("loops wrong by more than 1 m", "wrong_loops/*"),
         ),
     ),
     Topic(
         "kidnapped-recording",
-        "pieces cut out of fr079",
+        "kidnapped robot, made by cutting pieces out of fr079",
         (_study("kidnapped-recording"),),
-        _asked(("way driven until it is found", "found_m/*"), ("loops wrong by more than 1 m", "wrong_loops/*")),
+        _asked(
+            ("distance driven until the robot is localised", "found_m/*"), ("loops wrong by more than 1 m", "wrong_loops/*")
+        ),
         needs="real/fr079/fr079.mcap",
     ),
     Topic(
         "threshold-sweep-laser",
-        "a laser's threshold from far too strict to far too loose, fr079",
+        "fr079 with a threshold for loops by laser from far too strict to far too loose",
         (_study("threshold-sweep-laser"),),
         _asked(("relation error, held against odometry's", "relation_m/*")),
         needs="real/fr079/fr079.mcap",
     ),
     Topic(
         "threshold-sweep-rgbd",
-        "a camera's threshold from far too strict to far too loose, office",
+        "simulated office with a threshold for loops by RGB-D from far too strict to far too loose",
         (_study("threshold-sweep-rgbd"),),
         _asked(("ATE, held against odometry's", "ate_m/*")),
     ),
     Topic(
         "manhattan",
-        "manhattanOlson3500 through several back-ends",
+        "manhattanOlson3500, several back-ends",
         (
             Step(
                 "hybridmap compare $HYBRIDMAP_DATA/posegraphs/manhattanOlson3500.g2o"
@@ -296,7 +306,7 @@ TOPICS = (
         _asked(
             ("chi2, held against 1.001 of the best known", "chi2/gtsam-lm"),
             ("proved gap to the optimum", "certificate_gap/gtsam-lm"),
-            ("process time", "cpu_s/gtsam-lm"),
+            ("CPU time", "cpu_s/gtsam-lm"),
         ),
         needs="posegraphs/city10000.g2o",
     ),
@@ -305,11 +315,11 @@ TOPICS = (
         "false loops on intel, `gtsam-gnc`, ten seeds",
         (_study("false-loops-intel"),),
         _asked(
-            ("10 and 40 % false: share of seeds within 5 cm", "within_5_cm mean/*"),
+            ("10 and 40 % false: share of seeds with an ATE within 5 cm", "within_5_cm mean/*"),
             ("10 and 40 % false: ATE", "ate_m/*10 %/* | ate_m/*40 %/*"),
             ("10 and 40 % false: true loops lost", "own_lost_percent/*"),
             ("10 and 40 % false: false loops kept", "false_kept/*"),
-            ("70 % false: ATE, medians of the seeds", "ate_m median/*70 %/*"),
+            ("70 % false: ATE, median over the seeds", "ate_m median/*70 %/*"),
             ("70 % false: ATE", "ate_m/*70 %/*"),
         ),
         needs="posegraphs/intel.g2o",
@@ -330,20 +340,20 @@ TOPICS = (
     ),
     Topic(
         "bent-odometry",
-        "intel and manhattanOlson3500 with odometry bent by 3.4 deg/m, `gtsam-calibrated`",
+        "intel and manhattanOlson3500 with a heading bias of 3.4 deg/m added to the odometry, `gtsam-calibrated`",
         (_study("bent-odometry"),),
         _asked(("ATE", "ate_m/*gtsam-calibrated"), ("true loops lost", "own_lost_percent/*gtsam-calibrated")),
         needs="posegraphs/intel.g2o",
     ),
     Topic(
         "cells",
-        "the cells against exact integration over 230 m",
+        "cells compared with exact integration over 230 m",
         (Step('python -m pytest -q -m slow tests/neural -k "230_m"', holds="within_their_bars"),),
         _asked(("modules within 0.5 % of their spacing, position within 0.3 mm, three seeds", "within_their_bars")),
     ),
     Topic(
         "verify",
-        "the cells against physiology, three seeds",
+        "cells compared with physiology, three seeds",
         tuple(
             Step(f"hybridmap verify --seed {seed} --out verify-{seed}", own_bars=True, wall_bar_s=180.0)
             for seed in (1, 7, 2026)
@@ -365,46 +375,46 @@ TOPICS = (
     ),
     Topic(
         "calibration",
-        "calibrated odometry in % of raw, tested on the second half of each log",
+        "end error of calibrated odometry in % of that of raw odometry, on the second half of each log",
         (Step("python tools/calibration_study.py --data $HYBRIDMAP_DATA/real --out $OUT", own_bars=True),),
         _asked(
             ("fr079 and aces, windows of 16.8 m", "end_error/fr079-16.8m-* | end_error/aces-16.8m-*"),
             ("fr079 and aces, windows of 70 m", "end_error/fr079-70m-* | end_error/aces-70m-*"),
-            ("five robots with motion capture", "end_error/mrclam6-*"),
-            ("of them, better than raw", "better/mrclam6-*"),
+            ("five robots with motion capture, windows of 16.8 m", "end_error/mrclam6-*"),
+            ("number of these robots that calibration improves", "better/mrclam6-*"),
         ),
         needs="real/mrclam6",
     ),
     Topic(
         "cost-backends",
-        "back-ends, ratios of process time within one run",
+        "CPU time of the back-ends, as ratios within one run",
         (Step("python tools/backend_bench.py sweep overhead gnc isam2 --data $HYBRIDMAP_DATA", own_bars=True),),
         _asked(
-            ("a sweep of relaxation, times as fast as plain Python", "speed/relaxation-*"),
-            ("`gtsam-lm` over bare GTSAM", "overhead/*"),
-            ("`gtsam-gnc`, times as fast as GTSAM's own, each against its bar", "speed_gnc/*"),
-            ("updates of `gtsam-isam2` a batch optimisation", "updates_a_batch/*"),
-            ("chi2 of its last update, of batch", "chi2_last_update/* | chi2_at_the_end/*"),
+            ("sweep of relaxation, times as fast as plain Python", "speed/relaxation-*"),
+            ("`gtsam-lm` over GTSAM alone", "overhead/*"),
+            ("`gtsam-gnc`, times as fast as GTSAM's own GNC", "speed_gnc/*"),
+            ("one batch optimisation over the median update of `gtsam-isam2`", "updates_a_batch/*"),
+            ("chi2 of `gtsam-isam2` over that of batch", "chi2_last_update/* | chi2_at_the_end/*"),
         ),
         needs="posegraphs/city10000.g2o",
     ),
     Topic(
         "speed-cells",
-        "the cells, in one run on one core",
+        "speed of the cells on one core",
         (Step("python tools/bench_neural.py", own_bars=True),),
         _asked(
-            ("sheets, times as fast as plain `numpy.fft`", "sheets_over_baseline/*"),
-            ("front-end at 100 Hz, times real time", "x_real_time_at_100_Hz/*"),
+            ("sheets of grid cells, times as fast as plain `numpy.fft`", "sheets_over_baseline/*"),
+            ("path integrator at 100 Hz, times real time", "x_real_time_at_100_Hz/*"),
         ),
     ),
     Topic(
         "speed-matching",
-        "search for known places, 1,000 to 100,000 nodes",
+        "search for known places among 1,000 to 100,000 nodes",
         (Step("python tools/bench_matching.py", own_bars=True),),
         _asked(
-            ("time over bare `cv2.batchDistance`", "search_over_bare/*"),
+            ("time over that of `cv2.batchDistance` alone", "search_over_bare/*"),
             ("times as fast as plain numpy", "numpy_over_search/*"),
-            ("gated, time over that at the smallest map", "gated_against_the_smallest/*"),
+            ("time of a gated search over that on the smallest map", "gated_against_the_smallest/*"),
         ),
     ),
 )
@@ -427,12 +437,12 @@ PARTS = {
     "Cells and odometry": ("cells", "verify", "calibration"),
     "Speed": ("cost-backends", "speed-cells", "speed-matching"),
 }
-"""Headings of the page and their topics."""
+"""Heading on the page -> names of its topics."""
 
 
 @dataclass(frozen=True)
 class Headline:
-    """A line of the README's table: one figure of odometry and of the primary back-end, both in m."""
+    """A line of the table in the README: one error of odometry and of the map, both in m."""
 
     topic: str
     label: str

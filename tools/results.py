@@ -1,12 +1,13 @@
-"""Run the commands behind every figure that the project claims; write `docs/results.md` and the README's table.
+"""Run the commands behind every figure that the project claims. Write `docs/results.md` and the table of the README.
 
-    python tools/results.py                  everything (what lacks its recordings is left as it was)
-    python tools/results.py --only demo      some of it; the rest keeps what was found before
-    python tools/results.py --list           names and commands
-    python tools/results.py --page           write the page and the README's table again, and run nothing
+    python tools/results.py                  run every topic
+    python tools/results.py --only demo      run some topics; the others keep their figures
+    python tools/results.py --list           print the names and commands of the topics
+    python tools/results.py --page           write the page and the table again without running anything
 
-What was found is kept in `docs/results.csv`, a line a figure: its value (of a study: of every seed), median, worst, bar, day
-and machine. The page has a line a question. Recordings are looked for in `$HYBRIDMAP_DATA`, else in `../shared/data`.
+The figures are kept in `docs/results.csv`, one line each: value, median, worst, bar, day and machine. A figure of a study has
+one value for each seed. The page sums up the figures, with one line for each question. A topic whose recordings are missing is
+left as it was. The folder of recordings is `$HYBRIDMAP_DATA`, or `../shared/data` if that is not set.
 """
 
 from __future__ import annotations
@@ -44,11 +45,11 @@ Row = dict[str, str]
 
 
 def main() -> None:
-    """Parse the command line, run, write."""
+    """Run the topics given on the command line and write the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=[topic.name for topic in TOPICS], help="these alone")
-    parser.add_argument("--list", action="store_true", help="name them with their commands and stop")
-    parser.add_argument("--page", action="store_true", help="run nothing")
+    parser.add_argument("--only", nargs="+", choices=[topic.name for topic in TOPICS], help="topics to run; default: all")
+    parser.add_argument("--list", action="store_true", help="print the topics and their commands, and run nothing")
+    parser.add_argument("--page", action="store_true", help="write the page and the table again, and run nothing")
     arguments = parser.parse_args()
     if arguments.list:
         print("\n".join(f"{topic.name}: {step.command}" for topic in TOPICS for step in topic.steps))
@@ -66,7 +67,7 @@ def main() -> None:
 
 
 def recorded() -> list[Row]:
-    """What was found so far."""
+    """Return the recorded figures."""
     if not RECORD.is_file():
         return []
     with RECORD.open(encoding="utf-8", newline="") as file:
@@ -74,7 +75,7 @@ def recorded() -> list[Row]:
 
 
 def write(rows: list[Row]) -> None:
-    """The record, the page and the README's table."""
+    """Write the record, the page and the table of the README."""
     order = {topic.name: number for number, topic in enumerate(TOPICS)}
     rows = sorted((row for row in rows if row["topic"] in order), key=lambda row: order[row["topic"]])
     text = io.StringIO()
@@ -87,12 +88,12 @@ def write(rows: list[Row]) -> None:
 
 
 def data_folder() -> Path:
-    """Where the recordings are, if they are anywhere."""
+    """Return the folder of recordings. It may not exist."""
     return Path(os.environ.get("HYBRIDMAP_DATA") or ROOT.parent / "shared" / "data")
 
 
 def run(topic: Topic) -> list[Row]:
-    """Run the steps of a topic in an empty folder; what each of its figures came to."""
+    """Run the steps of a topic in an empty folder. Return one row for each figure."""
     rows: list[Row] = []
     seen = {"topic": topic.name, "machine": machine(), "day": time.strftime("%Y-%m-%d", time.gmtime())}
     with tempfile.TemporaryDirectory() as folder:
@@ -106,7 +107,7 @@ def run(topic: Topic) -> list[Row]:
 
 
 def execute(step: Step, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run one command; `$HYBRIDMAP_DATA` in it is the folder of recordings."""
+    """Run one command. `$HYBRIDMAP_DATA` in it stands for the folder of recordings."""
     program, *arguments = shlex.split(step.command.replace(DATA, str(data_folder())).replace("$OUT", str(folder)))
     cwd = ROOT if program == "python" else folder
     command = [*PROGRAMS[program], *arguments, *(["--json"] if step.figures or step.own_bars else [])]
@@ -118,7 +119,7 @@ def execute(step: Step, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 def read(step: Step, done: subprocess.CompletedProcess[str], elapsed_s: float, hashes: list[str], folder: Path) -> list[Row]:
-    """The rows that a step gives: its figures, its wall time if asked for, whether it passed, whether its graph is the same."""
+    """Return the rows of a step: its figures and, where asked for, its success, wall time, and comparison of graphs."""
     rows = []
     if step.study:
         rows += [study_row(step, line) for line in csv.DictReader((folder / step.study / "bars.csv").open(encoding="utf-8"))]
@@ -144,12 +145,12 @@ def read(step: Step, done: subprocess.CompletedProcess[str], elapsed_s: float, h
 
 
 def figure_row(step: Step, figure: Figure, name: str, metric: dict[str, Any]) -> Row:
-    """One figure of a command, held against the bar that it is given here."""
+    """Return the row of a figure whose bar stands in `result_studies`."""
     return row(step, name, metric["value"], metric["unit"], "at least" if figure.at_least else "at most", figure.bar)
 
 
 def own_row(step: Step, metric: dict[str, Any]) -> Row:
-    """One figure that the command itself holds against a bar; its description says on which side it must lie."""
+    """Return the row of a figure with a bar of the command itself. Its description says `at least` or `at most`."""
     side = "at least" if f"at least {metric['bar']:g}" in metric["description"] else "at most"
     return row(step, metric["name"], metric["value"], metric["unit"], side, metric["bar"]) | {
         "passed": "yes" if metric["passed"] else "no"
@@ -157,7 +158,7 @@ def own_row(step: Step, metric: dict[str, Any]) -> Row:
 
 
 def study_row(step: Step, line: Row) -> Row:
-    """A line of a study's `bars.csv`."""
+    """Return the row of a line of `bars.csv` of a study."""
     rate = f"{line['false_loop_kind']} {100 * float(line['false_loop_rate']):g} %" if line["false_loop_kind"] else ""
     where = "/".join(part for part in (line["source"], line["setting"], rate, line["backend"]) if part)
     found = {name: line[name] for name in ("unit", "values", "median", "worst", "side", "bar", "passed")}
@@ -168,7 +169,7 @@ def study_row(step: Step, line: Row) -> Row:
 
 
 def row(step: Step, figure: str, value: float | None, unit: str, side: str, bar: float | None) -> Row:
-    """A line of the record with one value."""
+    """Return a row with one value."""
     text = "" if value is None else f"{value:.6g}"
     passed = None if bar is None else value is not None and (value >= bar if side == "at least" else value <= bar)
     return {
@@ -185,7 +186,7 @@ def row(step: Step, figure: str, value: float | None, unit: str, side: str, bar:
 
 
 def machine() -> str:
-    """What it was seen on."""
+    """Describe this machine: processor, load, system and versions."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():
@@ -197,13 +198,14 @@ def machine() -> str:
 
 
 def page(rows: list[Row]) -> str:
-    """The Markdown page: a line a question."""
+    """Return the Markdown page. It has one line for each question."""
     lines = [
         "# Results",
         "",
-        "What the project claims, a line a question: the median and the worst of so many figures, and the bar that every one",
-        "of them is held against. Each figure, of each seed, with its command, day and machine: [results.csv](results.csv).",
-        f"Written by `tools/results.py`; do not edit. `{DATA}` is the folder of recordings.",
+        "This page shows the figures behind the claims of the project. Each line gives the number of figures, their median,",
+        "the worst of them, and the bar that each of them must meet. [results.csv](results.csv) holds every figure of every",
+        "seed with its command, day and machine. `tools/results.py` writes this page; do not edit it by hand.",
+        f"`{DATA}` is the folder of recordings.",
     ]
     for part, names in PARTS.items():
         found = [line for topic in TOPICS if topic.name in names for line in table(topic, rows)]
@@ -213,7 +215,7 @@ def page(rows: list[Row]) -> str:
 
 
 def table(topic: Topic, rows: list[Row]) -> list[str]:
-    """The lines of a topic's questions; those of which nothing is recorded are left out."""
+    """Return one line for each question of a topic that has recorded figures."""
     lines = []
     for number, question in enumerate(topic.questions):
         asked = [row for row in rows if row["topic"] == topic.name and is_of(row, question)]
@@ -224,14 +226,14 @@ def table(topic: Topic, rows: list[Row]) -> list[str]:
 
 
 def is_of(found: Row, question: Question) -> bool:
-    """Whether a figure is one that a question sums up."""
+    """Tell whether a figure belongs to a question."""
     return any(fnmatchcase(found["figure"], pattern) for pattern in question.figures)
 
 
 def line(what: str, rows: list[Row]) -> str:
-    """One line of the page: the median and the worst of all figures, and their bar.
+    """Return one line of the page: the number of figures, their median, the worst, and the bar.
 
-    Where a bar is on the mean or the median over the seeds, each of them is one figure.
+    Each seed is one figure. A mean or median over the seeds that has a bar of its own is one figure.
     """
     shown = [found for found in rows if found["side"] == rows[0]["side"]]
     single = any(" mean/" in found["figure"] or " median/" in found["figure"] for found in shown)
@@ -249,7 +251,7 @@ def line(what: str, rows: list[Row]) -> str:
 
 
 def bar_text(rows: list[Row], unit: str) -> str:
-    """The bar, or both; where each figure has one of its own, how near the worst of them comes to it."""
+    """Return the bar as text. If the figures have different bars, give the worst figure in % of its own bar."""
     texts = []
     for side, sign in (("at least", ">="), ("at most", "<=")):
         held = [found for found in rows if found["bar"] and found["side"] == side]
@@ -262,7 +264,7 @@ def bar_text(rows: list[Row], unit: str) -> str:
 
 
 def commands(rows: list[Row]) -> list[str]:
-    """What to type for each topic, and where and when it was seen."""
+    """Return the last part of the page: the command of each topic, and the day and machine of its figures."""
     lines = ["", "## Commands", "", "| of | commands | seen |", "|---|---|---|"]
     machines = list(dict.fromkeys(bare(found["machine"]) for found in rows))
     for topic in TOPICS:
@@ -275,13 +277,13 @@ def commands(rows: list[Row]) -> list[str]:
 
 
 def bare(name: str) -> str:
-    """A machine, whatever else ran on it."""
+    """Return the description of a machine without its load."""
     before, _, after = name.partition(" (load ")
     return before + after.partition(")")[2]
 
 
 def with_headlines(readme: str, rows: list[Row]) -> str:
-    """The README with its table of results brought up to what was found."""
+    """Return the README with its table of results brought up to date."""
     before, rest = readme.split(HEADLINES_BEGIN)
     _, after = rest.split(HEADLINES_END)
     lines = ["| | odometry | mapped |", "|---|---:|---:|"]

@@ -118,9 +118,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", help="recording to map")
     parser.add_argument("--config", default="laser", help="configuration whose settings are changed")
-    parser.add_argument(
-        "--relations", type=Path, help="file of verified relations; needed if the recording has no ground truth"
-    )
+    parser.add_argument("--relations", type=Path, help="file of verified relations; needed where there is no ground truth")
     parser.add_argument("--end", type=float, help="map only the first so many seconds")
     parser.add_argument("--out", type=Path, default=SENSITIVITY, help="CSV file to which rows are added")
     return parser

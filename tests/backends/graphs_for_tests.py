@@ -13,7 +13,7 @@ SIGMA = np.array([0.03, 0.02, 0.01])
 
 
 def laps(rng, nodes=60, per_lap=20, noise=1.0, every=1):
-    """A robot that drives round and round; node k sees node k - per_lap again. Returns the graph and the true poses."""
+    """Make the graph of a robot that drives in laps. A loop joins node k to node k - per_lap. Return it and the true poses."""
     way = [np.zeros(3)]
     for _ in range(nodes - 1):
         way.append(compose(way[-1], [0.5, 0.05, 2 * np.pi / per_lap]))
@@ -25,7 +25,7 @@ def laps(rng, nodes=60, per_lap=20, noise=1.0, every=1):
 
 
 def star(degree):
-    """A hub with as many spokes, and loops along the rim."""
+    """Make a graph of one hub with `degree` spokes. Loops join the ends of neighbouring spokes."""
     truth = np.array([[0.0, 0.0, 0.0]] + [[np.cos(a), np.sin(a), a] for a in np.linspace(0, 6, degree)])
     pairs = [(0, k, EdgeKind.ODOMETRY) for k in range(1, degree + 1)]
     pairs += [(k, k + 1, EdgeKind.LOOP) for k in range(1, degree)]
@@ -33,7 +33,7 @@ def star(degree):
 
 
 def graph_of(truth, pairs, rng, noise=1.0):
-    """Measure pairs (source, target, kind) of true poses with noise; `initial` is the chain."""
+    """Make a graph of noisy relative poses between pairs (source, target, kind). `initial` is the chain."""
     sources, targets = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
     count = len(pairs)
     twists = rng.normal(size=(count, 3)) * SIGMA * noise

@@ -1,4 +1,4 @@
-"""Drives with a known calibration."""
+"""Drives whose calibration is known."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ COVARIANCE = np.diag([1e-4, 1e-4, 3e-5])
 
 @dataclass(frozen=True)
 class Drive:
-    """True poses (S + 1, 3) and raw odometry at the same instants."""
+    """A drive: true poses (S + 1, 3), and raw odometry at the same times."""
 
     truth: np.ndarray
     motion: Motion
 
 
 def drive(rng, laps=4, gains=GAINS, noise=1.0, drop_outs=0):
-    """Round and round a room of 8 x 5 m at 0.5 m/s, turning in place in the corners, now the one way and now the other.
+    """Drive laps around a room of 8 x 5 m at 0.5 m/s. The robot turns in place in the corners. Each lap changes direction.
 
-    `noise` scales a random walk of heading of 0.4 deg per sqrt(m) and 1 % of way; a drop-out is one step
+    `noise` scales the noise of the odometry: 0.4 deg per sqrt(m) of heading and 1 % of the way. A drop-out is one step that is
     wrong by 0.5 m and 20 deg.
     """
     steps = []
@@ -50,19 +50,19 @@ def drive(rng, laps=4, gains=GAINS, noise=1.0, drop_outs=0):
 
 
 def along(rng, steps, noise=1.0):
-    """A drive of given true steps (S, 3), its odometry right but for `noise` as in `drive`."""
+    """Make a drive of given true steps (S, 3). Its odometry has only the noise; `noise` scales it as in `drive`."""
     true = np.asarray(steps, dtype=np.float64)
     raw = true + noise * rng.normal(size=true.shape) * [0.002, 0.0, np.radians(0.4) * np.sqrt(0.05)]
     return Drive(chain(true), Motion(np.arange(len(true) + 1) * STEP_NS + 7, raw))
 
 
 def circle(rng, step_m=0.02, turn_rad=0.05, steps=2000, noise=1.0):
-    """Round and round at one speed and one rate of turn: bias and turn gain do the same."""
+    """Drive on a circle at constant speed. Heading bias and turn gain then have the same effect."""
     return along(rng, [(step_m, 0.0, turn_rad)] * steps, noise)
 
 
 def sighting(one, rng=None, every=10, delay_s=0.0):
-    """The true poses every second; with noise of 1 cm and 0.3 deg, stamped late by a delay."""
+    """Observe the true pose every second. The noise is 1 cm and 0.3 deg, and the stamps are late by `delay_s`."""
     chosen = np.arange(every, len(one.truth) - every, every)
     share = delay_s * 1e9 / STEP_NS
     whole = int(np.floor(share))
@@ -73,9 +73,9 @@ def sighting(one, rng=None, every=10, delay_s=0.0):
 
 
 def experience_map(one, rng, every=10, registered=False):
-    """Nodes each second, odometry edges as neutral gains have them, true loops with noise where a place is seen again.
+    """Make a map with one node per second, odometry edges of raw odometry, and true loops with noise at places seen again.
 
-    Returns the map and the index of each node among the odometry's instants.
+    Return the map and the index of each node in the odometry.
     """
     chosen = np.arange(0, len(one.truth), every)
     raw = chain(one.motion.steps)
@@ -105,7 +105,7 @@ def _seen_again(truth, number, registered):
 
 
 def write_session(folder, one, rng, registered=True, gains=None, changes=(), poses=None, sensors="{}", rig=None):
-    """A session folder around a drive; the stored odometry is what the given gains make of the raw one."""
+    """Write a session folder for a drive. The stored odometry is the raw one corrected by `gains`."""
     from hybridmap.backends.base import SolveReport, SolveStatus
     from hybridmap.odometry_model import NEUTRAL, apply
 

@@ -1,4 +1,4 @@
-"""Drives for the tests: increments and the exact path they make."""
+"""Drives for the tests: the motion at each step, and the exact path."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from hybridmap import geometry
 
 
 def arc(v_m_s: float, omega_rad_s: float, dt_s: float) -> np.ndarray:
-    """Pose after one step, seen from before it, by the mid-point heading."""
+    """Return the motion (3,) of one step in the frame before it, with the mid-point heading."""
     ds, dyaw = v_m_s * dt_s, omega_rad_s * dt_s
     return np.array([ds * np.cos(dyaw / 2), ds * np.sin(dyaw / 2), dyaw])
 
 
 def wander(seed: int, distance_m: float, dt_s: float = 1 / 30, v_m_s: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
-    """Wander through a 10 x 3 m room: increments (N, 3) and the exact poses (N, 3) after each."""
+    """Wander through a room of 10 x 3 m. Return the motion (N, 3) of each step and the exact pose (N, 3) after it."""
     rng = np.random.default_rng(seed)
     pose, omega = np.zeros(3), 0.0
     deltas, poses = [], []

@@ -1,4 +1,4 @@
-"""Small sessions for the tests of everything that reads one."""
+"""Small sessions for the tests of code that reads a session."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ RIG = Rig(camera=CAMERA, laser=LASER)
 
 
 def truth_at(stamp_ns: np.ndarray) -> np.ndarray:
-    """A circle of 2 m radius, once round in 40 s."""
+    """Return true poses on a circle of radius 2 m. One round takes 40 s."""
     angle = 2 * np.pi * np.asarray(stamp_ns) / (40 * SECOND)
     return np.stack([2 * np.sin(angle), 2 - 2 * np.cos(angle), (angle + np.pi) % (2 * np.pi) - np.pi], axis=-1)
 
 
 def odometry_of(truth: np.ndarray, bias_rad_per_m: float = 0.03) -> np.ndarray:
-    """Dead reckoning with a heading bias."""
+    """Return dead reckoning with a heading bias."""
     poses = [truth[0]]
     for step in between(truth[:-1], truth[1:]):
         length = np.hypot(step[0], step[1])
@@ -38,7 +38,10 @@ def odometry_of(truth: np.ndarray, bias_rad_per_m: float = 0.03) -> np.ndarray:
 
 
 def ring_map(laps: float = 1.5, *, loops: bool = True, false_loop: bool = False) -> ExperienceMap:
-    """A map of the circle: a node a second, odometry edges, and loop edges of the true relative pose one lap apart."""
+    """Make a map of the circle with one node per second.
+
+    It has odometry edges. Loops with the true relative pose join nodes one lap apart.
+    """
     count = int(40 * laps)
     stamps = np.arange(count) * SECOND
     truth = truth_at(stamps)
@@ -64,7 +67,7 @@ def ring_map(laps: float = 1.5, *, loops: bool = True, false_loop: bool = False)
 
 
 def laser_ranges(pose: np.ndarray, half_m: float = 5.0) -> np.ndarray:
-    """Ranges to the walls of a square room of 10 m centred on (0, 2)."""
+    """Return the ranges to the walls of a square room of 10 m, centred on (0, 2)."""
     yaw = pose[2] + LASER.bearings_rad
     origin = compose(pose, LASER.pose_base_laser)[:2] - [0.0, 2.0]
     with np.errstate(divide="ignore"):
@@ -75,7 +78,7 @@ def laser_ranges(pose: np.ndarray, half_m: float = 5.0) -> np.ndarray:
 
 
 def keyframe_of(node: int, truth: np.ndarray) -> dict[str, np.ndarray]:
-    """Laser ranges, a colour picture and a wall 2 m ahead in depth."""
+    """Make a keyframe: laser ranges, a colour image, and a depth image of a wall 2 m ahead."""
     color = np.full((24, 32, 3), [200, node % 256, 10], np.uint8)
     depth = np.full((24, 32), 2000, np.uint16)
     depth[:2] = 0
@@ -91,7 +94,7 @@ def write_session(
     keyframes: bool = True,
     ended: bool = True,
 ) -> SessionFolder:
-    """A whole session folder around a map; the `solver` of its one back-end knows the truth."""
+    """Write a whole session folder for a map. The trajectory of its one back-end is the true one."""
     session = SessionFolder(folder)
     with session.writing():
         session.write_config("backends:\n  names: [gtsam-lm]\n")

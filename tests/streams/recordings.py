@@ -1,4 +1,4 @@
-"""Tiny bags for the tests: one description of the messages, written as ROS 1 bag, mcap or sqlite3."""
+"""Tiny bags for the tests. The same messages can be written as a ROS 1 bag, as mcap or as sqlite3."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NS = 1_000_000_000
 
 @cache
 def _types(ros1: bool) -> tuple[Any, SimpleNamespace]:
-    """The type store, and its messages by their short names."""
+    """Return the type store, and its message types by their short names."""
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
     if ros1:
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
@@ -32,7 +32,7 @@ def _types(ros1: bool) -> tuple[Any, SimpleNamespace]:
 
 @dataclass
 class Recording:
-    """Messages in the order of recording; `bag_ns` counts on by itself, for header stamps are another matter."""
+    """Messages in the order of recording. `bag_ns` is the time of recording; it does not depend on header stamps."""
 
     ros1: bool = False
     messages: list[tuple[str, str, Any]] = field(default_factory=list)
@@ -162,7 +162,7 @@ class Recording:
         self.messages.append((topic, "sensor_msgs/msg/CameraInfo", message))
 
     def write(self, path: Path, *, folder: bool = False) -> Path:
-        """Write a `.bag`, or a bare `.mcap` / `.db3` file, or with `folder` the whole ROS 2 folder."""
+        """Write a `.bag`, `.mcap` or `.db3` file. With `folder`, write a whole ROS 2 bag folder."""
         if path.suffix == ".bag":
             with Writer1(path) as writer:
                 self._fill(writer, self.store.serialize_ros1)
@@ -187,7 +187,7 @@ class Recording:
 
 
 def laser_drive(ros1: bool = False, steps: int = 6) -> Recording:
-    """A straight drive with odometry, scans and a laser mounted ahead of the base."""
+    """Record a straight drive with odometry and scans. The laser is mounted ahead of the base."""
     recording = Recording(ros1)
     recording.transform("base_link", "laser", (0.2, 0.0, 0.3))
     for i in range(steps):
@@ -201,19 +201,19 @@ OPTICAL_XYZW = (-0.5, 0.5, -0.5, 0.5)
 
 
 def color_pixels(seed: int = 0, size: tuple[int, int] = (8, 6)) -> np.ndarray:
-    """(H, W, 3) uint8 noise."""
+    """Make a colour image (H, W, 3) uint8 of noise."""
     return np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
 
 
 def depth_mm(seed: int = 0, size: tuple[int, int] = (8, 6)) -> np.ndarray:
-    """(H, W) uint16 depth in mm, some of it 0."""
+    """Make a depth image (H, W) uint16 in mm. Some pixels are 0, without depth."""
     values = np.random.default_rng(seed + 100).integers(500, 5000, (size[1], size[0]), dtype=np.uint16)
     values[0, :3] = 0
     return values
 
 
 def rgbd_drive(ros1: bool = False, frames: int = 3) -> Recording:
-    """A straight drive with odometry and registered colour and depth of 8 x 6 pixels."""
+    """Record a straight drive with odometry and registered colour and depth images of 8 x 6 pixels."""
     recording = Recording(ros1)
     recording.transform("base_link", "camera_optical", (0.1, 0.0, 0.5), OPTICAL_XYZW)
     for i in range(frames):

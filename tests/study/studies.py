@@ -1,4 +1,4 @@
-"""Small studies, and what may be sent to another process: the work of a pool is found by its name."""
+"""Small studies, and work for a pool of processes. A process finds its work by name, so the functions stand in a module."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TREE = {
 
 
 def small(**changes: object) -> StudyConfig:
-    """A study of 2 seeds x 3 back-ends x (no, random, aliased false loops) on a made-up graph."""
+    """Make a study of 2 seeds x 3 back-ends x (no, random, aliased false loops) on a synthetic graph."""
     return StudyConfig.from_tree(TREE | changes, "small.yaml", Path.cwd())
 
 
@@ -28,14 +28,14 @@ def double(number: int) -> int:
 
 
 def picky(number: int) -> int:
-    """Work that raises at 3."""
+    """Work that raises an error for the number 3."""
     if number == 3:
         raise ValueError("not this\none")
     return 2 * number
 
 
 def deadly(task: tuple[int, str]) -> int:
-    """Work that kills its process at 3, as often as there are files named after it to be eaten."""
+    """Work that kills its process once for each file named `NUMBER-*`. It deletes the file first."""
     number, marks = task
     for mark in sorted(Path(marks).glob(f"{number}-*")):
         mark.unlink()
@@ -44,5 +44,5 @@ def deadly(task: tuple[int, str]) -> int:
 
 
 def threads(_: int) -> str:
-    """How many threads a worker's libraries may use."""
+    """Return the limits on threads of the libraries in a worker."""
     return os.environ["OMP_NUM_THREADS"] + os.environ["OPENBLAS_NUM_THREADS"]

@@ -1,4 +1,4 @@
-"""A verification of the cells that runs in seconds."""
+"""The scale of a verification of the cells that takes only seconds."""
 
 from hybridmap.verification import Scale
 

@@ -6,5 +6,5 @@ from tests.verification.cells_for_tests import TINY
 
 @pytest.fixture(scope="session")
 def result():
-    """A small verification of the cells, seed 3."""
+    """Verify the cells at a small scale with seed 3."""
     return verify_cells(3, TINY, {})

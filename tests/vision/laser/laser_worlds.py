@@ -1,4 +1,4 @@
-"""Small worlds of line segments, cast in numpy, and drives through them."""
+"""Small worlds of line segments, simulated laser scans of them, and drives through them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def box(x0, y0, x1, y1):
 
 
 def room():
-    """8 x 6 m with furniture, no symmetry."""
+    """A room of 8 x 6 m with furniture and without symmetry."""
     return np.array(
         [
             *box(-4, -3, 4, 3),
@@ -36,12 +36,12 @@ def room():
 
 
 def corridor(length=80.0):
-    """Two bare walls 2.4 m apart; no end in sight from the middle."""
+    """Two bare walls 2.4 m apart. The ends are out of sight from the middle."""
     return np.array([(-length / 2, -1.2, length / 2, -1.2), (-length / 2, 1.2, length / 2, 1.2)])
 
 
 def ring():
-    """A corridor 2 m wide round a block of 12 x 8 m, with niches and pillars that differ everywhere."""
+    """A corridor 2 m wide around a block of 12 x 8 m. No two places look alike."""
     rng = np.random.default_rng(5)
     walls = [*box(-8, -6, 8, 6), *box(-6, -4, 6, 4)]
     for x in (-7.0, -4.6, -1.3, 1.9, 5.2):
@@ -57,7 +57,7 @@ def ring():
 
 
 def cast(world, pose, rng=None, laser=LASER, sigma_m=0.01):
-    """Ranges (B,) float32 from a pose of `base_link`; NaN where no wall is met."""
+    """Return the ranges (B,) float32 from a pose of `base_link`. A beam that meets no wall gives NaN."""
     x, y, yaw = compose(pose, laser.pose_base_laser)
     angle = yaw + laser.bearings_rad
     dx, dy = np.cos(angle)[:, None], np.sin(angle)[:, None]
@@ -76,7 +76,7 @@ def cast(world, pose, rng=None, laser=LASER, sigma_m=0.01):
 
 
 def ring_drive(laps, step_m=0.1):
-    """Poses (N, 3) round the ring, counter-clockwise, turning on the spot at the corners."""
+    """Return poses (N, 3) of a counter-clockwise drive around the ring. The robot turns on the spot at the corners."""
     corners = [(-7.0, -5.0), (7.0, -5.0), (7.0, 5.0), (-7.0, 5.0)]
     poses = []
     for leg in range(round(4 * laps)):
@@ -88,7 +88,7 @@ def ring_drive(laps, step_m=0.1):
 
 
 def drifting(poses, rng, bias_deg_per_m=1.0, noise_deg=0.05, gain=1.01):
-    """What wheels would say of a drive: a gain, a heading bias per metre, white noise; starts at the first pose."""
+    """Return odometry of a drive, from the first pose on, with a gain, a heading bias per metre and white noise."""
     out = [poses[0]]
     for a, b in pairwise(poses):
         step = between(a, b)
@@ -99,7 +99,7 @@ def drifting(poses, rng, bias_deg_per_m=1.0, noise_deg=0.05, gain=1.01):
 
 
 class Run:
-    """A drive through a world; the belief is the chain itself: proposals need no solver."""
+    """Run the laser front-end on a drive through a world. No solver runs: the belief has the poses of the chain."""
 
     def __init__(self, world, truth, odometry, every=5, config=None, seed=0):
         rng = np.random.default_rng(seed)

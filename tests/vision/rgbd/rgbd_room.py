@@ -1,4 +1,4 @@
-"""A textured box room with a cupboard, ray-cast in plain numpy."""
+"""A textured rectangular room with a cupboard, rendered by ray casting in numpy."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def textures(seed=0):
 
 
 def render(view, pose, table=None, stamp_ns=0, noise=0.0, rng=None):
-    """Frame of a camera on a robot at `pose` (3,)."""
+    """Render the frame of a camera on a robot at `pose` (3,)."""
     table = textures() if table is None else table
     v, u = np.mgrid[0 : view.height_px, 0 : view.width_px]
     rays = np.stack([(u - view.cx_px) / view.fx_px, (v - view.cy_px) / view.fy_px, np.ones_like(u, float)], axis=-1)
