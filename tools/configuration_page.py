@@ -47,11 +47,11 @@ INTRODUCTION = """# Settings
 
 A configuration is a YAML file of sections, as in `configs/`. `--config NAME_OR_FILE` chooses one, and
 `--set SECTION.KEY=VALUE` sets one setting on top. Command line > file > default. A file may begin with `extends: OTHER`.
-An unknown key is refused; one that has gone says what became of it. The resolved configuration is saved with every
-session as `config.yaml`.
+An unknown key is refused. For a key of an older version the error says what became of it. The resolved configuration
+is saved with every session as `config.yaml`.
 
-There are {count} settings; a mounting or calibration, which is given as a whole or not at all, counts as one. Whatever else
-decides something is a named constant beside the code that uses it, with the reason for its value.
+There are {count} settings. A mounting or a calibration is given as a whole or not at all, and counts as one. All other
+parameters are named constants in the code, each with the reason for its value.
 This page is written by `python tools/configuration_page.py`.
 """
 
@@ -128,10 +128,10 @@ def _sensitive() -> list[str]:
     tried = len({row["setting"] for row in rows})
     head = (
         "## Which of them matter\n\n"
-        f"`python tools/sensitivity.py` moved each of {tried} numeric settings by 30 % up and down, on the first\n"
-        "200 s of aces by laser (mean relation error) and on the simulated laboratory by RGB-D (ATE), with the\n"
-        "primary back-end alone. These changed the error of the map by more than 2 %; all are in\n"
-        "[sensitivity.csv](sensitivity.csv).\n"
+        f"`python tools/sensitivity.py` raised and lowered each of {tried} numeric settings by 30 %. The maps\n"
+        "are of the first 200 s of aces by laser (mean relation error) and of the simulated laboratory by RGB-D (ATE).\n"
+        "Only the primary back-end ran. The table shows the settings that changed the error of a map by more than 2 %.\n"
+        "[sensitivity.csv](sensitivity.csv) holds all of them.\n"
     )
     table = ["| setting | recording | value | error | as it is | change |\n|---|---|---|---|---|---|"]
     for row in matter:
