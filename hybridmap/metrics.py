@@ -1,4 +1,4 @@
-"""A figure with its name, unit and meaning. One list gives the table for people and the JSON for programs."""
+"""A measured value with its name, unit and meaning. One list of them gives the table for people and the JSON for programs."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """One figure.
+    """One measured value.
 
     Attributes:
-        name: `<measure>/<backend or stage>`, e.g. `ate_rmse/gtsam-gnc`.
+        name: `<measure>/<back-end or processing stage>`, e.g. `ate_rmse/gtsam-gnc`.
         value: NaN if it could not be computed.
         unit: `m`, `deg`, `s`, `1`, ...
         description: one line for people.
-        bar: the limit of the figure, if any.
-        passed: whether the figure keeps its bar.
+        bar: the limit that the value must keep, None without one.
+        passed: whether the value keeps the limit, None without one.
     """
 
     name: str
@@ -32,7 +32,7 @@ class Metric:
     passed: bool | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; a value that is not finite becomes null, as JSON has no NaN."""
+        """The metric as a dictionary of JSON values; a value that is not finite becomes null, as JSON has no NaN."""
         row: dict[str, Any] = {
             "name": self.name,
             "value": self.value if math.isfinite(self.value) else None,
@@ -129,22 +129,28 @@ ONLINE = "_online"
 
 
 def figure(name: str, value: float, **facts: object) -> Metric:
-    """A figure of the list, `<measure>` or `<measure>/<back-end or stage>`; `facts` fill in its description."""
+    """Create the metric `name`, with unit and description from the list of known measures.
+
+    Args:
+        name: `<measure>` or `<measure>/<back-end or processing stage>`.
+        value: NaN if it could not be computed.
+        facts: values to insert into the description.
+    """
     measure, slash, _ = name.partition("/")
     unit, words = FIGURES[measure.removesuffix(ONLINE) + slash]
     return Metric(name, float(value), unit, words.format(**facts))
 
 
 def to_json(head: dict[str, Any], metrics: Iterable[Metric]) -> str:
-    """One JSON object: the head's keys, then the flat list `metrics`."""
+    """Write a JSON object: the keys of `head`, and the list `metrics`."""
     return json.dumps({**head, "metrics": [metric.to_json() for metric in metrics]}, indent=2)
 
 
 class StageClock:
-    """Process time by stage; results never depend on it.
+    """Measures the CPU time of each processing stage; results never depend on it.
 
     Attributes:
-        cpu_s: seconds by stage. A nested stage is not counted in the outer one, so the sum is the time of all stages.
+        cpu_s: stage -> seconds. Time in a nested stage counts only there, so the sum is the time of all stages.
     """
 
     def __init__(self) -> None:
@@ -153,7 +159,7 @@ class StageClock:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the process time of the block to a stage, without the time of nested stages."""
+        """Context manager: add the CPU time of the block to a stage, without the time of stages nested in it."""
         self._within.append(0.0)
         start = time.process_time()
         try:

@@ -76,7 +76,7 @@ app.command("verify")(verify)
 
 
 def main() -> None:
-    """Run the command line: every error is one line on standard error and exit code 2."""
+    """Run the command line. Every error is printed as one line on standard error, with exit code 2."""
     os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")  # pictures are small: a second thread costs more than it gives
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # a damaged picture is reported by our own line
     try:

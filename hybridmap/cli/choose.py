@@ -25,10 +25,10 @@ class OpenedSource:
 
 
 def parse_settings(settings: list[str] | None) -> dict[str, Any]:
-    """`["nodes.distance_m=0.3"]` -> `{"nodes.distance_m": 0.3}`; values are read as YAML.
+    """Read the values of `--set`: `["nodes.distance_m=0.3"]` becomes `{"nodes.distance_m": 0.3}`; values are read as YAML.
 
     Raises:
-        ConfigError: no `=`, or a value that is not YAML.
+        ConfigError: an entry has no `=` or no key, or its value is not YAML.
     """
     parsed: dict[str, Any] = {}
     for setting in settings or []:
@@ -47,13 +47,20 @@ def choose(
     start_s: float | None = None,
     end_s: float | None = None,
 ) -> OpenedSource:
-    """Open a source and load its configuration.
+    """Open a source (recording or simulated world) and load its configuration.
 
-    Without a configuration name, a simulated world uses its own configuration, and a recording that of the first sensor found.
+    Without `config_name`, a simulated world gets the configuration of its own name, and a recording the one named after the
+    first kind of sensor found in it (`laser` or `rgbd`).
+
+    Args:
+        source: path of a recording, or name of a simulated world.
+        config_name: name or path of a configuration.
+        overrides: dotted key -> value, applied last.
+        start_s, end_s: the part of the source to read, seconds after its first stamp.
 
     Raises:
         StreamError: the source cannot be opened.
-        ConfigError: the configuration cannot be used.
+        ConfigError: the configuration does not exist or is not valid.
     """
     if config_name is None:
         config_name = world_of(source)

@@ -46,15 +46,21 @@ _Relations = Annotated[
 
 def compare(
     source: Annotated[Path, typer.Argument(metavar="DIR_OR_GRAPH", help="Session folder, or planar g2o or TORO file.")],
-    backends: Annotated[str, typer.Option(metavar="A,B,...", help="Back-ends, separated by commas.")] = _DEFAULT,
+    backends: Annotated[
+        str, typer.Option(metavar="A,B,...", help="Back-ends, separated by commas. An unknown name gives the list.")
+    ] = _DEFAULT,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for maps.png and comparison.html.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing comparison.")] = False,
     batch: _Batch = False,
     incremental: _Incremental = False,
     reference: _Reference = None,
     relations: _Relations = None,
-    config: Annotated[str | None, typer.Option(help="Configuration of the back-ends: a name or a file.")] = None,
-    setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch.")] = None,
+    config: Annotated[
+        str | None, typer.Option(help="Configuration of the back-ends: a name (an unknown one gives the list) or a YAML file.")
+    ] = None,
+    setting: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch. Keys: docs/configuration.md.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
     """Compare back-ends on one graph: chi2, status, iterations, CPU seconds, rejected loops, and proof of optimality if found.

@@ -26,9 +26,7 @@ def evaluate(
     ] = None,
     loops: Annotated[
         bool,
-        typer.Option(
-            "--loops", help="Also evaluate the candidates: how well the stored views tell places apart (needs ground truth)."
-        ),
+        typer.Option("--loops", help="Also evaluate how well the stored views tell places apart (needs ground truth)."),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
 ) -> None:
@@ -37,7 +35,7 @@ def evaluate(
     Precision: share of the accepted loops whose relative pose is within 1 m and 15 deg of the truth.
     Recall: share of the revisits that were closed. A revisit is a node within 1 m and 30 deg of one at least 10 s older. It
     counts as closed if a correct loop starts at most 3 nodes away.
-    The figures are printed and stored in metrics.json, and the session's page is rewritten.
+    The results are printed and stored in metrics.json, and the session's page is rewritten.
     """
     from hybridmap.cli.show import emit
     from hybridmap.errors import OutputError

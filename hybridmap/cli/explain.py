@@ -24,7 +24,7 @@ def explain(
     frame: Annotated[
         float | None,
         typer.Option(
-            metavar="T", help="Explain the decisions at this time: seconds from the start of the recording, or a stamp."
+            metavar="T", help="Explain the decisions at this time: seconds from the start of the recording, or a stamp, s."
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,

@@ -9,19 +9,26 @@ import typer
 
 from hybridmap.export import FORMATS
 
+_FORMATS = ", ".join(f"{name} ({entry.description})" for name, entry in FORMATS.items())
+
 
 def export(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Session folder, as `hybridmap map` writes it.")],
-    format_name: Annotated[str, typer.Option("--format", metavar="F", help=f"One of: {', '.join(FORMATS)}.")],
-    out: Annotated[Path, typer.Option(metavar="PATH", help="File to write; `grid` writes PATH.yaml and PATH.pgm.")],
+    format_name: Annotated[str, typer.Option("--format", metavar="F", help=_FORMATS)],
+    out: Annotated[Path, typer.Option(metavar="PATH", help="File to write; `grid` writes a .yaml and a .pgm of this name.")],
     backend: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Back-end whose poses to use. Default: the session's primary one.")
+        str | None,
+        typer.Option(
+            metavar="NAME", help="Back-end whose poses to use; an unknown name gives the list. Default: the primary one."
+        ),
     ] = None,
     resolution: Annotated[float, typer.Option(min=0.001, max=10.0, help="Cell size of the occupancy grid, m.")] = 0.05,
     voxel: Annotated[
         float, typer.Option(min=0.001, max=10.0, help="Voxel size of point clouds, m: one point is kept per voxel.")
     ] = 0.02,
-    max_depth: Annotated[float, typer.Option(min=0.1, help="Largest depth to use, m.")] = 5.0,
+    max_depth: Annotated[
+        float, typer.Option(min=0.1, help="Point clouds and grid: larger depth of a camera is left out, m.")
+    ] = 5.0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
 ) -> None:

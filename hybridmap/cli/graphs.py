@@ -20,15 +20,15 @@ from hybridmap.store import MapStore, SessionFolder
 
 @dataclass(frozen=True, slots=True)
 class GraphSource:
-    """A graph and its origin.
+    """A pose graph and where it was read from.
 
     Attributes:
-        path: the file or session folder.
-        graph: its nodes and accepted edges.
+        path: the graph file or session folder.
+        graph: nodes and accepted edges.
         is_session: whether `path` is a session folder.
-        start: what the graph's initial poses are, in words.
+        start: origin of the graph's initial poses, in words (`dead reckoning`).
         head: facts about the graph for the JSON output.
-        kidnapped: where the robot was kidnapped; empty for a file.
+        kidnapped: the places where the robot was kidnapped; empty for a graph file.
     """
 
     path: Path
@@ -40,11 +40,11 @@ class GraphSource:
 
 
 def open_graph(path: Path) -> GraphSource:
-    """Read a g2o or TORO file, or the graph of a session folder.
+    """Read the pose graph of a g2o or TORO file or of a session folder.
 
     Raises:
-        GraphError: a file that is missing, damaged or of another kind, or a session without an edge.
-        StoreError: a folder that holds no session.
+        GraphError: the file is missing, damaged or of another kind, or the session's map has no accepted edge.
+        StoreError: the folder holds no session.
     """
     if not path.is_dir():
         graph = read_graph(path)
@@ -60,10 +60,15 @@ def open_graph(path: Path) -> GraphSource:
 
 
 def settings_of(source: GraphSource, config: str | None, setting: list[str] | None) -> BackendsConfig:
-    """Settings of the back-ends: from the named configuration, else from the session, with `--set` applied last.
+    """Settings of the back-ends for a graph.
+
+    Args:
+        source: the graph; a session brings its own settings, which are used if `config` is None.
+        config: name or path of a configuration.
+        setting: `KEY=VALUE` entries of `--set`, applied last.
 
     Raises:
-        ConfigError: the configuration cannot be used.
+        ConfigError: the configuration does not exist or is not valid.
     """
     own = SessionFolder(source.path).config_yaml
     if config is not None or not source.is_session or not own.is_file():

@@ -17,14 +17,19 @@ if TYPE_CHECKING:
 
 def inspect(
     source: Source,
-    config: Annotated[str | None, typer.Option(help="Configuration to use: a name or a file.")] = None,
+    config: Annotated[
+        str | None, typer.Option(help="Configuration to use: a name (an unknown one gives the list) or a YAML file.")
+    ] = None,
     odometry_topic: Topic = None,
     scan_topic: Topic = None,
     color_topic: Topic = None,
     depth_topic: Topic = None,
     camera_info_topic: Topic = None,
     odometry_file: OdometryFile = None,
-    setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. sensors.sync_tolerance_s=0.05.")] = None,
+    setting: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="KEY=VALUE, e.g. sensors.sync_tolerance_s=0.05. Keys: docs/configuration.md."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
     """Show what a recording holds (topics, rates in Hz, spans in s), what mapping would use, and what is missing or damaged."""

@@ -19,11 +19,17 @@ def map_source(
     source: Source,
     out: Annotated[Path, typer.Option(help="Session folder to write.")],
     config: Annotated[
-        str | None, typer.Option(help="Configuration: a name or a file. Default: chosen by the sensors found.")
+        str | None,
+        typer.Option(
+            help="Configuration: a name (an unknown one gives the list) or a YAML file. Default: chosen by the sensors found."
+        ),
     ] = None,
     backend: Annotated[
         list[str] | None,
-        typer.Option(help="Back-end; may be given several times. The first sets the robot's pose (map -> odom)."),
+        typer.Option(
+            help="Back-end; may be given several times, the first sets the robot's pose (map -> odom)."
+            " An unknown name gives the list."
+        ),
     ] = None,
     start: Annotated[float | None, typer.Option(help="Start this many seconds after the first stamp.")] = None,
     end: Annotated[float | None, typer.Option(help="End this many seconds after the first stamp.")] = None,
@@ -33,8 +39,10 @@ def map_source(
     depth_topic: Topic = None,
     camera_info_topic: Topic = None,
     odometry_file: OdometryFile = None,
-    seed: Annotated[int | None, typer.Option(help="Random seed of the run.", min=0)] = None,
-    setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. nodes.distance_m=0.3.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Random seed of the simulated sensors and of RANSAC.", min=0)] = None,
+    setting: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. nodes.distance_m=0.3. Keys: docs/configuration.md.")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
@@ -61,7 +69,11 @@ def map_source(
 
 
 def map_and_report(stream: Any, config: Any, out: Path, *, overwrite: bool) -> tuple[dict[str, Any], list[Any]]:
-    """Map, evaluate if ground truth is known, and write the page; returns head and figures of `metrics.json`."""
+    """Map a stream into the folder `out`, evaluate the map if ground truth is known, and write the page.
+
+    Returns:
+        The two parts of `metrics.json`: the facts about the run, and the list of metrics.
+    """
     from hybridmap import session
     from hybridmap.evaluate import evaluate_session
     from hybridmap.report import write_report

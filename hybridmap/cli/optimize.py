@@ -17,9 +17,14 @@ def optimize(
     out: Annotated[Path | None, typer.Option(metavar="FILE.g2o", help="File for the optimised graph (m, rad).")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     config: Annotated[
-        str | None, typer.Option(help="Configuration with the settings of the back-end: a name or a file.")
+        str | None,
+        typer.Option(
+            help="Configuration with the settings of the back-end: a name (an unknown one gives the list) or a YAML file."
+        ),
     ] = None,
-    setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch.")] = None,
+    setting: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch. Keys: docs/configuration.md.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
     """Optimise a pose graph. Shows chi2 before and after, status, iterations, CPU seconds, and a proof of optimality if found.

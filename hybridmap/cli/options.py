@@ -9,18 +9,31 @@ from typing import Annotated
 import typer
 
 Source = Annotated[
-    str, typer.Argument(help="Recording (.bag, .mcap or .db3 file, ROS 2 bag folder, TUM folder, .csv) or simulated world.")
+    str,
+    typer.Argument(
+        help="Recording (.bag, .mcap or .db3 file, ROS 2 bag folder, TUM folder, .csv) "
+        "or simulated world: lab, office, corridor, corridor-landmarks."
+    ),
 ]
-Topic = Annotated[str | None, typer.Option(metavar="TOPIC", help="Topic to use instead of the one found automatically.")]
-OdometryFile = Annotated[str | None, typer.Option(help="TUM folders only: odometry file to use.")]
+Topic = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TOPIC", help="Topic of the recording to use instead of the one found; `hybridmap inspect` lists them."
+    ),
+]
+OdometryFile = Annotated[str | None, typer.Option(help="TUM folders only: file with the odometry, instead of odometry.txt.")]
 
 
 def sensor_settings(source: str, **given: str | None) -> dict[str, str]:
-    """The given topics and files as settings of the section `sensors`.
+    """Turn the options for topics and files that were given into settings: `{"sensors.scan_topic": "/scan"}`.
+
+    Args:
+        source: path of a recording, or name of a simulated world.
+        given: option name -> value; None if the option was not given.
 
     Raises:
-        ConfigError: one that does not fit the source.
-        StreamError: one is given, and the source is of no readable kind.
+        ConfigError: an option does not fit the source, such as a topic for a TUM folder.
+        StreamError: an option was given, and the source is not of a kind that can be read.
     """
     named = {name: value for name, value in given.items() if value is not None}
     if named:
@@ -36,4 +49,4 @@ def _require_fitting(source: str, named: Iterable[str]) -> None:
     for name in named:
         fitting = "TUM RGB-D folder" if name == "odometry_file" else "bag"
         if fitting not in kind:
-            raise ConfigError(f"--{name.replace('_', '-')}: is for a {fitting}; {source} is a {kind}")
+            raise ConfigError(f"--{name.replace('_', '-')}: is for a {fitting}; {source} is a {kind}: leave the option out")

@@ -1,4 +1,4 @@
-"""Output of the commands: tables and JSON from one list of figures, and progress on standard error."""
+"""Output of the commands: tables or JSON from one list of metrics on standard output, progress on standard error."""
 
 from __future__ import annotations
 
@@ -16,14 +16,21 @@ if TYPE_CHECKING:
 
 
 class Advance(Protocol):
-    """Called as work progresses."""
+    """Function that is called as work progresses, with the units of work done and, if known, the total."""
 
     def __call__(self, done: int, total: int | None = None) -> None:
         """`done` units of `total`."""
 
 
 def emit(head: dict[str, Any], metrics: Iterable[Metric], *, as_json: bool, title: str = "") -> None:
-    """Print one JSON object, or tables with units and the head's `remarks`, on standard output."""
+    """Print results on standard output: one JSON object, or tables with units and the remarks of the run.
+
+    Args:
+        head: facts about the run; in a table only its `remarks` are shown.
+        metrics: the values to print.
+        as_json: print JSON.
+        title: title of the tables.
+    """
     rows = list(metrics)
     if as_json:
         sys.stdout.write(to_json(head, rows) + "\n")
@@ -92,7 +99,11 @@ def _table_by_backend(rows: list[Metric], columns: list[str]) -> Table:
 
 @contextmanager
 def progress(label: str) -> Iterator[Advance]:
-    """A progress bar on standard error; silent when standard error is no terminal or `-q` was given."""
+    """Show a progress bar on standard error, unless standard error is no terminal or `-q` was given.
+
+    Yields:
+        The function to call as work progresses.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 

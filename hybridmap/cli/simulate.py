@@ -28,7 +28,10 @@ def simulate(
         ),
     ],
     format_: Annotated[Format | None, typer.Option("--format", help="Format to write, regardless of the suffix.")] = None,
-    config: Annotated[str | None, typer.Option(help="Configuration: a name or a file. Default: the one of the world.")] = None,
+    config: Annotated[
+        str | None,
+        typer.Option(help="Configuration: a name (an unknown one gives the list) or a YAML file. Default: that of the world."),
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Random seed of the sensor errors.", min=0)] = None,
     duration: Annotated[float | None, typer.Option(help="Stop the drive after this many seconds.")] = None,
     kidnap: Annotated[
@@ -38,7 +41,9 @@ def simulate(
             help="Kidnap the robot: carry it 20 m (simulation.carried_m) to a visited place while its sensors are off.",
         ),
     ] = False,
-    setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. simulation.sensors=laser.")] = None,
+    setting: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. simulation.sensors=laser. Keys: docs/configuration.md.")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing recording.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:

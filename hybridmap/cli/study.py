@@ -19,7 +19,11 @@ _COLUMNS = {"false_kept": "false kept", "own_lost": "own lost", "loop_recall": "
 
 def study(
     config: Annotated[
-        str, typer.Argument(metavar="CONFIG.yaml", help="Study: a file, or the name of one that comes with hybridmap.")
+        str,
+        typer.Argument(
+            metavar="CONFIG.yaml",
+            help="Study: a YAML file, or a name that comes with hybridmap (an unknown one gives the list).",
+        ),
     ],
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="Folder for the results. An existing one of the same study is continued.")
@@ -33,15 +37,17 @@ def study(
             metavar="tcp://HOST:PORT", help="Compute on the workers of this Dask scheduler (needs the extra `cluster`)."
         ),
     ] = None,
-    setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. seeds=3.")] = None,
+    setting: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE of the study, e.g. seeds=3. Keys: docs/studies.md.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
     """Run a study: map or solve every combination of source, setting, back-end, false loops and seed; compare the back-ends.
 
-    Figures: error against ground truth, verified relations or the optimum without false loops; chi2; accepted false loops;
+    Metrics: error against ground truth, verified relations or the optimum without false loops; chi2; accepted false loops;
     lost true loops. Differences between back-ends are paired by seed. Writes tables and a page.
-    An interrupted study continues when it is run again. A cell that fails keeps its row, with the reason.
-    The exit code is 1 if a figure misses a bar of the study.
+    An interrupted study continues when it is run again. A run that fails keeps its row, with the reason.
+    The exit code is 1 if a result misses a limit (bar) stated in the study.
     """
     _one_thread()
     from hybridmap.cli.choose import parse_settings

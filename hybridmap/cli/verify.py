@@ -11,13 +11,16 @@ import typer
 def verify(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for verify.html and metrics.json.")],
     seed: Annotated[int, typer.Option(help="Random seed of drives, sampled cells and noise.", min=0)] = 0,
-    setting: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. neural.spacing_max_m=0.6.")] = None,
+    setting: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="KEY=VALUE of the cells, e.g. neural.spacing_max_m=0.6. Keys: docs/configuration.md."),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing verification.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Verify the head-direction, band, grid and place cells against stated bars (m, rad, deg, %). Writes a page. Needs no data.
+    """Verify the head-direction, band, grid and place cells against stated limits (m, rad, deg, %). Writes a page.
 
-    The exit code is 1 if a figure misses its bar.
+    Needs no data. The exit code is 1 if a value misses its limit.
     """
     from hybridmap.cli.choose import parse_settings
     from hybridmap.cli.show import emit, progress

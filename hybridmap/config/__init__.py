@@ -1,4 +1,7 @@
-"""Every setting, one frozen section per stage. Command line overrides file, file overrides defaults. Results store them all."""
+"""Every setting, one frozen section per processing stage.
+
+The command line overrides the configuration file, the file overrides the defaults. Results store the whole configuration.
+"""
 
 from hybridmap.config.root import Config, named_configs
 

@@ -10,7 +10,7 @@ from hybridmap.config.section import Section
 
 
 class RelaxationConfig(Section):
-    """Relaxation: the paper's correction rule and stable variants."""
+    """Settings of map relaxation: the paper's correction rule and its stable variants."""
 
     theta: float = Field(default=0.5, gt=0, le=1)
     """Correction rate, the paper's vartheta.
@@ -43,8 +43,8 @@ class GncConfig(Section):
     """Graduated non-convexity (truncated least squares) on the loop edges; all other edges count as inliers."""
 
     start: Literal["auto", "batch", "grow"] = "auto"
-    """`batch` anneals the whole graph from its initial poses; `grow` adds the nodes in chunks; `auto` grows in two ways, at the
-    end of a drive starts from its map as well, and takes the solution with the lowest truncated cost.
+    """Where graduated non-convexity starts. `batch`: on the whole graph at its initial poses. `grow`: chunk by chunk of nodes,
+    and at the end of a drive on the map built so far. `auto`: in these and more ways; the lowest truncated cost wins.
 
     Watch: `auto` takes the most time, and tolerates worse initial poses.
     """
@@ -72,7 +72,7 @@ class RobustConfig(Section):
 
 
 class ConsistencyConfig(Section):
-    """Pre-filter: pairwise consistency of loops through the chain, tested before any back-end solves a whole graph."""
+    """Filter before a back-end solves a whole graph: loops must be pairwise consistent, given the odometry between them."""
 
     enabled: bool = False
     """Leave out loops that are not consistent with others, and test them again against the solution.
@@ -82,17 +82,20 @@ class ConsistencyConfig(Section):
 
 
 class Isam2Config(Section):
-    """Incremental smoothing."""
+    """Settings of incremental smoothing (iSAM2)."""
 
     loop_kernel: Literal["none", "cauchy"] = "none"
     """Kernel on the loop edges."""
 
 
 class BackendsConfig(Section):
-    """The back-ends that follow the graph. The first is the primary one and sets the robot's pose (`map -> odom`)."""
+    """The back-ends that optimise the graph while the robot drives.
+
+    The first one is the primary back-end: it sets the robot's pose (`map -> odom`).
+    """
 
     names: tuple[str, ...] = Field(default=("gtsam-gnc", "relaxation-ratslam"), min_length=1)
-    """Names; the first is the primary.
+    """Names of the back-ends; the first is the primary one. An unknown name gives the list.
 
     Watch: each back-end takes its own time at every node.
     """

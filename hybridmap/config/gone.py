@@ -1,4 +1,4 @@
-"""Removed settings: what became of each, and reading old configurations that still have them."""
+"""Removed and renamed settings: what replaced each, and reading old configurations that still contain them."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ OTHERWISE: dict[str, str] = {
 
 @cache
 def constants() -> dict[str, tuple[str, str]]:
-    """Old dotted key -> module (path below `hybridmap/`) and name of the constant that replaced it."""
+    """Removed settings that are constants now: old dotted key -> (module below `hybridmap/`, name of the constant)."""
     found = {}
     for section, module, *keys in map(str.split, _CONSTANTS.strip().splitlines()):
         for key in keys:
@@ -124,11 +124,11 @@ def constants() -> dict[str, tuple[str, str]]:
 
 
 def what_became_of(key: str, value: Any = None) -> str | None:
-    """One line on a removed setting or section; None if there never was such a one.
+    """Explain in one line what replaced a removed or renamed setting or section; None if the key was never a setting.
 
     Args:
-        key: dotted.
-        value: its value; of a removed section it tells which of its settings is looked up.
+        key: dotted key, such as `neural.kernel_widths`.
+        value: value found at the key. If it is a mapping (a removed section), the setting inside it is explained.
     """
     if key in RENAMED:
         return f"{key} is now called {RENAMED[key]}"
@@ -146,7 +146,7 @@ def what_became_of(key: str, value: Any = None) -> str | None:
 
 
 def without_gone(tree: Mapping[str, Any], at: str = "") -> dict[str, Any]:
-    """A stored configuration without removed settings, and with the new names of renamed ones.
+    """Copy a stored configuration: removed settings are left out, renamed ones get their new names.
 
     Args:
         tree: nested mapping of sections.

@@ -10,7 +10,7 @@ from hybridmap.config.section import Section
 
 
 class LaserMounting(Section):
-    """Pose of the laser on the base; replaces the recording's transforms."""
+    """Pose of the laser on the robot's base; replaces the pose in the recording's transforms."""
 
     x_m: float = 0.0
     """Position forward of the base's origin, m."""
@@ -23,7 +23,7 @@ class LaserMounting(Section):
 
 
 class CameraMounting(Section):
-    """Pose of the camera's OPTICAL frame (x right, y down, z forward) on the base; replaces the recording's."""
+    """Pose of the camera's OPTICAL frame (x right, y down, z forward) on the robot's base; replaces the recording's pose."""
 
     translation_m: tuple[float, float, float]
     """Origin of the optical frame in the base, m."""
@@ -34,7 +34,7 @@ class CameraMounting(Section):
 
 
 class CameraIntrinsics(Section):
-    """Calibration of the colour camera; replaces the recording's."""
+    """Intrinsic calibration of the colour camera; replaces the one in the recording."""
 
     width_px: int = Field(gt=0)
     """Image width, pixels."""
@@ -53,7 +53,7 @@ class CameraIntrinsics(Section):
 
 
 class SensorsConfig(Section):
-    """Source of the sensor data; None means: found automatically."""
+    """Where the sensor data come from. None means: found automatically in the recording."""
 
     odometry_topic: str | None = None
     """Topic of nav_msgs/Odometry, or of tf2_msgs/TFMessage with the transform `odom_frame` -> base."""
@@ -95,7 +95,8 @@ class SensorsConfig(Section):
     Watch: the pose is delayed by this time.
     """
     odometry_delay_s: float = Field(default=0.0, ge=-1, le=1)
-    """Time added to the stamps of odometry, s: by how much scans and images are stamped later. `hybridmap calibrate` finds it.
+    """Time added to the stamps of odometry, s: how much later scans and images are stamped than odometry of the same moment.
+    `hybridmap calibrate` finds it.
 
     Watch: updates of a live robot are delayed by this time.
     """
@@ -107,7 +108,7 @@ class SensorsConfig(Section):
     range_max_m: float | None = Field(default=None, gt=0)
     """Laser returns at or beyond this are dropped, m; None: only the recording's limit applies.
 
-    Watch: a long hall needs the far walls.
+    Watch: in a long hall a low limit removes the far walls, which hold the heading and position along it.
     """
     depth_min_m: float | None = Field(default=None, ge=0)
     """Depth nearer than this is dropped, m; None: all depth is kept.
@@ -138,7 +139,7 @@ class WheelErrorConfig(Section):
 
 
 class CameraConfig(Section):
-    """The simulated RGB-D camera."""
+    """Image size, field of view and rate of the simulated RGB-D camera."""
 
     width_px: int = Field(default=240, ge=16, le=1920)
     """Image width, pixels.
@@ -153,7 +154,7 @@ class CameraConfig(Section):
 
 
 class LaserScannerConfig(Section):
-    """The simulated planar laser."""
+    """Beams, field of view, rate and range of the simulated planar laser."""
 
     beams: int = Field(default=180, ge=8, le=4096)
     """Beams a scan."""
@@ -166,10 +167,10 @@ class LaserScannerConfig(Section):
 
 
 class SimulationConfig(Section):
-    """World, drive, sensors and their noise."""
+    """The simulated world and drive, the robot's sensors, and their noise."""
 
     world: str = "lab"
-    """Name of the world and its drive."""
+    """Name of the world and its drive: `lab`, `office`, `corridor` or `corridor-landmarks`."""
     sensors: Literal["rgbd", "laser", "both"] = "rgbd"
     """Sensors of the robot besides its wheels."""
     noise: float = Field(default=1.0, ge=0, le=10)

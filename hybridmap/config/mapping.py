@@ -10,7 +10,7 @@ from hybridmap.config.section import Section
 
 
 class PlaceConfig(Section):
-    """Place cells learned from the grid cells, and the place attractor."""
+    """Place cells that learn from the grid cells, and the attractor sheet to which they project."""
 
     attractor_side: int = Field(default=32, ge=8, le=256)
     """Cells along a side of the place attractor; the place code has side * side entries.
@@ -27,14 +27,14 @@ class PlaceConfig(Section):
 
     Watch: fields drift towards where the robot is most often."""
     attractor_input: float = Field(default=0.0, ge=0, lt=1)
-    """Share of the place cells' input in the attractor's activity at each learning step.
+    """Share of the attractor's activity that the place cells' input sets at each learning step.
 
     Watch: with 0 only self-motion moves the attractor.
     """
 
 
 class NeuralConfig(Section):
-    """The path integrator: head direction -> band -> grid -> place -> place attractor."""
+    """The neural path integrator: head-direction cells -> band cells -> grid cells -> place cells -> place attractor."""
 
     head_direction_cells: int = Field(default=360, ge=8, le=100_000)
     """m, cells of the head-direction ring.
@@ -115,7 +115,7 @@ class NeuralConfig(Section):
 
 
 class NodesConfig(Section):
-    """When a node is made."""
+    """When a new node is added to the map."""
 
     rule: Literal["travel", "novelty"] = "travel"
     """`travel`: after some distance or rotation; `novelty`: the paper's rule, by place code and view template.
@@ -143,15 +143,16 @@ class EdgesConfig(Section):
     """Noise of odometry edges, and how a loop closure enters the map."""
 
     hanging: Literal["chain", "ratslam"] = "chain"
-    """`chain` keeps consecutive nodes joined and adds a loop edge; `ratslam` joins the next node to the matched one, as
-    OpenRatSLAM does (a baseline).
+    """How a loop closure enters the graph. `chain` keeps consecutive nodes joined and adds a loop edge; `ratslam` joins the
+    next node to the matched one, as OpenRatSLAM does (a baseline).
 
-    Watch: with `ratslam` one false match breaks the chain for good.
+    Watch: with `ratslam` one false match breaks the chain of nodes for good.
     """
     gate: Literal["map", "odometry"] = "map"
-    """Poses that gate loop closures: those of the primary back-end (`map`) or of the path integrator (`odometry`).
+    """Poses used to find older nodes close enough for a loop closure: those of the primary back-end (`map`) or of the path
+    integrator (`odometry`).
 
-    Watch: with `odometry` the graph does not depend on a back-end, and long drives drift out of the gate.
+    Watch: with `odometry` the graph does not depend on a back-end, and after a long drive true loops are missed.
     """
     drop_contradicted: bool = True
     """Drop an odometry edge if a good registration of the same two nodes contradicts it.

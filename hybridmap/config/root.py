@@ -22,7 +22,7 @@ from hybridmap.errors import ConfigError
 
 
 class Config(Section):
-    """Everything that determines a map: one section per stage, in the order in which a sample passes them."""
+    """The whole configuration, which determines a map: one section per processing stage, in the order of processing."""
 
     seed: int = Field(default=0, ge=0)
     """Random seed of the run (the simulator's world and noise, RANSAC)."""
@@ -51,11 +51,16 @@ class Config(Section):
         *,
         overridden_by: str = "command line",
     ) -> Self:
-        """Read a configuration by name (`rgbd`) or path and apply `overrides` (`{"nodes.distance_m": 0.3}`).
+        """Read a configuration and apply overrides.
+
+        Args:
+            source: name of one that comes with hybridmap (`rgbd`), or path of a YAML file; None for the defaults.
+            overrides: dotted key -> value, e.g. `{"nodes.distance_m": 0.3}`.
+            overridden_by: origin of the overrides, named in error messages.
 
         Raises:
-            ConfigError: no such file, not YAML, an unknown key (named with its path) or a value out of range. The message names
-                the file, or `overridden_by` if an override caused the error.
+            ConfigError: the file does not exist or is not YAML, a key is unknown, or a value is out of range. The message names
+                the key, and the file or the origin of the override.
         """
         tree: dict[str, Any] = {} if source is None else _read_tree(source, seen=())
         changed = deepcopy(tree)
@@ -69,10 +74,14 @@ class Config(Section):
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any], origin: str) -> Self:
-        """Validate a nested mapping; `origin` names it in errors.
+        """Validate a nested mapping of settings.
+
+        Args:
+            tree: section -> key -> value.
+            origin: name of the source of the mapping, used in error messages.
 
         Raises:
-            ConfigError: as `load`.
+            ConfigError: a key is unknown or a value out of range.
         """
         try:
             return cls.model_validate(tree)
@@ -81,21 +90,25 @@ class Config(Section):
 
     @classmethod
     def stored(cls, text: str, origin: str) -> Self:
-        """The configuration stored with a session, without settings that have been removed since.
+        """Read the configuration that is stored with a session; settings that have been removed since are left out.
+
+        Args:
+            text: the configuration as YAML.
+            origin: name of the file, used in error messages.
 
         Raises:
-            ConfigError: as `load`.
+            ConfigError: the text is not YAML, a key was never a setting, or a value is out of range.
         """
         return cls.from_tree(without_gone(mapping_of(text, origin)), origin)
 
     def to_yaml(self) -> str:
-        """The resolved configuration as YAML that `load` reads back to an equal one."""
+        """The whole configuration, defaults included, as YAML. `load` reads it back to an equal configuration."""
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
 
 
 @cache
 def is_allowed(key: str, value: float) -> bool:
-    """Whether a setting, the others at their defaults, may have a value; a key that is no setting may have none."""
+    """Whether a setting can have a value while all others have their defaults; False for an unknown key."""
     try:
         Config.load(None, {key: value})
     except ConfigError:
@@ -104,7 +117,7 @@ def is_allowed(key: str, value: float) -> bool:
 
 
 def named_configs() -> dict[str, Path]:
-    """Name -> file of the configurations that come with the package (in a checkout: `configs/`)."""
+    """Name -> file of each configuration that comes with hybridmap."""
     packaged = Path(str(resources.files("hybridmap"))) / "configs"
     folder = packaged if packaged.is_dir() else Path(str(resources.files("hybridmap"))).parent / "configs"
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}

@@ -38,14 +38,14 @@ class Section(BaseModel):
 
 
 def said(error: ValidationError, model: type[BaseModel], section: str = "") -> str:
-    """The first error of pydantic as one line: the key, what was expected, what was found.
+    """Describe the first error of pydantic in one line: the key, what was expected, what was found.
 
-    Unknown keys are reported first: a missing key may be the same key, misspelt.
+    An unknown key is reported before a missing one, as it may be the missing key, misspelt.
 
     Args:
-        error: of a section.
+        error: the error raised when a section was validated.
         model: class of that section.
-        section: dotted name of that section in the whole configuration; empty for the whole.
+        section: dotted name of that section; empty for the whole configuration.
     """
     complaints = error.errors()
     unknown = {_dotted(section, *each["loc"]): each.get("input") for each in complaints if each["type"] == "extra_forbidden"}
@@ -92,6 +92,10 @@ def _dotted(section: str, *parts: int | str) -> str:
 def read_mapping(path: Path, error: type[HybridMapError] = ConfigError) -> dict[str, Any]:
     """Read a YAML file that holds a mapping; an empty file gives an empty mapping.
 
+    Args:
+        path: the file.
+        error: type of the error to raise.
+
     Raises:
         HybridMapError: of the type `error`: the file is not YAML (the message names the line), or holds no mapping.
     """
@@ -103,7 +107,13 @@ def read_mapping(path: Path, error: type[HybridMapError] = ConfigError) -> dict[
 
 
 def mapping_of(text: str, origin: str, error: type[HybridMapError] = ConfigError) -> dict[str, Any]:
-    """Read a YAML text that holds a mapping; `origin` names the text in errors."""
+    """Read a YAML text that holds a mapping; an empty text gives an empty mapping.
+
+    Args:
+        text: the YAML text.
+        origin: name of the text in error messages.
+        error: type of the error to raise if the text is not YAML or holds no mapping.
+    """
     tree = value_of(text, origin, error)
     if tree is None:
         return {}
@@ -113,7 +123,13 @@ def mapping_of(text: str, origin: str, error: type[HybridMapError] = ConfigError
 
 
 def value_of(text: str, origin: str, error: type[HybridMapError] = ConfigError) -> Any:
-    """Read one YAML value; a key that a mapping has twice is refused."""
+    """Read one YAML value.
+
+    Args:
+        text: the YAML text.
+        origin: name of the text in error messages.
+        error: type of the error to raise if the text is not YAML, or a mapping in it has the same key twice.
+    """
     try:
         return yaml.load(text, Loader=_Strict)
     except yaml.YAMLError as mistake:

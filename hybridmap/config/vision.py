@@ -10,7 +10,7 @@ from hybridmap.config.section import Section
 
 
 class ProfileConfig(Section):
-    """The scanline profile (eq. 11): the short vector that describes one frame."""
+    """The scanline profile (eq. 11 of the paper): the short vector that describes one camera frame or laser scan."""
 
     width: int = Field(default=64, ge=16, le=1024)
     """b: columns of a profile, or bearings of a laser's.
@@ -20,7 +20,7 @@ class ProfileConfig(Section):
     bands: int = Field(default=4, ge=1, le=32)
     """Row bands into which an image is cut for `four-band` matching.
 
-    Watch: the paper's modes always use the whole column.
+    Watch: the other kinds of `vision.rgbd.matching` always use the whole column.
     """
     normalise: Literal["z", "mean"] = "z"
     """`z`: mean 0 and standard deviation 1; `mean`: divided by its mean.
@@ -29,12 +29,12 @@ class ProfileConfig(Section):
 
     @property
     def max_shift(self) -> int:
-        """Largest shift |c| tried between two views, columns."""
+        """Largest column shift |c| tried when two profiles are compared, columns."""
         return self.width // 4
 
 
 class MatchingConfig(Section):
-    """Comparison of profiles (eq. 12 and 13)."""
+    """How the scanline profiles of two views are compared (eqs. 12 and 13 of the paper)."""
 
     mu_r: float = Field(default=0.7, ge=0, le=1)
     """mu_R, weight of the intensity profile; that of the depth profile is mu_D = 1 - mu_R.
@@ -43,9 +43,10 @@ class MatchingConfig(Section):
     g_bar: Literal["templates", "shifts"] = "templates"
     """Definition of g_bar: the mean of g_min over the stored templates, or the mean of g over the shifts of the pair."""
     c_t: float | None = Field(default=None)
-    """Threshold: a match has G < c_t. None: no threshold if candidates are verified, else a moderate one for the mode.
+    """Threshold: two views match if their score G is below c_t. None: no threshold if matches are verified by features, else a
+    moderate one that depends on `vision.rgbd.matching`.
 
-    Watch: the scale of G differs between the modes.
+    Watch: the scale of G differs between the readings of `vision.rgbd.matching`.
     """
     sequence: int = Field(default=1, ge=1, le=50)
     """Consecutive nodes whose views must match, on average; 1: each view by itself.
@@ -55,12 +56,12 @@ class MatchingConfig(Section):
 
     @property
     def mu_d(self) -> float:
-        """mu_D, weight of the depth profile."""
+        """mu_D = 1 - mu_R, weight of the depth profile."""
         return round(1.0 - self.mu_r, 12)
 
 
 class TrackingConfig(Section):
-    """Refined self-motion: each new node is registered to the previous ones, by laser or camera."""
+    """Correction of odometry: each new node is registered to the previous ones, by laser or camera."""
 
     enabled: bool = True
     """Whether new nodes are registered.
@@ -70,10 +71,10 @@ class TrackingConfig(Section):
 
 
 class ClosingConfig(Section):
-    """Loop closure, by laser or camera."""
+    """Search for loop closures by laser or camera."""
 
     gate_sigmas: float = Field(default=2.5, gt=0)
-    """Width of the gate in standard deviations of the map's uncertainty.
+    """Older nodes are considered for a loop within this many standard deviations of the pose uncertainty on the map (the gate).
 
     Watch: a wide gate takes time and admits places that only look alike; a narrow one loses loops after long drift. A laser
     multiplies the deviations by four; a camera uses them only after its gate has grown by 10 m.
@@ -96,7 +97,7 @@ class RelocalisingConfig(Section):
 
 
 class ScanConfig(Section):
-    """Use of single scans."""
+    """What single laser scans are used for, besides submaps."""
 
     templates: bool = True
     """Whether every scan is compared with the view templates.
@@ -106,7 +107,7 @@ class ScanConfig(Section):
 
 
 class ProbeConfig(Section):
-    """Loop hypotheses: the submap of the last metres is matched with old submaps inside the gate."""
+    """Search for loops by laser: the submap of the last metres is matched with old submaps that the drift allows."""
 
     every_m: float = Field(default=2.0, gt=0)
     """Travel between two searches for loops, m.
@@ -114,7 +115,7 @@ class ProbeConfig(Section):
     Watch: half the distance takes about twice the time for matching.
     """
     fit_min: float = Field(default=0.7, gt=0, le=1)
-    """Least share of inliers among the points that lie near the old submap.
+    """Least share of inliers among the points of the new submap that lie near the old one.
 
     Watch: from 0.01 to 0.99 the map of fr079 hardly changes (see results): the cluster test and the robust back-end reject
     false hypotheses.
@@ -122,7 +123,7 @@ class ProbeConfig(Section):
 
 
 class LaserConfig(Section):
-    """Submap registration, and acceptance of loops in clusters."""
+    """Loop closure by laser: submaps are registered to each other, and loops that agree are accepted in clusters."""
 
     scan: ScanConfig = ScanConfig()
     """Use of single scans."""
@@ -136,7 +137,7 @@ class LaserConfig(Section):
 
 
 class RegistrationConfig(Section):
-    """Registration of depth."""
+    """Registration of the depth of two RGB-D frames."""
 
     depth_sigma: float = Field(default=0.003, gt=0)
     """Noise of depth: standard deviation in m at 1 m; it grows with the square of the distance.
@@ -146,22 +147,23 @@ class RegistrationConfig(Section):
 
 
 class PnpConfig(Section):
-    """Verification of a candidate by visual features and depth."""
+    """Verification of a loop candidate by visual features and depth (perspective-n-point)."""
 
     min_inliers: int = Field(default=12, ge=4)
-    """Least number of inlier keypoints.
+    """Least number of matched features that agree with the estimated relative pose (inliers).
 
     Watch: from 4 to 400 the map of the office hardly changes (see results); with a high number fewer loops limit the drift.
     """
 
 
 class RgbdClosingConfig(Section):
-    """Loop closure by camera: gate and candidates."""
+    """Loop closure by camera: which older nodes are candidates."""
 
     min_age_s: float = Field(default=10.0, ge=0)
     """Least age of a node to be a candidate, s."""
     gate_m: float = Field(default=2.5, gt=0)
-    """Radius of the gate right after a loop closure, m; it grows by 10 % of the travel since then, by at most 10 m.
+    """Radius around the robot within which older nodes are candidates, right after a loop closure, m. It grows by 10 % of the
+    travel since then, by at most 10 m.
 
     Watch: candidates outside are not considered.
     """
@@ -173,7 +175,7 @@ class RgbdClosingConfig(Section):
 
 
 class RgbdConfig(Section):
-    """Scanline profiles, features, depth registration."""
+    """Mapping with an RGB-D camera: scanline profiles, visual features, depth registration."""
 
     matching: Literal["literal", "ratio", "signed", "plain", "four-band"] = "four-band"
     """How candidates are ranked: by the paper's single-band profile with one of four readings of G, or by four row bands.
@@ -208,10 +210,10 @@ class RgbdConfig(Section):
 
 
 class VisionConfig(Section):
-    """The sensor that closes loops, and its settings."""
+    """The sensor that corrects odometry and closes loops, and its settings."""
 
     sensor: str = Field(default="auto", min_length=1)
-    """The sensor to map with: `laser`, `rgbd`, `none`, or the front-end of an installed package; `auto` takes the first kind
+    """The sensor to map with: `laser`, `rgbd`, `none`, or a sensor added by an installed package; `auto` takes the first kind
     that the source has.
 
     Watch: `none` is dead reckoning.

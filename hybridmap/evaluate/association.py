@@ -17,13 +17,13 @@ _DEAD_BAND_M = 0.05
 
 @dataclass(frozen=True, slots=True)
 class PosePairs:
-    """Poses of an estimate and of the reference at the same stamps.
+    """Poses of an estimated trajectory and of the reference at the same stamps.
 
     Attributes:
         stamps_ns: (P,) int64.
         estimate: (P, 3) m and rad, in the estimate's map frame.
         reference: (P, 3) m and rad, in the reference's frame.
-        total: number of all poses of the estimate, matched or not.
+        total: number of all poses of the estimate, with or without a reference.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -36,7 +36,12 @@ class PosePairs:
 
 
 def associate(estimate: Trajectory, reference: Trajectory, max_gap_s: float = MAX_GAP_S) -> PosePairs:
-    """Interpolate the reference at the stamps of the estimate.
+    """Interpolate the reference trajectory at the stamps of the estimate.
+
+    Args:
+        estimate: trajectory to evaluate.
+        reference: true trajectory.
+        max_gap_s: longest gap of the reference over which it is interpolated; other stamps are left out.
 
     Raises:
         EvaluationError: fewer than three stamps in common.
@@ -52,7 +57,7 @@ def associate(estimate: Trajectory, reference: Trajectory, max_gap_s: float = MA
 
 
 def travel(poses: Array) -> Array:
-    """Path length (P,) up to each pose, m. Steps count once their sum exceeds 5 cm, so that jitter does not."""
+    """Path length (P,) up to each pose (P, 3), m. Motion counts only once it adds up to 5 cm, so that jitter does not."""
     total, length = [], 0.0
     positions = poses[:, :2].tolist()
     anchor = positions[0]

@@ -19,10 +19,10 @@ class ClosureLimits:
     """When a loop edge is correct, and what counts as a revisit.
 
     Attributes:
-        right_m, right_deg: a loop edge is correct if its measurement is this close to the truth.
-        revisit_m, revisit_deg: a node is a revisit if it is this close to an older one ...
-        revisit_gap_s: ... that was made at least this long before.
-        window_nodes: a revisit is found if a correct loop edge starts within this many nodes of it.
+        right_m, right_deg: a loop edge is correct if its measured relative pose is this close to the truth.
+        revisit_m, revisit_deg: largest distance and turn between a revisit and the older node that it revisits.
+        revisit_gap_s: least time between the two.
+        window_nodes: a revisit counts as found if a correct loop edge starts within this many nodes of it.
     """
 
     right_m: float = 1.0
@@ -35,14 +35,15 @@ class ClosureLimits:
 
 @dataclass(frozen=True, slots=True)
 class ClosureErrors:
-    """Quality of a set of loop edges.
+    """Quality of a set of loop edges. Only edges between nodes whose true poses are known are evaluated.
 
     Attributes:
-        precision: share of the judged edges that are correct; NaN without any.
-        recall: share of the revisits with a correct edge; NaN without any revisit.
-        judged, right: number of loop edges between nodes with known truth, and of the correct ones.
-        revisits, found: number of revisits, and of those with a correct edge.
-        trans_median_m, trans_p95_m, rot_median_deg, rot_p95_deg: errors of the correct edges; NaN without any.
+        precision: share of the evaluated edges that are correct; NaN if there is none.
+        recall: share of the revisits that a correct edge found; NaN without any revisit.
+        judged, right: number of evaluated edges, and of the correct ones among them.
+        revisits, found: number of revisits, and of those that a correct edge found.
+        trans_median_m, trans_p95_m, rot_median_deg, rot_p95_deg: median and 95th percentile of the errors of the correct
+            edges; NaN without any.
     """
 
     precision: float
@@ -73,7 +74,6 @@ def closure_errors(
         truth: true poses of `base_link`, in any frame.
         rejected: numbers of loop edges that a back-end rejected; they do not count as closures.
         limits: when an edge is correct, and when a node is a revisit.
-        max_gap_s: longest gap over which the truth is interpolated.
     """
     stamps, poses, known = _true_nodes(experiences, truth)
     edges = [e for n, e in _judged(experiences, EdgeKind.LOOP, known).items() if n not in rejected]
@@ -135,15 +135,15 @@ WRONG_M = 1.0
 
 @dataclass(frozen=True, slots=True)
 class EdgeErrors:
-    """The accepted edges of one kind.
+    """Errors of the accepted edges of one kind (odometry, registration or loop).
 
     Attributes:
-        count: edges between nodes with known truth.
-        trans_median_m, trans_p95_m, rot_median_deg, rot_p95_deg: their errors; NaN without any edge.
-        chi2_ratio: median normalised squared error over its expected value: 1 for correct covariances, less if they are too
+        count: number of edges between nodes whose true poses are known.
+        trans_median_m, trans_p95_m, rot_median_deg, rot_p95_deg: median and 95th percentile of their errors; NaN without any.
+        chi2_ratio: median squared Mahalanobis error over its expected value: 1 for correct covariances, less if they are too
             large, more if they are too small.
-        wrong: edges with an error of more than a metre.
-        wrong_kept: of those, the ones with a weight above one half in a back-end.
+        wrong: number of edges with an error of more than a metre.
+        wrong_kept: number of those whose weight in the back-end is above one half.
     """
 
     count: int
@@ -170,7 +170,6 @@ def edge_errors(
         experiences: the map.
         truth: true poses of `base_link`, in any frame.
         weights: edge number -> weight in a robust back-end; a missing edge counts as 1.
-        max_gap_s: longest gap over which the truth is interpolated.
     """
     _, poses, known = _true_nodes(experiences, truth)
     return edge_errors_on(experiences, poses, known, weights)
@@ -179,7 +178,14 @@ def edge_errors(
 def edge_errors_on(
     experiences: ExperienceMap, poses: Array, known: NDArray[np.bool_] | None = None, weights: Mapping[int, float] | None = None
 ) -> dict[EdgeKind, EdgeErrors]:
-    """Evaluate the accepted edges, given the true pose (N, 3) of each node and which of them are known (default: all)."""
+    """Evaluate the accepted edges of a map, kind by kind, given the true poses of its nodes.
+
+    Args:
+        experiences: the map.
+        poses: (N, 3) true pose of each node, m and rad, in any frame.
+        known: (N,) which of them are known; default: all.
+        weights: edge number -> weight in a robust back-end; a missing edge counts as 1.
+    """
     known = np.ones(len(poses), dtype=np.bool_) if known is None else known
     out = {}
     for kind in (EdgeKind.ODOMETRY, EdgeKind.REGISTRATION, EdgeKind.LOOP):
@@ -189,7 +195,11 @@ def edge_errors_on(
 
 
 def normalised_errors(edges: list[Edge], poses: Array) -> tuple[Array, Array]:
-    """Errors (E, 3) of measured edges, twists in the target's frame, m and rad, and their squared Mahalanobis norms (E,)."""
+    """Errors of E edges against the true poses (N, 3) of the nodes.
+
+    Returns:
+        (E, 3) errors as twists in the frame of the edge's target node, m and rad, and their squared Mahalanobis norms (E,).
+    """
     measured = [edge.relative for edge in edges if edge.relative is not None]
     ends = np.array([(e.source, e.target) for e in edges if e.relative is not None], dtype=np.int64).reshape(-1, 2)
     delta = np.array([m.delta for m in measured]).reshape(-1, 3)

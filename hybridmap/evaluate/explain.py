@@ -31,11 +31,11 @@ class Decision:
     """One edge that was considered, with its outcome.
 
     Attributes:
-        number: of the edge in the map file.
-        edge: the edge, with the record of the decision.
-        weights: back-end -> weight of an accepted loop (0: rejected).
-        inconsistent: the back-ends that rejected it as inconsistent with the other loops.
-        error: (m, deg) of its measurement against ground truth, if known.
+        number: number of the edge in the map file.
+        edge: the edge, with the checks and the verdict.
+        weights: back-end -> weight that it gives to the loop if it was accepted (0: rejected by this back-end).
+        inconsistent: names of the back-ends that rejected the loop as inconsistent with other loops.
+        error: distance (m) and turn (deg) between its measurement and ground truth, None if unknown.
     """
 
     number: int
@@ -45,7 +45,7 @@ class Decision:
     error: tuple[float, float] | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """The decision as plain values for JSON."""
+        """The decision as a dictionary of JSON values."""
         e = self.edge
         return {
             "edge": self.number,
@@ -74,22 +74,21 @@ class Decision:
 
 @dataclass(frozen=True, slots=True)
 class NodeStory:
-    """The decisions at one node.
+    """The decisions made at one node.
 
     Attributes:
-        node: its number.
-        stamp_ns: of its frame.
-        time_s: since the first stamp of the recording, s.
-        travel_m: path length so far.
-        moved: (m, deg) since the previous node, None for the first.
-        nearest: the older node with the nearest pose on the final map: (node, m, deg).
-        template, founded: its view template, and whether the node created it.
-        poses: name -> (3,) final pose by every back-end, `odometry` first.
-        gate: the gate that chose the older nodes to compare with, None if not stored.
-        ranked: (n, 3) the best older nodes by their views: node, G, shift in columns.
-        chain: odometry and registration edges that end here.
-        loops: loop closures considered when the node was made, or proposed for it at the end.
-        no_loops: why there are none; empty if unknown.
+        node: number of the node.
+        stamp_ns, time_s: stamp of its frame, and seconds since the first stamp of the recording.
+        travel_m: path length from the start to the node.
+        moved: distance (m) and turn (deg) since the previous node, None for the first.
+        nearest: the older node with the nearest pose on the final map: (node, m, deg), None if there is none.
+        template, founded: number of its view template, and whether the node created that template.
+        poses: `odometry` or back-end -> (3,) final pose of the node, m and rad.
+        gate: the region in which older nodes were considered for a loop, None if not stored.
+        ranked: (n, 3) the best older nodes by the scores of their views: node, score G, shift in columns.
+        chain: odometry and registration edges that end at the node.
+        loops: loop closures considered when the node was made, or proposed for it after the drive.
+        no_loops: why no loop was considered; empty if unknown.
         later: loop closures that later nodes considered with this one.
     """
 
@@ -110,7 +109,7 @@ class NodeStory:
     later: list[Decision]
 
     def to_json(self) -> dict[str, Any]:
-        """The story as plain values for JSON."""
+        """The decisions at the node as a dictionary of JSON values."""
         return {
             "node": self.node,
             "stamp_ns": self.stamp_ns,
@@ -133,16 +132,16 @@ class NodeStory:
 
 @dataclass(frozen=True, slots=True)
 class FrameStory:
-    """The decisions at one time.
+    """The decisions made at one time of a recording.
 
     Attributes:
-        stamp_ns, time_s: of the nearest time in the map file.
+        stamp_ns, time_s: time in the map file nearest to the one asked for: stamp, and seconds since the first stamp.
         at_node: the last node made until then.
-        moved: (m, deg) since that node.
+        moved: distance (m) and turn (deg) since that node.
         made: whether a node was made at this time.
         reason: why a node was made, or why not.
-        next_node, next_time_s: the next node, None at the end.
-        poses: name -> (3,) the robot's pose as estimated at the time, `odometry` first.
+        next_node, next_time_s: the next node and its time, None if none follows.
+        poses: `odometry` or back-end -> (3,) the robot's pose as it was estimated at this time, m and rad.
     """
 
     stamp_ns: int
@@ -156,7 +155,7 @@ class FrameStory:
     poses: Mapping[str, Array]
 
     def to_json(self) -> dict[str, Any]:
-        """The story as plain values for JSON."""
+        """The decisions at the time as a dictionary of JSON values."""
         return {
             "stamp_ns": self.stamp_ns,
             "time_s": self.time_s,
@@ -172,14 +171,14 @@ class FrameStory:
 
 
 class Explainer:
-    """Answers questions about one session. It is a context manager.
+    """Answers questions about the decisions in one session. It is a context manager.
 
     Args:
         folder: the session folder.
 
     Raises:
-        StoreError: no session there.
-        EvaluationError: its map holds no node.
+        StoreError: the folder holds no session.
+        EvaluationError: the session's map holds no node.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -200,14 +199,14 @@ class Explainer:
 
     @property
     def primary(self) -> str:
-        """The primary back-end."""
+        """Name of the session's primary back-end."""
         return self._store.primary
 
     def node(self, number: int) -> NodeStory:
-        """The decisions at a node.
+        """The decisions made at the node with this number.
 
         Raises:
-            EvaluationError: it does not exist.
+            EvaluationError: the node does not exist.
         """
         if not 0 <= number < len(self._map):
             raise EvaluationError(f"{self._folder.path}: node {number} does not exist; expected one of 0..{len(self._map) - 1}")
@@ -237,10 +236,10 @@ class Explainer:
         )
 
     def frame(self, time_s: float) -> FrameStory:
-        """The decisions at a time: seconds since the start, or (beyond 1e6) a stamp.
+        """The decisions made at a time: seconds since the start of the recording, or (if beyond 1e6) a stamp in seconds.
 
         Raises:
-            EvaluationError: the recording does not cover it.
+            EvaluationError: the recording does not cover the time.
         """
         track = self._store.track()
         stamps = track.stamps_ns

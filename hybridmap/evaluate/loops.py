@@ -1,7 +1,7 @@
-"""How well the stored profiles of a session tell its places apart.
+"""How well the stored scanline profiles of a session tell its places apart.
 
 Two nodes show *the same* place if they are within `same_m` and `same_deg` of each other, *different* ones if they are
-beyond `other_m` or `other_deg`; other pairs are not used. Only nodes at least `gap_s` older count.
+beyond `other_m` or `other_deg`; other pairs are not used. Each node is compared only with nodes at least `gap_s` older.
 """
 
 from __future__ import annotations
@@ -32,7 +32,13 @@ MOST_QUERIES = 400
 
 @dataclass(frozen=True, slots=True)
 class CandidateLimits:
-    """When two nodes show the same place, and when different ones; see the docstring of the module."""
+    """Limits by which two nodes count as the same place or as different places.
+
+    Attributes:
+        same_m, same_deg: largest distance and turn between nodes at the same place.
+        other_m, other_deg: nodes farther apart than either are at different places; pairs in between are not used.
+        gap_s: least time between two nodes that are compared.
+    """
 
     same_m: float = 1.0
     same_deg: float = 30.0
@@ -43,14 +49,14 @@ class CandidateLimits:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One way of computing the score G.
+    """Settings by which the score G of two views is computed from their scanline profiles.
 
     Attributes:
-        mode: the reading of G.
-        mu_r, mu_d: weights of intensity and depth.
+        mode: formula of G, see `vision.templates.combine`.
+        mu_r, mu_d: weights of the intensity and of the depth profile.
         max_shift: largest shift tried, columns.
-        g_bar: see `vision.templates.combine`.
-        sequence: consecutive views that must match.
+        g_bar: definition of g_bar in G, see `vision.templates.combine`.
+        sequence: number of consecutive views over which G is averaged.
         circular: whether the profiles cover 360 degrees.
     """
 
@@ -65,14 +71,14 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class CandidateErrors:
-    """How well one reading of G tells places apart.
+    """How well the score G of two views tells places apart. A revisit is a view with an older view of the same place.
 
     Attributes:
         pair_auc: probability that a pair of the same place scores better than one of different places; 0.5 by chance.
         top1: share of the revisits whose best match among all older nodes is the same place.
         average_precision: area under the precision-recall curve of the best matches.
         recall_full_precision: largest recall of the revisits at a threshold without any false match.
-        queries, revisits, pairs: number of compared views, of those that are revisits, and of judged pairs.
+        queries, revisits, pairs: number of views that were compared with older ones, of revisits, and of pairs used.
     """
 
     pair_auc: float
@@ -86,11 +92,11 @@ class CandidateErrors:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """Which pairs of nodes show the same place: rows are the queries, columns all nodes.
+    """Which pairs of nodes show the same place, by their true poses.
 
     Attributes:
-        queries: (Q,) node numbers, ascending.
-        same, different: (Q, N); both False if a pair is not judged.
+        queries: (Q,) numbers of the nodes that are compared with older ones, ascending.
+        same, different: (Q, N) for each of them and each of all N nodes; both False if the pair is not used.
     """
 
     queries: Indices
@@ -109,7 +115,14 @@ def judge_pairs(
     limits: CandidateLimits = DEFAULT_LIMITS,
     max_gap_s: float = MAX_GAP_S,
 ) -> Truth:
-    """Determine which nodes made at given stamps (N,) show the same place."""
+    """Determine from the true poses which nodes show the same place.
+
+    Args:
+        stamps_ns: (N,) stamps of the nodes.
+        truth: true trajectory, in any frame.
+        limits: when two nodes show the same place.
+        max_gap_s: longest gap of the truth over which it is interpolated.
+    """
     known = known_at(truth, stamps_ns, max_gap_s)
     poses: Array = truth.at(stamps_ns) if known.any() else np.zeros((len(stamps_ns), 3))
     candidates = np.flatnonzero(known & (stamps_ns - stamps_ns[0] >= limits.gap_s * NS_PER_S))
@@ -128,9 +141,9 @@ def score_matrix(profiles: Sequence[Profile], queries: Indices, reading: Reading
     """Scores of views against all older ones.
 
     Args:
-        profiles: of all nodes, (bands, width) each.
-        queries: (Q,) the views, ascending.
-        reading: how to score.
+        profiles: scanline profile of every node, (bands, width) each.
+        queries: (Q,) numbers of the nodes whose views are compared with older ones, ascending.
+        reading: how the score is computed.
 
     Returns:
         (Q, N), smaller for a better match; infinite where a node is not older than the view.
@@ -151,7 +164,7 @@ def score_matrix(profiles: Sequence[Profile], queries: Indices, reading: Reading
 
 
 def candidate_errors(scores: Array, truth: Truth) -> CandidateErrors:
-    """Evaluate scores (Q, N), smaller for a better match."""
+    """Evaluate scores (Q, N), smaller for a better match, against the true places."""
     same, different = scores[truth.same], scores[truth.different]
     pool = np.where(truth.same | truth.different, scores, np.inf)
     asked = np.flatnonzero(np.isfinite(pool).any(axis=1))
@@ -214,7 +227,14 @@ def _average_precision(precision: Array, recall: Array) -> float:
 
 @dataclass(frozen=True, slots=True)
 class ViewSettings:
-    """What of a session its profiles and their comparison depend on; `circular`: its laser sees all around."""
+    """The settings of a session by which its scanline profiles are computed and compared.
+
+    Attributes:
+        profile: size and normalisation of a profile.
+        matching: weights and threshold of the comparison.
+        mode: formula of the score G, see `vision.templates.combine`.
+        circular: whether the session's laser covers 360 degrees.
+    """
 
     profile: ProfileConfig
     matching: MatchingConfig
@@ -223,19 +243,20 @@ class ViewSettings:
 
 
 def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
-    """Evaluate the candidates of a session, with its own mode of matching.
+    """Evaluate how well the views of a session tell its places apart, with the session's own settings.
 
     Args:
         folder: the session folder.
         reference: ground truth in the TUM format; default: the session's own.
 
     Returns:
-        `pair_auc/<mode>`, `candidate_top1/<mode>`, `candidate_ap/<mode>`, `candidate_recall_full_precision/<mode>`.
+        `pair_auc/<mode>`, `candidate_top1/<mode>`, `candidate_ap/<mode>`, `candidate_recall_full_precision/<mode>`; `<mode>`
+        is the formula of the score.
 
     Raises:
-        StoreError: no session there.
+        StoreError: the folder holds no session.
         StreamError: the reference is damaged.
-        EvaluationError: no ground truth, or no profiles.
+        EvaluationError: there is no ground truth, or the session stores no profiles.
     """
     truth = truth_of(folder, reference)
     with MapStore.open(folder) as store:
@@ -261,7 +282,7 @@ def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
 
 
 def candidate_metrics(mode: str, errors: CandidateErrors) -> list[Metric]:
-    """The figures of one mode."""
+    """The errors of one formula of the score as metrics, named `<measure>/<mode>`."""
     views = f"of {errors.revisits} revisits among {errors.queries} views"
     rows = [
         ("pair_auc", errors.pair_auc),
@@ -273,10 +294,10 @@ def candidate_metrics(mode: str, errors: CandidateErrors) -> list[Metric]:
 
 
 def truth_of(folder: Path, reference: Path | None) -> Trajectory:
-    """The given reference, or the session's own.
+    """Read the given ground truth, or if it is None the session's own.
 
     Raises:
-        EvaluationError: there is neither.
+        EvaluationError: no reference is given, and the session has none.
     """
     session = SessionFolder(folder)
     session.require()
@@ -286,7 +307,7 @@ def truth_of(folder: Path, reference: Path | None) -> Trajectory:
 
 
 def view_settings(store: MapStore) -> ViewSettings:
-    """The settings of a session's profiles; settings that are missing in an older session have their defaults."""
+    """Read how a session computes and compares its profiles; settings that an older session lacks get their defaults."""
     tree: dict[str, Any] = without_gone(store.config_tree).get("vision") or {}
     rgbd = tree.get("rgbd") or {}
     return ViewSettings(

@@ -23,10 +23,10 @@ LOOP_GAP_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Relations:
-    """Verified relative poses.
+    """Verified relative poses of a recording.
 
     Attributes:
-        stamps_ns: (R, 2) int64, the two times.
+        stamps_ns: (R, 2) int64, the two times of each relation.
         deltas: (R, 3) pose of `base_link` at the second time seen from the first, m and rad.
     """
 
@@ -41,10 +41,10 @@ class Relations:
 
 @dataclass(frozen=True, slots=True)
 class ErrorStatistics:
-    """Mean and (population) standard deviation of the errors; NaN if no relation could be used.
+    """Mean and (population) standard deviation of relation errors; NaN if no relation could be used.
 
     Attributes:
-        trans_mean_m, trans_std_m, rot_mean_deg, rot_std_deg: of the used relations.
+        trans_mean_m, trans_std_m, rot_mean_deg, rot_std_deg: mean and deviation of the errors of the used relations.
         used, total: number of relations whose two times the trajectory covers, and of all.
     """
 
@@ -93,10 +93,10 @@ def read_relations(path: Path) -> Relations:
 
 
 def relations_of(path: Path, trajectory: Trajectory) -> Relations:
-    """Read relations for a trajectory.
+    """Read verified relations from a file, for a trajectory of the same recording.
 
     Raises:
-        EvaluationError: as `read_relations`, or the trajectory covers none of them.
+        EvaluationError: the file is missing, empty or damaged, or the trajectory covers none of its relations.
     """
     relations = read_relations(path)
     if relation_errors(trajectory, relations).all.used == 0:

@@ -1,4 +1,4 @@
-"""All error figures of a session against a reference trajectory and verified relations."""
+"""All errors of a session against a reference trajectory and verified relations."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ log = logging.getLogger(__name__)
 def evaluate_session(
     folder: Path, reference: Path | None = None, relations: Path | None = None, *, loops: bool = False
 ) -> list[Metric]:
-    """Evaluate odometry and every back-end of a session, final and online; store the figures in its `metrics.json`.
-
-    If the file cannot be written, a warning is logged.
+    """Evaluate the trajectories of a session (odometry, and each back-end's final and online one) and store the metrics in its
+    `metrics.json`. If that file cannot be written, a warning is logged.
 
     Args:
         folder: the session folder.
         reference: ground truth in the TUM format; default: the session's own, if any.
-        relations: verified relative poses, lines `t1 t2 dx dy dyaw`.
-        loops: evaluate the candidates as well, see `evaluate_loops`.
+        relations: file of verified relative poses, lines `t1 t2 dx dy dyaw`.
+        loops: also evaluate how well the views tell places apart, see `evaluate_loops`.
 
     Returns:
-        Figures named `<measure>/<back-end>`; NaN if the data do not allow one.
+        Metrics named `<measure>/<back-end>`; NaN where the data do not allow a value.
 
     Raises:
-        StoreError: no session there.
+        StoreError: the folder holds no session.
         StreamError: the reference is damaged.
-        EvaluationError: nothing to compare with, no common stamps, or no views for the candidates.
+        EvaluationError: there is neither a reference nor a relations file, they share no stamps with the session, or `loops`
+            is set and the session stores no views.
     """
     session = SessionFolder(folder)
     session.require()
@@ -70,10 +70,10 @@ def evaluate_session(
 
 
 def session_trajectories(session: SessionFolder, store: MapStore) -> dict[str, Trajectory]:
-    """Name -> estimate of a session: `odometry`, then each back-end's final and `_online`.
+    """The estimated trajectories of a session: `odometry`, `<back-end>` (final) and `<back-end>_online` -> trajectory.
 
-    Read from `trajectory/`, or, after a killed run, from the map file. Poses while the robot was kidnapped are left out, as
-    far as the map knows.
+    They are read from `trajectory/`, or from the map file if the run was killed. Poses while the robot was kidnapped are left
+    out where the map records the kidnapping.
     """
     written = session.trajectories()
     estimates = {ODOMETRY: written[ODOMETRY] if ODOMETRY in written else store.track().odometry}
@@ -120,10 +120,15 @@ def _names(estimate: str) -> tuple[str, str, str]:
 
 
 def against_truth(estimate: str, trajectory: Trajectory, truth: Trajectory) -> list[Metric]:
-    """ATE, RPE and drift of one estimate, named `<measure>/<estimate>`.
+    """ATE, RPE and drift of one estimated trajectory, as metrics.
+
+    Args:
+        estimate: its name: `odometry`, `<back-end>` or `<back-end>_online`.
+        trajectory: the estimate.
+        truth: true trajectory.
 
     Raises:
-        EvaluationError: too few stamps in common.
+        EvaluationError: fewer than three stamps in common.
     """
     suffix, backend, when = _names(estimate)
     try:
@@ -147,7 +152,13 @@ def against_truth(estimate: str, trajectory: Trajectory, truth: Trajectory) -> l
 
 
 def against_relations(estimate: str, trajectory: Trajectory, relations: Relations) -> list[Metric]:
-    """Relation errors of one estimate, over all relations and over those of more than 60 s, named `<measure>/<estimate>`."""
+    """Relation errors of one estimated trajectory, as metrics: over all relations and over those that span more than 60 s.
+
+    Args:
+        estimate: its name: `odometry`, `<back-end>` or `<back-end>_online`.
+        trajectory: the estimate.
+        relations: verified relative poses.
+    """
     suffix, backend, when = _names(estimate)
     errors = relation_errors(trajectory, relations)
     if not suffix and backend == ODOMETRY and errors.all.used < 0.5 * errors.all.total:
@@ -201,12 +212,12 @@ def _edge_metrics(kind: str, errors: EdgeErrors) -> list[Metric]:
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """Errors of some solutions.
+    """Errors of several solutions of one graph.
 
     Attributes:
-        metrics: `<measure>/<title>`, named as by `evaluate`; empty if there is nothing to compare with.
-        truth: the true path, m and rad, aligned to the solution with the lowest ATE: pieces (P, 3) between the known
-            kidnappings; empty if unknown.
+        metrics: errors named `<measure>/<title of the solution>`; empty without ground truth and relations.
+        truth: the true path, m and rad, aligned to the solution with the lowest ATE, cut where the robot was kidnapped into
+            pieces (P, 3); empty if unknown.
     """
 
     metrics: tuple[Metric, ...]
@@ -216,17 +227,18 @@ class Judged:
 def judge_solutions(
     folder: Path, solutions: Mapping[str, Array], reference: Path | None = None, relations: Path | None = None
 ) -> Judged:
-    """Evaluate poses of a session's nodes over the whole recording.
+    """Evaluate several solutions of a session's graph, over the whole recording.
 
     Args:
-        folder: the session.
-        solutions: title -> poses (N, 3), m and rad; `odometry` stands for dead reckoning at every stamp.
+        folder: the session folder.
+        solutions: title -> poses (N, 3) of the nodes, m and rad; the title `odometry` stands for dead reckoning at every stamp.
         reference: ground truth in the TUM format; default: the session's own, if any.
-        relations: verified relative poses, lines `t1 t2 dx dy dyaw`.
+        relations: file of verified relative poses, lines `t1 t2 dx dy dyaw`.
 
     Raises:
-        StoreError: no session there.
-        StreamError, EvaluationError: the reference or the relations are damaged, or have no time in common with it.
+        StoreError: the folder holds no session.
+        StreamError: the reference is damaged.
+        EvaluationError: the relations are damaged, or reference or relations share no time with the session.
     """
     own = SessionFolder(folder).groundtruth
     truth_file = reference or (own if own.is_file() else None)

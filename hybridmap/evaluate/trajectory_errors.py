@@ -25,8 +25,8 @@ class AbsoluteError:
     """Distances between an estimate and the reference after the best SE(2) alignment.
 
     Attributes:
-        rmse_m, mean_m, median_m, max_m: of the distances.
-        pose_reference_estimate: (3,) the alignment: pose of the estimate's map frame in the reference's.
+        rmse_m, mean_m, median_m, max_m: statistics of the distances.
+        pose_reference_estimate: (3,) the alignment: pose of the estimate's map frame in the reference's, m and rad.
         used, total: number of compared poses of the estimate, and of all.
     """
 
@@ -41,12 +41,12 @@ class AbsoluteError:
 
 @dataclass(frozen=True, slots=True)
 class RelativeError:
-    """Errors of the motion over a fixed distance or time.
+    """Errors of the relative pose over pieces of fixed length or duration (RPE).
 
     Attributes:
-        trans_rmse_m, trans_mean_m: of the translation.
-        rot_rmse_deg, rot_mean_deg: of the rotation.
-        pairs: number of pieces compared; the figures are NaN if there is none.
+        trans_rmse_m, trans_mean_m: errors of the translation.
+        rot_rmse_deg, rot_mean_deg: errors of the rotation.
+        pairs: number of pieces compared; the errors are NaN if it is 0.
     """
 
     trans_rmse_m: float
@@ -60,13 +60,13 @@ def absolute_error(estimate: Trajectory, reference: Trajectory) -> AbsoluteError
     """ATE: the distances that remain after the estimate is aligned to the reference by one SE(2) transform.
 
     Raises:
-        EvaluationError: too few stamps in common.
+        EvaluationError: fewer than three stamps in common.
     """
     return absolute_error_of(associate(estimate, reference))
 
 
 def absolute_error_of(pairs: PosePairs) -> AbsoluteError:
-    """ATE of associated poses."""
+    """ATE of an estimate and a reference at common stamps."""
     pose = align(pairs.reference, pairs.estimate)
     offset = compose(pose, pairs.estimate)[:, :2] - pairs.reference[:, :2]
     distance = np.hypot(offset[:, 0], offset[:, 1])
@@ -85,13 +85,13 @@ def relative_error(estimate: Trajectory, reference: Trajectory, delta: float, un
     """RPE: error of the relative pose over every piece of `delta` metres of the reference's path, or of `delta` seconds.
 
     Raises:
-        EvaluationError: too few stamps in common.
+        EvaluationError: fewer than three stamps in common.
     """
     return relative_error_of(associate(estimate, reference), delta, unit)
 
 
 def relative_error_of(pairs: PosePairs, delta: float, unit: Literal["m", "s"]) -> RelativeError:
-    """RPE of associated poses."""
+    """RPE of an estimate and a reference at common stamps, over pieces of `delta` metres or seconds."""
     along = travel(pairs.reference) if unit == "m" else (pairs.stamps_ns - pairs.stamps_ns[0]) / NS_PER_S
     first, last = _pieces(along, delta)
     if len(first) == 0:
@@ -107,10 +107,9 @@ def relative_error_of(pairs: PosePairs, delta: float, unit: Literal["m", "s"]) -
 
 
 def drift_percent(pairs: PosePairs) -> float:
-    """Mean translational error in % of travel over pieces of 5, 10, 20, ... 160 m (the whole path if that is shorter).
+    """Mean translational error in % of the distance travelled, over pieces of 5, 10, 20, ... 160 m.
 
-    Returns:
-        NaN if the reference does not move.
+    A path shorter than 5 m is one piece. Returns NaN if the reference does not move.
     """
     along = travel(pairs.reference)
     lengths = [length for length in _DRIFT_LENGTHS_M if length <= along[-1]] or [float(along[-1])]
@@ -125,7 +124,15 @@ def drift_percent(pairs: PosePairs) -> float:
 
 
 def motion_errors(pairs: PosePairs, first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Translation (m) and rotation (deg) between the estimate's and the reference's motion from `first` to `last`."""
+    """Errors of the estimate's motion between pairs of poses.
+
+    Args:
+        pairs: estimate and reference at common stamps.
+        first, last: (K,) indices of the poses at which each motion begins and ends.
+
+    Returns:
+        Translation errors (K,), m, and rotation errors (K,), degrees.
+    """
     moved = between(pairs.estimate[first], pairs.estimate[last])
     truly = between(pairs.reference[first], pairs.reference[last])
     error = between(truly, moved)

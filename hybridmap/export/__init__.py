@@ -10,10 +10,10 @@ class Format:
     """An export format.
 
     Attributes:
-        writer: `module:function` below this package; it writes one file and returns figures about it.
+        writer: `module:function` below this package; it writes one file and returns metrics of it.
         suffix: usual suffix of the file.
         description: one line for people.
-        companion: suffix of a second file in the same folder, if there is one.
+        companion: suffix of a second file in the same folder, None if there is only one.
         by_suffix: whether Open3D needs this suffix to read the file.
     """
 
@@ -25,13 +25,13 @@ class Format:
 
 
 FORMATS: dict[str, Format] = {
-    "tum": Format("poses:write_tum_trajectory", ".tum", "trajectory: stamp, position, quaternion a line"),
-    "kitti": Format("poses:write_kitti_trajectory", ".txt", "trajectory: the 12 numbers of a 3x4 pose a line"),
+    "tum": Format("poses:write_tum_trajectory", ".tum", "trajectory: stamp, position, quaternion per line"),
+    "kitti": Format("poses:write_kitti_trajectory", ".txt", "trajectory: the 12 numbers of a 3x4 pose per line"),
     "g2o": Format("poses:write_g2o_graph", ".g2o", "pose graph: VERTEX_SE2, EDGE_SE2"),
     "lineset": Format("poses:write_lineset", ".ply", "graph as an Open3D LineSet, edges coloured by kind", by_suffix=True),
     "posegraph": Format("poses:write_posegraph", ".json", "graph as an Open3D PoseGraph", by_suffix=True),
     "ply": Format("keyframes:write_cloud", ".ply", "merged point cloud, PLY", by_suffix=True),
     "pcd": Format("keyframes:write_cloud", ".pcd", "merged point cloud, PCD", by_suffix=True),
-    "grid": Format("keyframes:write_grid", ".yaml", "occupancy grid for map_server: yaml and pgm", ".pgm"),
+    "grid": Format("keyframes:write_grid", ".yaml", "occupancy grid for map_server, yaml and pgm", ".pgm"),
 }
 """A new format is a row here and its writer. The command line reads it without loading what writes."""

@@ -43,7 +43,7 @@ class ExportOptions:
 
 
 class SessionView:
-    """A session with the poses of one back-end."""
+    """A session opened for export, with the poses of one back-end."""
 
     def __init__(self, store: MapStore, backend: str, options: ExportOptions) -> None:
         self.store = store
@@ -52,19 +52,19 @@ class SessionView:
 
     @cached_property
     def experiences(self) -> ExperienceMap:
-        """The map."""
+        """The nodes and edges of the session's map."""
         return self.store.map()
 
     @cached_property
     def poses(self) -> Array:
-        """(N, 3) pose of each node in `map` by the chosen back-end (the chain's for odometry), m and rad."""
+        """(N, 3) pose of each node in `map` by the chosen back-end, m and rad; for `odometry` the odometry edges in a chain."""
         if self.backend == ODOMETRY:
             return self.experiences.initial
         return self.solution.poses
 
     @cached_property
     def solution(self) -> Solution:
-        """The back-end's result: that of the session, else solved now from the graph in the map file."""
+        """The chosen back-end's solution: the one stored in the session, else the graph of the map file is solved now."""
         stored = self.store.solutions().get(self.backend)
         if stored is not None:
             return stored
@@ -74,24 +74,29 @@ class SessionView:
 
     @cached_property
     def rejected(self) -> frozenset[int]:
-        """Numbers of the loop edges that the back-end rejected."""
+        """Numbers of the loop edges that the chosen back-end rejected."""
         return frozenset() if self.backend == ODOMETRY else frozenset(self.solution.report.rejected_edge_ids)
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """Pose of `base_link` in `map` at every stamp."""
+        """Poses of `base_link` in `map` at every stamp of the session, by the chosen back-end."""
         track = self.store.track()
         return track.odometry if self.backend == ODOMETRY else trajectory_of(track, self.poses)
 
 
 def open_view(folder: Path, backend: str | None, options: ExportOptions) -> SessionView:
-    """Open a session with the poses of one back-end (default: the primary one). Close its `store` after use.
+    """Open a session with the poses of one back-end. Close the `store` of the view after use.
 
-    A back-end that was not part of the run, or whose run was killed, solves the graph in the map file.
+    A back-end without a stored solution (not part of the run, or the run was killed) solves the graph in the map file.
+
+    Args:
+        folder: the session folder.
+        backend: its name; None for the primary one.
+        options: resolution and limits of the export.
 
     Raises:
-        StoreError: no session there.
-        ExportError: there is no such back-end, or the map holds no node.
+        StoreError: the folder holds no session.
+        ExportError: the back-end does not exist, or the map holds no node.
     """
     SessionFolder(folder).require()
     store = MapStore.open(folder)
@@ -114,7 +119,7 @@ Writer = Callable[[SessionView, Path], list[Metric]]
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """The written files, the back-end of their poses, and figures about them."""
+    """The outcome of an export: the written files, the back-end whose poses they hold, and metrics of the files."""
 
     files: tuple[Path, ...]
     backend: str
@@ -136,14 +141,14 @@ def export_session(
         folder: the session folder.
         format_name: one of `FORMATS`.
         out: the file to write; `grid` writes a `.yaml` and a `.pgm` of that name.
-        backend: whose poses; default: the primary's.
+        backend: name of the back-end whose poses to use; None for the primary one.
         overwrite: replace existing files.
         options: resolution and limits.
 
     Raises:
-        StoreError: no session there.
-        ExportError: unknown format or back-end, or no data of the kind in the session.
-        OutputError: a file exists, or cannot be written.
+        StoreError: the folder holds no session.
+        ExportError: the format or back-end is unknown, or the session holds no data for the format.
+        OutputError: a file exists already, or cannot be written.
     """
     if format_name not in FORMATS:
         raise ExportError(f"unknown format {format_name!r}; expected one of: {', '.join(FORMATS)}")

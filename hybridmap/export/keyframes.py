@@ -62,7 +62,9 @@ class _Fan:
 
 
 def write_grid(view: SessionView, path: Path) -> list[Metric]:
-    """Write `path` (yaml) and the picture beside it (pgm): 0 occupied, 254 free, 205 unknown, top row = largest y.
+    """Write an occupancy grid: `path` (yaml) and a picture beside it (pgm).
+
+    Pixels are 0 for occupied, 254 for free, 205 for unknown; the top row has the largest y.
 
     Raises:
         ExportError: the session's keyframes hold no obstacle, or the grid would be too large.
@@ -94,10 +96,10 @@ def write_grid(view: SessionView, path: Path) -> list[Metric]:
 
 
 def build_grid(view: SessionView) -> OccupancyGrid:
-    """Ray-cast every keyframe into log-odds.
+    """Build an occupancy grid: ray-cast every keyframe into log-odds.
 
     Raises:
-        ExportError: as `write_grid`.
+        ExportError: the session's keyframes hold no obstacle, or the grid would be too large.
     """
     fans = list(_fans(view))
     if not fans:
@@ -172,7 +174,7 @@ def _fan(seen: Seen, options: ExportOptions) -> _Fan:
 
 
 def write_cloud(view: SessionView, path: Path) -> list[Metric]:
-    """Reduce the points of all keyframes to one per voxel and write PLY or PCD, by the suffix.
+    """Write the points of all keyframes, reduced to one per voxel, as PLY or PCD, depending on the suffix of `path`.
 
     Raises:
         ExportError: the session's keyframes hold no point.
@@ -186,10 +188,10 @@ def write_cloud(view: SessionView, path: Path) -> list[Metric]:
 
 
 def merged_cloud(view: SessionView) -> Any:
-    """The reduced cloud in `map` as an `open3d.geometry.PointCloud`.
+    """The points of all keyframes in `map`, reduced to one per voxel, as an `open3d.geometry.PointCloud`.
 
     Raises:
-        ExportError: as `write_cloud`.
+        ExportError: the session's keyframes hold no point.
     """
     import open3d as o3d
 

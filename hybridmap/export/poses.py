@@ -28,16 +28,19 @@ _PLANAR = (3, 4, 2)
 
 
 def write_g2o_graph(view: SessionView, path: Path) -> list[Metric]:
-    """Nodes at the back-end's poses and all accepted edges, 17 significant digits."""
+    """Write a g2o file: the nodes at the back-end's poses and all accepted edges, with 17 significant digits."""
     graph = view.experiences.pose_graph()
     write_g2o(path, graph, view.poses)
     return _counts("g2o", graph.n_nodes, graph.n_edges)
 
 
 def write_lineset(view: SessionView, path: Path) -> list[Metric]:
-    """Nodes as points in the plane z = 0, accepted edges as lines: odometry grey, registration green, loops red.
+    """Write an Open3D LineSet: nodes as points in the plane z = 0, accepted edges as lines.
 
-    A loop that the back-end rejected is yellow.
+    Odometry edges are grey, registration edges green, loops red, and loops that the back-end rejected yellow.
+
+    Raises:
+        ExportError: the graph has no edge; Open3D cannot read such a file.
     """
     import open3d as o3d
 
@@ -55,12 +58,12 @@ def write_lineset(view: SessionView, path: Path) -> list[Metric]:
 
 
 def write_posegraph(view: SessionView, path: Path) -> list[Metric]:
-    """Open3D's PoseGraph: nodes `T_map_node`; edges carry the source seen from the target, loops are `uncertain`.
+    """Write an Open3D PoseGraph: nodes hold `T_map_node`, edges the source's pose seen from the target; loops are `uncertain`.
 
-    Out of the plane the information is as large as the largest within it, so that Open3D's optimiser stays planar.
+    The information out of the plane equals the largest one within it, so that Open3D's optimiser stays planar.
 
     Raises:
-        ExportError: the graph has no edge; `read_pose_graph` fails on such a file.
+        ExportError: the graph has no edge; Open3D cannot read such a file.
     """
     import open3d as o3d
 
@@ -99,13 +102,16 @@ def _counts(name: str, nodes: int, edges: int) -> list[Metric]:
 
 
 def write_tum_trajectory(view: SessionView, path: Path) -> list[Metric]:
-    """`stamp x y z qx qy qz qw` of `base_link` in `map` at every stamp; s and m."""
+    """Write a TUM trajectory: `stamp x y z qx qy qz qw` of `base_link` in `map`, a line for every stamp; s and m."""
     write_tum(path, view.trajectory)
     return [Metric("poses/tum", len(view.trajectory), "1", "poses written")]
 
 
 def write_kitti_trajectory(view: SessionView, path: Path) -> list[Metric]:
-    """The upper 3x4 of `T_map_base`, row by row, one line per stamp (the stamps of the `tum` export); z points up."""
+    """Write a KITTI trajectory: the upper 3x4 of `T_map_base`, row by row, one line per stamp; z points up.
+
+    The file holds no stamps; they are those of the `tum` export of the same session.
+    """
     poses = view.trajectory.poses
     cos, sin, zero, one = np.cos(poses[:, 2]), np.sin(poses[:, 2]), np.zeros(len(poses)), np.ones(len(poses))
     rows = np.stack([cos, -sin, zero, poses[:, 0], sin, cos, zero, poses[:, 1], zero, zero, one, zero], axis=1)

@@ -34,18 +34,18 @@ _WORST = 6  # edges a row
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """The content of the page.
+    """The content of the page that compares back-ends on one graph.
 
     Attributes:
         title: headline.
-        start: what the graph's initial poses are, in words.
+        start: origin of the graph's initial poses, in words.
         head: facts about the graph, shown as `key: value`.
-        graph: the graph.
-        rows: the back-ends.
-        cells: the table: column titles, then one list of cells per row of `rows`.
-        settings: of the back-ends.
+        graph: the graph that was solved.
+        rows: one result per back-end and way of solving.
+        cells: the table as text: column titles, then one list of cells per entry of `rows`.
+        settings: settings of the back-ends.
         truth: pieces (P, 3) of the true path in the frame of the maps, m and rad; empty if unknown.
-        carried: where the robot was kidnapped; no line is drawn there.
+        kidnapped: the places where the robot was kidnapped; no line is drawn there.
     """
 
     title: str
@@ -60,10 +60,17 @@ class Compared:
 
 
 def write_comparison(place: Held, compared: Compared) -> Path:
-    """Write `maps.png` and `comparison.html` into a folder that is locked as `COMPARISON`; returns the page.
+    """Write `maps.png` and `comparison.html`.
+
+    Args:
+        place: the folder, locked against other writers.
+        compared: content of the page.
+
+    Returns:
+        The path of the page.
 
     Raises:
-        OutputError: it cannot be written to.
+        OutputError: the folder cannot be written to.
     """
     graph, rows = compared.graph, compared.rows
     picture = panels(graph, rows, compared.start, compared.kidnapped)
@@ -97,7 +104,7 @@ def write_comparison(place: Held, compared: Compared) -> Path:
 
 
 def worst_edges(graph: PoseGraph, row: Row) -> list[str]:
-    """The inlier edges of a solution with the largest squared residuals, worst first: number, ends, kind, squared residual."""
+    """Describe the inlier edges with the largest squared residuals, worst first: number, end nodes, kind, squared residual."""
     assert row.solution is not None
     squared = squared_norms(graph, row.solution.poses)
     squared[np.isin(graph.edge_ids, row.solution.report.rejected_edge_ids)] = -1.0
@@ -118,14 +125,20 @@ _BAR_IN = 0.34  # height of a back-end's bar of weights
 
 
 def solved(rows: Sequence[Row]) -> dict[str, Array]:
-    """Title -> poses (N, 3) of the rows that have a map; a back-end that diverged has only its initial poses."""
+    """Title -> poses (N, 3) of the results that have a map. A back-end that diverged has none, only its initial poses."""
     return {row.title: row.solution.poses for row in rows if row.has_map and row.solution is not None}
 
 
 def overlay(rows: Sequence[Row], truth: Sequence[Array], kidnapped: Sequence[Kidnapping]) -> str:
-    """The chain of nodes of every row in one frame, over the pieces (P, 3) of the truth if known; a `data:` URI.
+    """Draw the maps of all results in one frame, each as a line through its nodes, over the true path if known.
 
-    Empty if no row has a map.
+    Args:
+        rows: one result per back-end and way of solving.
+        truth: pieces (P, 3) of the true path, m and rad; empty if unknown.
+        kidnapped: the places where the robot was kidnapped; no line is drawn there.
+
+    Returns:
+        A `data:` URI; an empty string if no result has a map.
     """
     maps = solved(rows)
     if not maps:
@@ -148,13 +161,16 @@ def overlay(rows: Sequence[Row], truth: Sequence[Array], kidnapped: Sequence[Kid
 
 
 def panels(graph: PoseGraph, rows: Sequence[Row], start: str, kidnapped: Sequence[Kidnapping]) -> bytes:
-    """Each map with its loops and its rejected loops, side by side, as PNG; the same figure gives the same bytes.
+    """Draw each map with its loops and its rejected loops, side by side. The same input gives the same bytes.
 
     Args:
-        graph: the edges.
-        rows: the maps.
-        start: what the graph's initial poses are, in words.
-        carried: where the robot was kidnapped; no line is drawn there.
+        graph: the graph that was solved; its edges are drawn.
+        rows: one result per back-end and way of solving.
+        start: origin of the graph's initial poses, in words.
+        kidnapped: the places where the robot was kidnapped; no line is drawn there.
+
+    Returns:
+        A PNG file.
     """
     maps = solved(rows)
     if not any(np.allclose(poses, graph.initial) for poses in maps.values()):
@@ -176,7 +192,11 @@ def panels(graph: PoseGraph, rows: Sequence[Row], start: str, kidnapped: Sequenc
 
 
 def convergence(rows: Sequence[Row]) -> str:
-    """Batch: chi2 over iterations; incremental: unit variance over nodes. A `data:` URI, empty without curves."""
+    """Draw how each result converged: chi2 over the iterations (batch), unit variance over the nodes (incremental).
+
+    Returns:
+        A `data:` URI; an empty string if no result recorded its convergence.
+    """
     traced = [row for row in rows if row.has_map and row.curve is not None and row.backend != ODOMETRY]
     ways = [way for way in Way if any(row.way is way for row in traced)]
     if not ways:
@@ -195,7 +215,11 @@ def convergence(rows: Sequence[Row]) -> str:
 
 
 def weights(graph: PoseGraph, rows: Sequence[Row]) -> str:
-    """Weight of every loop by its number, for each row with weights or rejected loops; a `data:` URI or empty."""
+    """Draw the weight of every loop over its number, for each result with weights or rejected loops.
+
+    Returns:
+        A `data:` URI; an empty string if there is no such result.
+    """
     ids = graph.edge_ids[graph.is_loop].tolist()
     bars: dict[str, list[float]] = {}
     for row in rows:
@@ -218,9 +242,10 @@ def weights(graph: PoseGraph, rows: Sequence[Row]) -> str:
 
 
 def residuals(graph: PoseGraph, rows: Sequence[Row]) -> str:
-    """Share of edges (%) with a squared Mahalanobis residual below a value, one line per row; a `data:` URI.
+    """Draw the share of edges (%) whose squared Mahalanobis residual is below a value, one line per result.
 
-    Empty if no row has a map.
+    Returns:
+        A `data:` URI; an empty string if no result has a map.
     """
     if not solved(rows):
         return ""
@@ -270,7 +295,14 @@ def _box(maps: Sequence[Array]) -> tuple[Array, Array]:
 
 
 def draw_map(axes: Any, graph: PoseGraph, poses: Array, rejected: tuple[int, ...]) -> None:
-    """Draw the edges of one map: rejected loops (by edge id) below the other loops, and these below the chain."""
+    """Draw the edges of one map: rejected loops lowest, the other loops over them, edges between consecutive nodes on top.
+
+    Args:
+        axes: matplotlib axes.
+        graph: the graph.
+        poses: (N, 3) poses of its nodes, m and rad.
+        rejected: numbers of the loop edges that the back-end rejected.
+    """
     lost, loops = np.isin(graph.edge_ids, np.array(rejected, dtype=np.int64)), graph.is_loop
     _draw_edges(axes, graph, poses, lost, color=_REJECTED, linewidths=0.4, alpha=0.6, zorder=1.1)
     _draw_edges(axes, graph, poses, loops & ~lost, color=_LOOP, linewidths=0.6, zorder=1.2)

@@ -32,16 +32,16 @@ _NEW, _OLD = style.PRIMARY, style.ODOMETRY
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """One loop closure of the page.
+    """One example of a loop closure on the page.
 
     Attributes:
-        title: its nodes, and the verdict.
+        title: its two nodes, and whether it was accepted.
         accepted: whether it is in the graph.
-        reason: why.
-        facts: (name, value with unit) rows.
+        reason: why it was accepted or rejected.
+        facts: (name, value with unit) of each quantity shown.
         photos: colour images of the newer and the older node as `data:` URIs; empty without a camera.
-        overlay: both views from above, one over the other; None without points.
-        profiles: both scanline profiles; None without profiles.
+        overlay: picture of both nodes' points from above, aligned by the measured relative pose; None without points.
+        profiles: picture of both scanline profiles; None without profiles.
     """
 
     title: str
@@ -54,11 +54,11 @@ class Example:
 
 
 def examples(scene: SessionScene, store: MapStore, points_of: Mapping[int, Array]) -> list[Example]:
-    """Some accepted loops, spread over the drive, and the rejected loop that would have bent the map most.
+    """Choose example loops: some accepted ones, spread over the drive, and the rejected one that contradicts the map most.
 
     Args:
-        scene: the session.
-        store: its keyframes.
+        scene: content of the session's page.
+        store: the session's map file, which holds the keyframes.
         points_of: node -> its points, (M, 2) in `base_link`, m.
     """
     fates = loops_by_fate(scene)
@@ -69,7 +69,7 @@ def examples(scene: SessionScene, store: MapStore, points_of: Mapping[int, Array
 
 
 def spread(edges: Sequence[Edge], count: int) -> list[Edge]:
-    """`count` of the edges, from the middle of as many equal parts of the list."""
+    """Choose `count` edges, evenly spaced in the list."""
     if len(edges) <= count:
         return list(edges)
     return [edges[(2 * k + 1) * len(edges) // (2 * count)] for k in range(count)]
@@ -246,7 +246,10 @@ _WORDS: dict[str, tuple[str, str]] = {
 
 
 def in_words(edge: Edge) -> list[tuple[str, str]]:
-    """(words, value with unit) of each figure of an edge, decisive ones first; a figure without words has its own name."""
+    """(description, value with unit) of each quantity stored with an edge, those that decided about it first.
+
+    A quantity without a description is listed by its name.
+    """
     figures = {check.figure: check.value for check in edge.checks} | dict(edge.figures)
     figures |= {"shift": edge.shift} if edge.shift else {}
     rows = []

@@ -24,11 +24,11 @@ _FAINTEST = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Raster:
-    """A picture of the building from above.
+    """A grey picture of the building from above.
 
     Attributes:
         grey: (H, W) in [0, 1], 0 without points; row 0 is the lowest y.
-        extent: left, right, bottom, top, m.
+        extent: left, right, bottom and top edge, m.
     """
 
     grey: NDArray[np.float32]
@@ -36,7 +36,12 @@ class Raster:
 
 
 def outline(keyframe: Mapping[str, NDArray[Any]], rig: Rig) -> Array:
-    """Points (M, 2) of a node, in `base_link`, m; empty if there is nothing to draw."""
+    """Points (M, 2) that the sensors saw at one node, from above, in `base_link`, m; empty without any.
+
+    Args:
+        keyframe: sensor data stored with the node, by name.
+        rig: the robot's sensors.
+    """
     seen = see(keyframe, rig, _MAX_DEPTH_M)
     if seen is None:
         return np.zeros((0, 2))
@@ -47,7 +52,12 @@ def outline(keyframe: Mapping[str, NDArray[Any]], rig: Rig) -> Array:
 
 
 def outlines(store: MapStore, count: int) -> dict[int, Array]:
-    """Node -> points in `base_link`, for `count` nodes, or for evenly spaced nodes if there are very many."""
+    """Node -> points (M, 2) that the sensors saw there, in `base_link`, m.
+
+    Args:
+        store: the session's map file.
+        count: number of nodes in the map. Of a very large map only evenly spaced nodes are read.
+    """
     rig = store.rig
     step = max(1, -(-count // _MAX_KEYFRAMES))
     found = {node: outline(store.keyframe(node), rig) for node in range(0, count, step)}
@@ -55,7 +65,7 @@ def outlines(store: MapStore, count: int) -> dict[int, Array]:
 
 
 def raster(points_of: Mapping[int, Array], poses: Array) -> Raster | None:
-    """Draw the points of every node at its pose (N, 3); None without points."""
+    """Draw the points of every node at its pose (N, 3), m and rad. Returns None if there are no points."""
     placed = [transform_points(poses[node], points) for node, points in points_of.items() if node < len(poses)]
     if not placed:
         return None

@@ -16,7 +16,12 @@ _FIRST = ("ate", "relation")
 
 @dataclass(frozen=True, slots=True)
 class TableRow:
-    """One row: a measure, its unit and meaning, and one cell per column (empty without a figure)."""
+    """One row of a table of metrics.
+
+    Attributes:
+        measure, unit, meaning: name of the metric, its unit and its description.
+        cells: one text per column; empty where there is no value.
+    """
 
     measure: str
     unit: str
@@ -25,9 +30,9 @@ class TableRow:
 
 
 def by_backend(metrics: Sequence[Metric], backends: Sequence[str]) -> list[TableRow]:
-    """One row per measure, one cell per back-end.
+    """Table of the metrics that belong to a back-end: one row per measure, one cell per back-end.
 
-    Errors come first, then the others in their order; the description is that of the last back-end with the measure.
+    Errors come first, the other measures in their order in the list.
     """
     measures: dict[str, dict[str, Metric]] = {}
     for metric in metrics:
@@ -43,7 +48,7 @@ def by_backend(metrics: Sequence[Metric], backends: Sequence[str]) -> list[Table
 
 
 def of_session(metrics: Sequence[Metric], backends: Sequence[str]) -> list[TableRow]:
-    """A row for each figure that belongs to no back-end."""
+    """Table of the metrics that belong to no back-end, one row each."""
     return [
         TableRow(metric.name, unit(metric), metric.description, (shown(metric),))
         for metric in metrics
@@ -52,13 +57,13 @@ def of_session(metrics: Sequence[Metric], backends: Sequence[str]) -> list[Table
 
 
 def shown(metric: Metric) -> str:
-    """The value with four significant digits, and whether it keeps its bar."""
+    """The value of a metric with four significant digits, and a tick or cross if it has a limit."""
     verdict = "" if metric.passed is None else " ✓" if metric.passed else " ✗"
     return number(metric.value) + verdict
 
 
 def number(value: float) -> str:
-    """Four significant digits, integers in full; a dash for a missing value."""
+    """A number with four significant digits, integers in full; a dash for NaN or infinity."""
     if not math.isfinite(value):
         return "–"
     if value == round(value) and abs(value) < 1e7:
@@ -67,7 +72,10 @@ def number(value: float) -> str:
 
 
 def interval(found: Interval) -> str:
-    """A mean with its interval, with as many decimals as the interval justifies, at most six; without one, why."""
+    """A mean with its confidence interval, with as many decimals as the interval justifies, at most six.
+
+    Without an interval: the mean, and why there is none.
+    """
     if not found.count:
         return number(found.value)
     if not found.known:
@@ -80,7 +88,7 @@ def interval(found: Interval) -> str:
 
 
 def length(value_m: float) -> tuple[str, str]:
-    """A length for people: (digits, unit), below a metre in cm."""
+    """Format a length: (digits, unit), below a metre in cm."""
     if not math.isfinite(value_m):
         return "–", "m"
     value, name = (100.0 * value_m, "cm") if abs(value_m) < 1.0 else (value_m, "m")
@@ -88,12 +96,12 @@ def length(value_m: float) -> tuple[str, str]:
 
 
 def duration(value_s: float) -> tuple[str, str]:
-    """A time for people: (digits, unit), beyond two minutes in minutes."""
+    """Format a duration: (digits, unit), beyond two minutes in minutes."""
     return (f"{value_s:.0f}", "s") if not value_s > 120.0 else (f"{value_s / 60.0:.1f}", "min")
 
 
 def unit(metric: Metric) -> str:
-    """The unit; nothing for a plain number."""
+    """The unit of a metric; an empty string for a plain number."""
     return "" if metric.unit == "1" else metric.unit
 
 
@@ -101,12 +109,17 @@ _MARK = '<meta name="generator" content="hybridmap '  # in the head of the pages
 
 
 def is_page(path: Path) -> bool:
-    """Whether a file is a page made by hybridmap that is not part of a session or study folder."""
+    """Whether a file is a page that hybridmap wrote outside of a session or study folder."""
     return path.is_file() and _MARK in path.read_text(encoding="utf-8", errors="replace")
 
 
 def rendered(template: str, **content: Any) -> str:
-    """The text of a page: a template, by its file name, filled in. Text is escaped, and a missing name is an error."""
+    """Fill in the template of a page.
+
+    Args:
+        template: file name of the template.
+        content: values by name; text in them is escaped for HTML. A missing name is an error.
+    """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(

@@ -24,7 +24,15 @@ _MANY = 200
 
 
 def trajectories_figure(scene: SessionScene, building: Raster | None) -> str:
-    """Every back-end's trajectory over the ground truth and the primary back-end's map; a `data:` URI."""
+    """Draw every back-end's trajectory over the ground truth and the building.
+
+    Args:
+        scene: content of the session's page.
+        building: picture of the building from above; None without one.
+
+    Returns:
+        A `data:` URI.
+    """
     shown = [scene.estimates[name].poses for name in scene.backends if name in scene.estimates]
     shown += [scene.truth.poses] if scene.truth is not None else []
     with style.figure(*_size(np.concatenate(shown)[:, :2], building)) as picture:
@@ -34,7 +42,7 @@ def trajectories_figure(scene: SessionScene, building: Raster | None) -> str:
 
 
 def draw_trajectories(axes: Any, scene: SessionScene, building: Raster | None) -> None:
-    """Draw every back-end's trajectory over the truth and the building."""
+    """Draw every back-end's trajectory over the ground truth and the building on matplotlib axes."""
     style.draw_building(axes, building)
     if scene.truth is not None:
         _draw_ways(axes, scene.truth, scene, color=style.TRUTH, linewidth=3.2, alpha=0.28, label="ground truth", zorder=3)
@@ -55,7 +63,15 @@ def _draw_ways(axes: Any, trajectory: Trajectory, scene: SessionScene, *, label:
 
 
 def graph_figure(scene: SessionScene, building: Raster | None) -> str:
-    """Nodes at the primary back-end's poses, chain, kidnappings, and loops by their status; a `data:` URI."""
+    """Draw the graph at the primary back-end's poses: nodes, edges, kidnappings, and loops coloured by their status.
+
+    Args:
+        scene: content of the session's page.
+        building: picture of the building from above; None without one.
+
+    Returns:
+        A `data:` URI.
+    """
     with style.figure(*_size(scene.nodes[:, :2], building)) as picture:
         axes = picture.add_subplot()
         style.draw_building(axes, building, darkness=0.35)
@@ -99,7 +115,7 @@ def _draw_legend(picture: Any) -> None:
 
 
 def chain_and_kidnappings(scene: SessionScene) -> tuple[list[Edge], list[Edge]]:
-    """The accepted edges that no loops are: those of ways driven, and those that stand for a way through the air."""
+    """The accepted edges that are not loops, in two lists: those the robot drove, and those over which it was carried."""
     aloft = {(kidnapping.before, kidnapping.after) for kidnapping in kidnappings(scene.experiences)}
     motion = [e for e in scene.experiences.edges if e.kind is not EdgeKind.LOOP and e.status is Status.ACCEPTED]
     chain = [edge for edge in motion if (edge.source, edge.target) not in aloft]
@@ -107,7 +123,7 @@ def chain_and_kidnappings(scene: SessionScene) -> tuple[list[Edge], list[Edge]]:
 
 
 def loops_by_fate(scene: SessionScene) -> dict[str, list[Edge]]:
-    """Every loop that was considered, by its status, in the order of the legend."""
+    """Status -> the loop edges with it, for every loop that was considered; in the order of the legend."""
     report = scene.reports.get(scene.primary)
     unweighted = set(report.rejected_edge_ids) if report is not None else set()
     found: dict[str, list[Edge]] = {fate: [] for fate in _FATES}
@@ -146,10 +162,10 @@ _GAP_S, _GAP = 3.0, 5.0  # a line ends where no error is taken for so long, and 
 
 @dataclass(frozen=True, slots=True)
 class ErrorSeries:
-    """One back-end's error over time.
+    """The error of one trajectory over time.
 
     Attributes:
-        time_s: (P,) since the beginning of the recording.
+        time_s: (P,) time since the beginning of the recording.
         position_m, heading_deg: (P,) absolute errors.
     """
 
@@ -159,9 +175,10 @@ class ErrorSeries:
 
 
 def error_series(scene: SessionScene) -> dict[str, ErrorSeries]:
-    """Name -> error against ground truth: of every back-end's final trajectory and of the primary's online one.
+    """Name of a trajectory -> its error over time.
 
-    Without ground truth: of odometry and of each back-end's online trajectory, against the primary's final trajectory.
+    With ground truth: the final trajectory of every back-end, and the online one of the primary back-end, against it.
+    Without: odometry and the online trajectory of each back-end, against the primary back-end's final trajectory.
     """
     start_ns = scene.estimates[ODOMETRY].stamps_ns[0]
     if scene.truth is not None:
@@ -181,7 +198,11 @@ def error_series(scene: SessionScene) -> dict[str, ErrorSeries]:
 
 
 def error_figure(scene: SessionScene) -> str | None:
-    """Position and heading error over time, with a mark at every accepted loop; a `data:` URI, None without errors."""
+    """Draw position and heading error over time, with a mark at every accepted loop.
+
+    Returns:
+        A `data:` URI; None if no trajectory has errors.
+    """
     series = error_series(scene)
     if not series:
         return None
@@ -196,7 +217,7 @@ def error_figure(scene: SessionScene) -> str | None:
 
 
 def draw_errors(axes: Any, scene: SessionScene, *, heading: bool) -> None:
-    """Draw the position error, m, or the heading error, deg, of every back-end over time."""
+    """Draw the error of every trajectory over time: the heading error, deg, if `heading`, else the position error, m."""
     styles = style.line_styles(scene.backends)
     for name, errors in error_series(scene).items():
         looks = dict(styles[name.removesuffix(ONLINE)])
@@ -220,7 +241,7 @@ def _series(since_start_ns: Any, estimate: Array, reference: Array) -> ErrorSeri
 
 
 def over_intervals(errors: ErrorSeries, count: int) -> ErrorSeries:
-    """Root mean square over `count` equal intervals of time; empty ones are left out."""
+    """Root mean square of the errors over `count` equal intervals of time; intervals without errors are left out."""
     if len(errors.time_s) <= count:
         return errors
     first, last = errors.time_s[0], errors.time_s[-1]
@@ -235,7 +256,7 @@ def over_intervals(errors: ErrorSeries, count: int) -> ErrorSeries:
 
 
 def gaps(time_s: Array) -> Array:
-    """Middles (G,), s, of times without errors, such as a kidnapping or a gap of the ground truth."""
+    """Middle (G,), s, of each long gap in the times of errors, such as a kidnapping or a gap of the ground truth."""
     spacing = np.diff(time_s)
     if not len(spacing):
         return spacing
@@ -244,7 +265,7 @@ def gaps(time_s: Array) -> Array:
 
 
 def with_gaps(errors: ErrorSeries, gaps_s: Array) -> ErrorSeries:
-    """The series with NaN at given times, where its lines are interrupted."""
+    """The errors with NaN inserted at the times `gaps_s`, so that no line is drawn across them."""
     at = np.searchsorted(errors.time_s, gaps_s)
     position, heading = (np.insert(values, at, np.nan) for values in (errors.position_m, errors.heading_deg))
     return ErrorSeries(np.insert(errors.time_s, at, gaps_s), position, heading)
@@ -264,7 +285,16 @@ def _mark_loops(scene: SessionScene, axes: Any) -> None:
 
 
 def correction_figure(correction: Correction, points_of: Mapping[int, Array], kidnapped: Sequence[Kidnapping]) -> str:
-    """Two panels on the same axes: nodes and their points, before and after; a `data:` URI. No line crosses a kidnapping."""
+    """Draw the map before and after its largest correction, in two panels on the same axes: nodes and their points.
+
+    Args:
+        correction: poses of the nodes before and after.
+        points_of: node -> its points, (M, 2) in `base_link`, m.
+        kidnapped: the places where the robot was kidnapped; no line is drawn there.
+
+    Returns:
+        A `data:` URI.
+    """
     both = np.concatenate([correction.before, correction.after])[:, :2]
     low, high = both.min(axis=0) - 1.5, both.max(axis=0) + 1.5
     with style.figure(*style.fitted_size(high - low, panels=2)) as picture:

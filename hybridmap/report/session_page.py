@@ -25,7 +25,7 @@ _TEMPLATE = "report.html.j2"
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """One of the figures at the top."""
+    """One of the main values at the top of the page, with its unit and label."""
 
     value: str
     unit: str
@@ -35,8 +35,11 @@ class Tile:
 def write_report(folder: SessionFolder) -> Path:
     """Write `report.html` of a session: one self-contained page without network access or scripts.
 
+    Returns:
+        The path of the page.
+
     Raises:
-        StoreError: there is no session, or its map or figures are damaged.
+        StoreError: there is no session, or its map or metrics are damaged.
         StreamError: one of its trajectories is damaged.
     """
     folder.require_map()
@@ -77,7 +80,7 @@ def _content(scene: SessionScene, store: MapStore) -> dict[str, Any]:
 
 
 def tiles(scene: SessionScene) -> list[Tile]:
-    """The main figures: accuracy, travel, loops and computing time."""
+    """The main values of a session: accuracy, travel, loops and computing time."""
     named = {metric.name: metric for metric in scene.metrics}
     wanted = [
         (f"ate_rmse/{ODOMETRY}", "ATE of odometry"),

@@ -19,12 +19,12 @@ from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """The map of the primary back-end just before and after its largest change.
+    """The map of the primary back-end just before and after its largest change during the drive.
 
     Attributes:
-        stamp_ns: when.
+        stamp_ns: stamp at which the map changed.
         shift_m: largest shift of a node.
-        before, after: (K, 3) poses of the nodes at the time, in the page's frame.
+        before, after: (K, 3) poses of the nodes at that time, m and rad, in the page's frame.
     """
 
     stamp_ns: int
@@ -35,21 +35,21 @@ class Correction:
 
 @dataclass(frozen=True, slots=True)
 class SessionScene:
-    """Everything that is drawn, in the page's frame: that of the ground truth if known, else `map`.
+    """Everything drawn on a session's page, in one frame: that of the ground truth if known, else `map`.
 
     Attributes:
-        source: what was mapped.
-        primary: the primary back-end.
-        backends: `odometry`, then every back-end that followed the drive or has a solution, the primary first.
-        truth: true trajectory, if known.
-        estimates: name -> trajectory, each aligned to the truth by itself; also `<backend>_online`.
+        source: name of the recording or world that was mapped.
+        primary: name of the primary back-end.
+        backends: `odometry`, then every back-end with a trajectory or a solution, the primary first.
+        truth: true trajectory, None if unknown.
+        estimates: name -> trajectory, each aligned to the truth by itself; online ones are called `<backend>_online`.
         pairs: name -> estimate and truth at common stamps, both in the page's frame; empty without a truth.
-        nodes: (N, 3) poses of the nodes by the primary back-end.
-        experiences: nodes and edges.
-        reports: name -> report of the back-end's solution.
-        correction: the largest one, if any.
+        nodes: (N, 3) poses of the nodes by the primary back-end, m and rad.
+        experiences: the nodes and edges of the map.
+        reports: back-end -> report on its solution.
+        correction: the largest change of the map, None if it never changed.
         head, metrics: the content of `metrics.json`.
-        config_yaml: the resolved configuration.
+        config_yaml: the whole configuration as YAML.
     """
 
     source: str
@@ -68,10 +68,10 @@ class SessionScene:
 
 
 def load_scene(folder: SessionFolder, store: MapStore) -> SessionScene:
-    """Read a session.
+    """Read the content of a session's page from its folder and its map file.
 
     Raises:
-        StoreError: the map or the figures are damaged.
+        StoreError: the map or the metrics are damaged.
         StreamError: a trajectory is damaged.
     """
     estimates = session_trajectories(folder, store)

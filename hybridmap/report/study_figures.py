@@ -1,4 +1,4 @@
-"""The pictures of a study's page: each figure over the varied quantity, and the paired differences."""
+"""The pictures of a study's page: each metric over the quantity that the study varies, and the paired differences."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ Figure = Callable[[CellResult], float | None]
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Cells drawn on the same axes.
+    """Results of a study that are drawn on the same axes.
 
     Attributes:
-        title: what they have in common.
-        ticks: names of the positions along the axis of the varied quantity.
-        cells: (position, back-end, result).
+        title: what the results have in common.
+        ticks: names of the positions along the horizontal axis.
+        cells: (position, back-end, result) of each run of the study.
     """
 
     title: str
@@ -45,11 +45,12 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The panels of a study.
+    """How the results of a study are divided into panels.
 
     Attributes:
-        panels: in the order of the grid.
-        along: the varied quantity: `false loops`, `setting` or `back-end`; for the last one, each has a row instead of a line.
+        panels: in the order in which they are drawn.
+        along: the quantity on the axis: `false loops`, `setting` or `back-end`. With `back-end` each back-end has a row, else
+            a line.
     """
 
     panels: tuple[Panel, ...]
@@ -57,7 +58,11 @@ class Layout:
 
 
 def layout(study: Study) -> Layout:
-    """Panels over the rates if there are several, else over the settings, else over the back-ends."""
+    """Divide a study's results into panels, and choose the quantity on their horizontal axis.
+
+    It is the number of false loops if that varies, else the setting if that varies. Otherwise, or with many back-ends, it is
+    the back-end.
+    """
     config = study.grid.study
     rates = sorted(config.false_loops.rates)
     titles = [variant.title for variant in config.backends]
@@ -92,15 +97,25 @@ def _gathered(entries: Sequence[tuple[str, str, Cell, CellResult]], ticks: Seque
 
 
 def having(plan: Layout, figure: Figure) -> Layout:
-    """The panels in which some cell has the figure."""
+    """The layout without the panels in which no result has a value of the metric."""
     kept = (panel for panel in plan.panels if any(figure(result) is not None for _, _, result in panel.cells))
     return replace(plan, panels=tuple(kept))
 
 
 def merit_figure(study: Study, plan: Layout, label: str, figure: Figure, *, logarithmic: bool) -> str:
-    """One figure, an error or a share in percent: dots are cells, lines and bars their medians; a `data:` URI.
+    """Draw one metric, an error or a share in percent: a dot per result, lines or bars through the medians.
 
-    Panels without the figure are left out; empty if none has it.
+    Panels without a value of the metric are left out.
+
+    Args:
+        study: the finished study.
+        plan: its panels.
+        label: text along the axis.
+        figure: returns the metric of a result.
+        logarithmic: whether the metric's axis is logarithmic.
+
+    Returns:
+        A `data:` URI; an empty string if no result has a value.
     """
     shown = having(plan, figure).panels[:MOST_PANELS]
     if not shown:
@@ -130,7 +145,10 @@ def merit_figure(study: Study, plan: Layout, label: str, figure: Figure, *, loga
 
 
 def paired_groups(summaries: Sequence[Summary], measure: str) -> dict[str, list[Summary]]:
-    """Group -> the differences of an error to the baseline over several seeds; groups without any are left out."""
+    """Group of results -> the mean difference of each back-end's error to the baseline, paired by seed.
+
+    Groups without such a difference (fewer than two seeds) are left out.
+    """
     groups: dict[str, list[Summary]] = {}
     for one in summaries:
         if one.measure == measure and one.difference is not None and one.difference.count > 1:
@@ -139,9 +157,12 @@ def paired_groups(summaries: Sequence[Summary], measure: str) -> dict[str, list[
 
 
 def difference_figure(groups: Mapping[str, Sequence[Summary]]) -> str:
-    """Mean paired difference of an error to the baseline with its interval, one panel per group; a `data:` URI or empty.
+    """Draw the mean paired difference of the error to the baseline with its confidence interval, one panel per group.
 
     A difference without an interval is a single dot.
+
+    Returns:
+        A `data:` URI; an empty string if there is no group.
     """
     if not groups:
         return ""

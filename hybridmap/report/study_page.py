@@ -39,7 +39,7 @@ _SUMMED = (
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One back-end of a group: cells of the table, and whether its difference to the baseline is significant."""
+    """One back-end in a table of a study's page: the texts of its cells, and whether it differs from the baseline."""
 
     backend: str
     solved: str
@@ -53,12 +53,12 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A table.
+    """One table of a study's page: back-ends under the same conditions.
 
     Attributes:
-        label: the group in words.
-        lines: of the back-ends that have a map in it.
-        without: the other back-ends.
+        label: the conditions in words: source, setting, false loops.
+        lines: one row per back-end that has a map.
+        without: names of the back-ends without a map.
     """
 
     label: str
@@ -68,7 +68,7 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """A row of the table of bars: its cells."""
+    """One row of the table that compares a study's results with the limits (bars) stated for them."""
 
     what: str
     where: str
@@ -80,7 +80,7 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """Cells without a solution that share a message."""
+    """Runs of a study that gave no solution, with the same message."""
 
     status: str
     where: str
@@ -171,7 +171,7 @@ def _reference(study: Study) -> bool:
 
 
 def error_of(study: Study) -> str:
-    """The error figure of a study: ATE, or relation errors if only those are known."""
+    """Name of the error that the study's page compares: ATE, or relation errors if no ground truth is known."""
     return next((name for name in _ERRORS if any(result.figures.get(name) is not None for _, result in study.rows)), _ERRORS[0])
 
 
@@ -216,7 +216,7 @@ def _share(result: CellResult, part: str, whole: str) -> float | None:
 
 
 def groups_of(study: Study) -> list[Group]:
-    """Every group, with one line per back-end that has a map."""
+    """The tables of a study's page: one per source, setting and false loops, with a row for each back-end that has a map."""
     measure, others = error_of(study), _others(study)
     found: dict[str, dict[str, dict[str, Summary]]] = {}
     for one in study.summaries:
@@ -254,7 +254,7 @@ def _mean(found: Interval, cells: int) -> str:
 
 
 def remarks(study: Study) -> list[Remark]:
-    """What did not end well; cells that say the same but for the numbers are one remark, with the words of the first."""
+    """The runs of a study that gave no solution; those whose messages differ only in numbers are one remark."""
     found: dict[tuple[str, str], list[tuple[Cell, str]]] = {}
     for cell, result in study.rows:
         if result.status not in _SOLVED:

@@ -1,4 +1,4 @@
-"""How every picture of the page looks: colours that colour-blind people can tell apart, equal axes, embedded as text."""
+"""The style of all pictures: colours that colour-blind people can tell apart, equal axes, pictures embedded in the page."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _SETTINGS = {
 
 
 def line_styles(backends: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Name -> how its line is drawn; `backends` begins with `odometry` and the primary, as a scene's do."""
+    """Back-end -> style of its line (arguments of matplotlib). `backends` begins with `odometry` and the primary back-end."""
     styles: dict[str, dict[str, Any]] = {}
     others = [name for name in backends if name != base.ODOMETRY]
     dashes = ((0, (4, 1.2)), (0, (6, 1.2, 1, 1.2)), (0, (1.2, 1.2)))
@@ -66,7 +66,12 @@ def line_styles(backends: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 @contextmanager
 def figure(width_in: float, height_in: float, margins: Margins | None = None) -> Iterator[Any]:
-    """A matplotlib figure in the page's style; no window, no global state. Without margins they are worked out, slowly."""
+    """Create a matplotlib figure in the page's style, without a window and without global state.
+
+    Args:
+        width_in, height_in: size, inches.
+        margins: space around the axes; computed if None, which is slow.
+    """
     import matplotlib
     from matplotlib.figure import Figure
 
@@ -79,14 +84,14 @@ def figure(width_in: float, height_in: float, margins: Margins | None = None) ->
 
 
 def svg_uri(picture: Any) -> str:
-    """The figure as a `data:` URI; the same figure gives the same text."""
+    """The figure as SVG in a `data:` URI; the same figure gives the same text."""
     text = io.BytesIO()
     picture.savefig(text, format="svg", dpi=160, metadata={"Date": None, "Creator": None})
     return "data:image/svg+xml;base64," + base64.b64encode(text.getvalue()).decode("ascii")
 
 
 def photo_uri(rgb: NDArray[np.uint8]) -> str:
-    """A colour picture (H, W, 3) as a `data:` URI."""
+    """A colour picture (H, W, 3) uint8 as a `data:` URI."""
     import cv2
 
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 88])
@@ -94,13 +99,13 @@ def photo_uri(rgb: NDArray[np.uint8]) -> str:
 
 
 def thinned(poses: Array) -> Array:
-    """At most some thousand of the poses (P, 3), the last one among them: more cannot be seen."""
+    """Evenly spaced poses of a trajectory (P, 3), the last one included: at most a few thousand, as a picture shows no more."""
     step = max(1, len(poses) // _MAX_POINTS)
     return poses if step == 1 else np.concatenate([poses[:-1:step], poses[-1:]])
 
 
 def draw_building(axes: Any, building: Raster | None, darkness: float = 0.55) -> None:
-    """What the robot saw, in grey, under everything else."""
+    """Draw the picture of the building in grey, under everything else; draws nothing if it is None."""
     if building is None:
         return
     seen = np.ma.masked_equal(building.grey, 0.0) * darkness
@@ -109,7 +114,7 @@ def draw_building(axes: Any, building: Raster | None, darkness: float = 0.55) ->
 
 
 def metric_axes(axes: Any, adjustable: str = "datalim") -> None:
-    """Equal axes in metres."""
+    """Give matplotlib axes equal scales in metres."""
     axes.set_aspect("equal", adjustable=adjustable)
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
@@ -118,6 +123,14 @@ def metric_axes(axes: Any, adjustable: str = "datalim") -> None:
 
 
 def fitted_size(span_m: Array, panels: int = 1) -> tuple[float, float]:
-    """Width and height of a figure, inches, whose side-by-side panels each show `span_m` (2,), m."""
+    """Size of a figure for a map.
+
+    Args:
+        span_m: (2,) width and height that each panel shows, m.
+        panels: number of panels side by side.
+
+    Returns:
+        Width and height, inches.
+    """
     shape = max(float(span_m[1]), 0.5) / max(float(span_m[0]), 0.5)
     return PAGE_WIDTH_IN, float(np.clip(PAGE_WIDTH_IN / panels * shape + 1.1, 2.6, 8.5))

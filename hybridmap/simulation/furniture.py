@@ -1,4 +1,6 @@
-"""Furniture: each piece is a list of surfaces at (x, y), facing `yaw_deg`."""
+"""Furniture of the simulated worlds. Each piece is a list of surfaces, placed on the floor at `at` = (x, y), m; its front
+faces the direction `yaw_deg`.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ def table(
 
 
 def desk(at: Spot, yaw_deg: float, width_m: float = 1.4) -> list[Facet]:
-    """A desk with drawers, a screen towards `yaw_deg` and papers."""
+    """A desk with drawers, papers, and a screen that faces `yaw_deg`."""
     out = table(at, yaw_deg, (0.7, width_m))
     drawers = {"front": paints.metal((128, 132, 140), drawers=3)}
     out += box(
@@ -79,7 +81,7 @@ def cabinet(
 
 
 def crate(at: Spot, yaw_deg: float, size: tuple[float, float, float] = (0.4, 0.5, 0.4), bottom_m: float = 0.0) -> list[Facet]:
-    """A cardboard box."""
+    """A cardboard box of `size` (depth, width, height), m, with its lower face at the height `bottom_m`."""
     return box(at, size, pictures.parcel(), yaw_deg=yaw_deg, bottom_m=bottom_m, px_per_m=170)
 
 

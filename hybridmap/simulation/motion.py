@@ -18,7 +18,7 @@ _LOOK_AHEAD_M = 0.45
 
 @dataclass(frozen=True, slots=True)
 class DriveLimits:
-    """Limits of the drive: m/s, rad/s, m/s^2, rad/s^2."""
+    """Largest speeds and accelerations of the simulated robot: m/s, rad/s, m/s^2, rad/s^2."""
 
     speed_m_s: float
     turn_rate_rad_s: float
@@ -45,12 +45,15 @@ class _State:
 
 
 def drive(legs: Sequence[Array], limits: DriveLimits, dt_s: float) -> Array:
-    """True poses (N, 3), m and rad, every `dt_s` seconds: along each leg, turning on the spot before the next.
+    """Simulate a drive along pieces of a path; between two pieces the robot stops and turns on the spot.
 
     Args:
-        legs: way points (M, 2), m; each leg begins where the one before ends.
-        limits: of the drive.
-        dt_s: step, s.
+        legs: way points (M, 2) of each piece, m; each piece begins where the one before ends.
+        limits: largest speeds and accelerations.
+        dt_s: time step, s.
+
+    Returns:
+        True poses (N, 3), m and rad, one per time step.
     """
     first = legs[0][1] - legs[0][0]
     state = _State(float(legs[0][0, 0]), float(legs[0][0, 1]), math.atan2(first[1], first[0]))
@@ -136,13 +139,13 @@ _EVERY = 15
 
 @dataclass(frozen=True, slots=True)
 class KidnappedDrive:
-    """A drive with a kidnapping.
+    """A drive on which the robot is kidnapped: picked up, carried, and put down elsewhere.
 
     Attributes:
-        first, last: steps at which the robot is picked up and put down.
-        distance_m: straight distance of the kidnapping, m.
-        truth: (N, 3) true poses, including the kidnapping.
-        felt: (N, 3) poses according to the wheels: the robot stands still while it is carried.
+        first, last: indices of the poses at which the robot is picked up and put down.
+        distance_m: straight distance between the two, m.
+        truth: (N, 3) true poses, including the kidnapping, m and rad.
+        felt: (N, 3) poses according to the wheels, which stand still while the robot is carried.
     """
 
     first: int
@@ -153,14 +156,14 @@ class KidnappedDrive:
 
 
 def carry(drive: Array, distance_m: float, step_s: float) -> KidnappedDrive:
-    """Kidnap the robot: cut a piece out of a drive, from the pick-up to a later place that was visited before.
+    """Kidnap the robot: cut a piece out of a drive, so that it is carried to a place that it has visited before.
 
-    The robot is picked up after the middle of the drive, at the first step with a visited place at this distance, farther
-    along the drive. In a smaller world the most distant visited place is used.
+    The robot is picked up after the middle of the drive, and put down at a later place of the drive at this distance. If no
+    visited place is that far away, the most distant one is used.
 
     Args:
         drive: (N, 3) true poses, m and rad.
-        distance_m: straight distance, m.
+        distance_m: straight distance over which the robot is carried, m.
         step_s: time between two poses, s.
 
     Raises:
@@ -223,9 +226,9 @@ def wheel_odometry(true_poses: Array, errors: WheelErrorConfig, rng: np.random.G
     """Poses (N, 3) of `base_link` in `odom` that the wheels report; the first is the identity.
 
     Args:
-        true_poses: (N, 3) m and rad, of the world.
-        errors: figures of the wheels.
-        rng: of this robot's wheels.
+        true_poses: (N, 3) true poses in the world, m and rad.
+        errors: systematic errors and noise of the wheels.
+        rng: random generator for the noise.
     """
     steps = between(true_poses[:-1], true_poses[1:])
     ahead, turn = steps[:, 0] * 1.0, steps[:, 2] * 1.0
@@ -247,5 +250,5 @@ def wheel_odometry(true_poses: Array, errors: WheelErrorConfig, rng: np.random.G
 
 
 def as_transmitted(yaw_rad: Array) -> Array:
-    """Headings (N,) after conversion to the quaternions of messages and files, and back."""
+    """Round headings (N,), rad, as messages and files do, which store them as quaternions."""
     return yaw_from_quaternion(*quaternion_from_yaw(wrap_angle(yaw_rad)).T)

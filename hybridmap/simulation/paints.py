@@ -1,4 +1,7 @@
-"""Materials: plaster, carpet, wood, bricks and the like. Each paint draws `(height_px, width_px)` texels from a generator."""
+"""Materials of the simulated surfaces: plaster, carpet, wood, bricks and the like.
+
+A paint is a function that draws a texture of `(height_px, width_px)` texels with a random generator.
+"""
 
 from __future__ import annotations
 
@@ -22,31 +25,31 @@ P = ParamSpec("P")
 
 
 def smooth_noise(rng: Rng, shape: Shape, cell_px: float) -> Field:
-    """Smooth noise (H, W) float32 of mean 0 and about unit deviation, features about `cell_px` wide."""
+    """Smooth noise (H, W) float32 with mean 0 and a standard deviation of about 1; its blobs are about `cell_px` wide."""
     rows, columns = (max(2, round(side / max(cell_px, 1.0)) + 1) for side in shape)
     coarse = rng.standard_normal((rows, columns), dtype=np.float32)
     return np.asarray(cv2.resize(coarse, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC), dtype=np.float32)
 
 
 def tint(color: Color, tone: Field) -> Image:
-    """A colour whose brightness follows `tone` (H, W), 1 for the colour itself."""
+    """Fill a texture with a colour whose brightness is multiplied by `tone` (H, W); 1 gives the colour itself."""
     return np.asarray(np.clip(tone[..., None] * np.asarray(color, dtype=np.float32), 0, 255).astype(np.uint8))
 
 
 def vary(rng: Rng, color: Color, spread: int = 20) -> Color:
-    """A colour near another one."""
+    """A random colour near another one: each channel differs by at most `spread`."""
     drawn = np.clip(np.asarray(color) + rng.integers(-spread, spread + 1, 3), 0, 255)
     return int(drawn[0]), int(drawn[1]), int(drawn[2])
 
 
 def any_color(rng: Rng, low: int = 20, high: int = 235) -> Color:
-    """A colour drawn channel by channel."""
+    """A random colour, with each channel between `low` and `high`."""
     drawn = rng.integers(low, high, 3)
     return int(drawn[0]), int(drawn[1]), int(drawn[2])
 
 
 def material(draw: Callable[Concatenate[Rng, Shape, float, P], Image]) -> Callable[P, Paint]:
-    """Decorator: from a function that draws to one that takes only its options and returns the paint."""
+    """Decorator: turns a function that draws a texture into one that takes its options (colours, sizes) and returns a paint."""
 
     @wraps(draw)
     def with_options(*args: P.args, **options: P.kwargs) -> Paint:
@@ -65,7 +68,7 @@ def plain(_rng: Rng, shape: Shape, _px_per_m: float, color: Color) -> Image:
 def plaster(
     rng: Rng, shape: Shape, px_per_m: float, color: Color, *, skirting: Color | None = (92, 84, 76), scuffs: float = 0.5
 ) -> Image:
-    """A painted wall: faint clouds, a skirting board, `scuffs` marks a metre of wall."""
+    """A painted wall: faint clouds, `scuffs` marks per metre of wall, and a skirting board of that colour (None: no board)."""
     tone = 1.0 + 0.012 * smooth_noise(rng, shape, 0.6 * px_per_m) + 0.012 * smooth_noise(rng, shape, 0.03 * px_per_m)
     image = tint(color, tone)
     for _ in range(rng.poisson(scuffs * shape[1] / px_per_m)):
@@ -96,7 +99,7 @@ def carpet(rng: Rng, shape: Shape, px_per_m: float, color: Color, *, tile_m: flo
 
 @material
 def wood(rng: Rng, shape: Shape, px_per_m: float, color: Color = (150, 108, 70), *, plank_m: float = 0.0) -> Image:
-    """Wood with its grain along the surface's `along`; with `plank_m` laid in planks of that width."""
+    """Wood with its grain along the surface's edge `along`; with `plank_m` > 0 it consists of planks of that width."""
     stretched = smooth_noise(rng, (shape[0], max(2, shape[1] // 12)), 0.02 * px_per_m)
     grain = cv2.resize(stretched, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
     rings = np.sin(4.0 * smooth_noise(rng, shape, 0.35 * px_per_m) + 2.0 * grain)

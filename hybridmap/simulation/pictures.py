@@ -1,4 +1,4 @@
-"""Landmarks: posters, doors, book spines, windows, boards, screens and parcels, each drawn anew from a generator."""
+"""Textures of landmarks: posters, doors, book spines, windows, boards, screens and parcels, drawn from a random generator."""
 
 from __future__ import annotations
 

@@ -18,13 +18,13 @@ from hybridmap.simulation.surfaces import Facet, World
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """Results of ray casting; every array has the rays' leading shape.
+    """Results of ray casting; every array has the shape of the rays without its last axis.
 
     Attributes:
         hit: whether the ray hit a surface.
-        length: float32, in units of the ray's direction vector.
+        length: float32 distance to the hit, in units of the length of the ray's direction vector.
         surface: int32 index of the surface (0 without a hit).
-        across: float32 texture coordinate 0..1 along the surface.
+        across: float32 texture coordinate 0..1 from the left edge of the surface.
         down: float32 texture coordinate 0..1 from its upper edge.
     """
 
@@ -36,7 +36,7 @@ class Hits:
 
 
 class Caster:
-    """Casts rays at a list of surfaces, two triangles each."""
+    """Casts rays at a list of rectangular surfaces."""
 
     def __init__(self, surfaces: Sequence[Facet]) -> None:
         corner = np.array([s.corner for s in surfaces])
@@ -63,16 +63,16 @@ class Caster:
         return Hits(hit, length, triangle >> 1, across, np.float32(1.0) - height)
 
     def blocked(self, rays: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Whether anything lies between 0 and 1 lengths of the direction of rays `(..., 6)`."""
+        """Whether each ray `(..., 6)` (origin, direction) hits a surface before the end of its direction vector."""
         return np.asarray(self._scene.test_occlusions(o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=0.999).numpy())
 
 
 class Scene:
-    """The surfaces of a world as a camera and a laser see them.
+    """The surfaces of a world, prepared for a camera and a laser.
 
     Attributes:
-        normals: (S, 3) float32, unit, towards the painted side.
-        px_per_m: (S,) float32, texels a metre.
+        normals: (S, 3) float32, unit normal of each surface, towards the painted side.
+        px_per_m: (S,) float32, texels per metre.
         in_depth: (S,) bool, whether a depth camera sees the surface.
     """
 
@@ -87,7 +87,7 @@ class Scene:
 
     @cached_property
     def atlas(self) -> TextureAtlas:
-        """Textures with the light on them; painted when a camera first looks."""
+        """Textures of all surfaces with the light on them; painted when a camera first needs them."""
         surfaces = self._world.surfaces
         shadow_makers = Caster([s for s in surfaces if not s.decal])
         generators = np.random.default_rng(self._world.texture_seed).spawn(len(surfaces))
@@ -106,7 +106,7 @@ class Scene:
 
 
 def texture_size(surface: Facet) -> tuple[int, int]:
-    """Height and width in texels."""
+    """Height and width of a surface's texture, texels."""
     height, width = (float(np.linalg.norm(edge)) * surface.px_per_m for edge in (surface.up, surface.along))
     return max(3, round(height)), max(3, round(width))
 
@@ -118,12 +118,12 @@ _SMALLEST_PX = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TextureAtlas:
-    """Packed textures.
+    """The textures of all surfaces, each at several resolutions, in one image.
 
     Attributes:
         image: (H, W, 3) uint8, RGB.
         levels: (S,) int32, number of resolutions of each surface.
-        places: (S * L, 4) float32: left, top, width - 1, height - 1 in texels of surface s at level l in row s * L + l.
+        places: (S * L, 4) float32: left, top, width - 1, height - 1 in texels of surface s at resolution l in row s * L + l.
     """
 
     image: Image
@@ -164,7 +164,7 @@ class TextureAtlas:
 
 
 def build_atlas(textures: list[Image]) -> TextureAtlas:
-    """Pack textures (h, w, 3) uint8 and their halved copies."""
+    """Pack textures (h, w, 3) uint8 and their copies at half, quarter, ... resolution into one image."""
     pyramids = [_pyramid(texture) for texture in textures]
     stride = max(len(pyramid) for pyramid in pyramids)
     rows = [(index * stride + level, image) for index, pyramid in enumerate(pyramids) for level, image in enumerate(pyramid)]
@@ -210,14 +210,14 @@ class LightMap:
     factors: NDArray[np.float32]
 
     def apply(self, texture: Image) -> Image:
-        """Texture (H, W, 3) with the light on it."""
+        """The texture (H, W, 3) multiplied by the brightness factors."""
         height, width = texture.shape[:2]
         smooth = cv2.resize(self.factors, (width, height), interpolation=cv2.INTER_LINEAR)
         return np.asarray(np.clip(texture * smooth[..., None], 0, 255), dtype=np.uint8)
 
 
 def bake(surfaces: Sequence[Facet], caster: Caster) -> list[LightMap]:
-    """Light on every surface; light sources have full brightness. A world without lamps is lit evenly."""
+    """Compute the light on every surface; light sources have full brightness. A world without lamps is lit evenly."""
     lamps = [s for s in surfaces if s.glow > 0.0]
     if not lamps:
         return [LightMap(np.ones((1, 1), dtype=np.float32)) for _ in surfaces]

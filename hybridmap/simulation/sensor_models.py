@@ -63,7 +63,7 @@ class _Exposure:
 
 
 class CameraModel:
-    """Renders frames of one scene."""
+    """Renders frames of a simulated RGB-D camera in one scene."""
 
     def __init__(self, scene: Scene, config: CameraConfig, rng: np.random.Generator, noise: float = 1.0) -> None:
         self._scene = scene
@@ -78,13 +78,13 @@ class CameraModel:
         self._exposure = _Exposure(noise * EXPOSURE_CHANGE, rng.uniform(0.02, 0.25, 4), rng.uniform(0, 2 * np.pi, 4))
 
     def frame(self, stamp_ns: int, time_s: float, pose_world_base: Array, rng: np.random.Generator) -> RgbdFrame:
-        """The camera's frame at a pose.
+        """Render the camera's frame at a pose.
 
         Args:
             stamp_ns: stamp of the frame, ns.
             time_s: time since the drive began, s; the exposure depends on it.
-            pose_world_base: (3,) true pose, m and rad.
-            rng: of this frame alone.
+            pose_world_base: (3,) true pose of the robot, m and rad.
+            rng: random generator for the noise of this frame.
         """
         cos, sin = np.cos(pose_world_base[2]), np.sin(pose_world_base[2])
         turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -160,7 +160,7 @@ DROP_FRACTION = 0.002
 
 
 def laser_of(config: LaserScannerConfig) -> Laser:
-    """Bearings and mounting; bearings are those that a LaserScan message with its 32-bit angles gives."""
+    """Beam directions and mounting of the simulated laser; angles have the 32-bit precision of a LaserScan message."""
     field = np.deg2rad(config.field_of_view_deg)
     steps = config.beams if config.field_of_view_deg >= 360.0 else config.beams - 1
     first, step = float(np.float32(-0.5 * field)), float(np.float32(field / steps))
@@ -170,7 +170,7 @@ def laser_of(config: LaserScannerConfig) -> Laser:
 
 
 class LaserModel:
-    """Scans one scene in a plane parallel to the floor."""
+    """Simulates scans of a planar laser in one scene, in a plane parallel to the floor."""
 
     def __init__(self, scene: Scene, config: LaserScannerConfig, noise: float = 1.0) -> None:
         self._scene = scene
@@ -178,7 +178,7 @@ class LaserModel:
         self.laser = laser_of(config)
 
     def scan(self, stamp_ns: int, pose_world_base: Array, rng: np.random.Generator) -> LaserScan:
-        """The scan at a pose (3,), m and rad, with the noise of `rng`."""
+        """The scan at a true pose (3,) of the robot, m and rad, with noise drawn from `rng`."""
         x, y, yaw = pose_world_base
         angle = self.laser.bearings_rad + yaw
         rays = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))]).astype(np.float32)

@@ -30,7 +30,7 @@ _WHEELS, _CAMERA, _LASER = range(3)
 
 
 class SimulatedStream:
-    """A drive through a simulated world.
+    """A drive through a simulated world, as a stream of odometry, camera frames and laser scans.
 
     The drive and the world are the same for every seed; the seed determines the errors of the sensors. Samples are rounded to
     the precision of bags and folders, so a recording of the stream reads back to the same bits.
@@ -68,12 +68,12 @@ class SimulatedStream:
 
     @property
     def name(self) -> str:
-        """The world's name."""
+        """Name of the simulated world."""
         return self._world.name
 
     @cached_property
     def rig(self) -> Rig:
-        """The sensors that the configuration asks for."""
+        """Calibration and mounting of the sensors that the configuration selects."""
         from hybridmap.simulation.sensor_models import camera_of, laser_of
 
         camera = camera_of(self._config.camera) if self._config.sensors != "laser" else None
@@ -92,17 +92,17 @@ class SimulatedStream:
 
     @property
     def carry(self) -> KidnappedDrive | None:
-        """The drive with its kidnapping; None without one."""
+        """The drive with its kidnapping; None if the robot is not kidnapped."""
         return self._carry
 
     @property
     def expected_observations(self) -> int:
-        """Number of frames and scans."""
+        """Number of camera frames and laser scans that the stream will yield."""
         return sum(len(stamps) for stamps in (self._frame_stamps, self._scan_stamps))
 
     @property
     def report(self) -> StreamReport:
-        """Counts of the last iteration."""
+        """Number of samples of each kind in the last iteration."""
         return self._report
 
     def __iter__(self) -> Iterator[Sample]:

@@ -20,17 +20,17 @@ DOOR_HEIGHT_M = 2.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Facet:
-    """A painted rectangle; it faces the side to which `along x up` points.
+    """A painted rectangle; its painted front faces the direction `along x up`.
 
     Attributes:
         corner: (3,) lower left corner seen from the front, m.
         along: (3,) edge from there to the right, m.
         up: (3,) edge from there upwards, m.
-        paint: draws its texture.
-        px_per_m: texels a metre.
+        paint: function that draws its texture.
+        px_per_m: texels per metre.
         glow: light given off, arbitrary unit; 0 for all but lamps and windows.
-        decal: so thin that it casts no shadow (posters, doors).
-        in_depth: whether a depth camera gets its light back (not from glass and screens).
+        decal: whether it is so thin that it casts no shadow (posters, doors).
+        in_depth: whether a depth camera sees it (not glass and screens).
     """
 
     corner: Array
@@ -48,10 +48,10 @@ class World:
     """A furnished building and the drive through it.
 
     Attributes:
-        name: what it is called on the command line.
-        surfaces: everything that can be seen.
-        legs: way points (N, 2), m, of each leg; between legs the robot stops and turns on the spot.
-        texture_seed: fixes the detail of the textures, whatever the seed of the noise.
+        name: name of the world on the command line.
+        surfaces: every surface that a sensor can see.
+        legs: way points (N, 2), m, of each piece of the drive; between pieces the robot stops and turns on the spot.
+        texture_seed: seed of the textures, independent of the seed of the sensor noise.
     """
 
     name: str
@@ -79,11 +79,11 @@ def box(
     Args:
         center: x and y of its middle, m.
         size: extent along its own x (front to back), y and z, m.
-        paint: of every face that `faces` does not name.
-        bottom_m: height of its lower face; on the floor there is none.
+        paint: paint of every face that `faces` does not name.
+        bottom_m: height of its lower face; a box on the floor (0) has none.
         yaw_deg: direction of its own x axis.
         faces: paints of `front` (+x), `back`, `left` (+y), `right`, `top`, `bottom`.
-        px_per_m: texels a metre.
+        px_per_m: texels per metre.
     """
     ex = _direction(np.deg2rad(yaw_deg)) * size[0]
     ey = _direction(np.deg2rad(yaw_deg + 90.0)) * size[1]
@@ -114,16 +114,16 @@ def panel(
     glow: float = 0.0,
     in_depth: bool = True,
 ) -> Facet:
-    """A thin upright rectangle, such as a poster, facing `yaw_deg`.
+    """A thin upright rectangle on a wall, such as a poster.
 
     Args:
-        middle: x, y and the height of its lower edge, m: a point of the wall that carries it.
-        yaw_deg: where it faces.
+        middle: x, y and height of the middle of its lower edge on the wall, m.
+        yaw_deg: direction that it faces.
         size: width and height, m.
-        paint: its texture.
-        px_per_m: texels a metre.
+        paint: paint of its front.
+        px_per_m: texels per metre.
         stand_off_m: distance from the wall.
-        glow: light given off.
+        glow: light given off, arbitrary unit.
         in_depth: whether a depth camera sees it.
     """
     yaw = np.deg2rad(yaw_deg)
@@ -135,7 +135,15 @@ def panel(
 def slab(
     low: Sequence[float], high: Sequence[float], height_m: float, paint: Paint, *, facing_up: bool, glow: float = 0.0
 ) -> Facet:
-    """A horizontal rectangle: floor, ceiling or lamp."""
+    """A horizontal rectangle at the height `height_m`: floor, ceiling or lamp.
+
+    Args:
+        low, high: (x, y) of its two opposite corners, m.
+        height_m: height above the floor.
+        paint: paint of its visible side.
+        facing_up: whether the visible side is the upper one.
+        glow: light given off, arbitrary unit.
+    """
     corner = np.array([low[0], low[1], height_m])
     ex, ey = np.array([high[0] - low[0], 0.0, 0.0]), np.array([0.0, high[1] - low[1], 0.0])
     along, up = (ex, ey) if facing_up else (ey, ex)
@@ -154,12 +162,11 @@ def partition(
     """A straight wall with door openings; above an opening the wall continues.
 
     Args:
-        start: (2,) m.
-        end: (2,) m.
-        paint: of its faces.
-        openings: start and end of each, metres from `start`, in order.
-        height_m: of the ceiling.
-        thickness_m: of the wall.
+        start, end: (2,) end points of the wall, m.
+        paint: paint of its faces.
+        openings: (start, end) of each opening, metres from `start`, in ascending order.
+        height_m: height of the wall.
+        thickness_m: thickness of the wall.
     """
     first, last = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     length = float(np.linalg.norm(last - first))

@@ -1,4 +1,6 @@
-"""The verification of the cells against physiology and exact integration, run by `hybridmap verify`."""
+"""Verification of the head-direction, band, grid and place cells against physiology and exact path integration
+(`hybridmap verify`).
+"""
 
 from hybridmap.verification.rows import rows_of
 from hybridmap.verification.verification import CellVerification, Scale, verify_cells

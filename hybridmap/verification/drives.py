@@ -1,4 +1,4 @@
-"""Drives of the verification: increments for the network, and the exact path."""
+"""Drives on which the cells are verified: the motion that the network gets, and the exact path."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _MARGIN_M = 0.9
 
 @dataclass(frozen=True, slots=True)
 class ExactDrive:
-    """A drive.
+    """A drive with its exact path.
 
     Attributes:
         deltas: (N, 3) pose after each step in the frame of the robot before it, m and rad.
-        poses: (N, 3) exact poses after each step, from the origin.
-        distance_m: (N,) driven so far.
-        hz: steps a second.
+        poses: (N, 3) exact poses after each step, starting from the origin, m and rad.
+        distance_m: (N,) distance driven up to each step.
+        hz: steps per second.
     """
 
     deltas: Array
@@ -31,7 +31,7 @@ class ExactDrive:
 
 
 def wander(rng: np.random.Generator, distance_m: float, hz: float) -> ExactDrive:
-    """Wander through a 10 x 3 m room at 0.3 to 1.1 m/s, turning away from its walls."""
+    """A random drive through a 10 x 3 m room at 0.3 to 1.1 m/s that turns away from the walls."""
     half = np.array(_ROOM_M) / 2 - _MARGIN_M
     dt = 1.0 / hz
     x = y = yaw = omega = driven = 0.0
@@ -53,16 +53,22 @@ def wander(rng: np.random.Generator, distance_m: float, hz: float) -> ExactDrive
 
 
 def corridor(rng: np.random.Generator, hz: float, length_m: float = 16.8) -> ExactDrive:
-    """Drive down a corridor at 0.5 m/s, swaying a little."""
+    """A drive down a corridor at 0.5 m/s, swaying a little."""
     steps = round(length_m / 0.5 * hz)
     sway = 0.05 * np.sin(np.arange(steps + 1) / hz * 2.0 * np.pi / 6.0 + rng.uniform(0.0, 2.0 * np.pi))
     return _along(np.stack([np.full(steps, 0.5 / hz), np.diff(sway)], axis=1), hz)
 
 
 def raster(side_m: float, pitch_m: float, angle_rad: float, *, upright: bool = False) -> ExactDrive:
-    """Drive back and forth along the lines of a square arena around the origin, one step per pixel.
+    """A drive back and forth along the lines of a square arena around the origin, one step per pixel.
 
-    The first step leads to the corner. Pixel (i, j) of a map is at `pixel_order`; `upright` drives along y instead of x.
+    The first step leads to a corner. `pixel_order` tells which pixel each following step reaches.
+
+    Args:
+        side_m: side of the arena.
+        pitch_m: side of a pixel.
+        angle_rad: rotation of the arena.
+        upright: drive along y instead of x.
     """
     count = round(side_m / pitch_m)
     ticks = (np.arange(count) - 0.5 * (count - 1)) * pitch_m
@@ -77,7 +83,7 @@ def raster(side_m: float, pitch_m: float, angle_rad: float, *, upright: bool = F
 
 
 def pixel_order(count: int, *, upright: bool = False) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-    """The pixels (count^2, 2), (x index, y index), in the order in which `raster` comes to them."""
+    """The pixels (count^2, 2), (x index, y index), in the order in which the drive of `raster` reaches them."""
     lines = np.repeat(np.arange(count), count)
     along = np.tile(np.concatenate([np.arange(count), np.arange(count)[::-1]]), -(-count // 2))[: count * count]
     return np.stack([lines, along] if upright else [along, lines], axis=1)

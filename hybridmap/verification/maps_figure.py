@@ -1,4 +1,4 @@
-"""Rate maps on the verification's page: stripes, grid cells and place cells."""
+"""Pictures of rate maps on the verification's page: stripes of band cells, grid cells and place cells."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _EXAMPLES = 8
 
 
 def stripes_figure(lattice: LatticeMaps) -> str:
-    """Rate maps of the three bands of every module; a `data:` URI."""
+    """Draw rate maps of one cell of each of the three bands of every module. Returns a `data:` URI."""
     modules = len(lattice.bands)
     with style.figure(style.PAGE_WIDTH_IN, 3.5, (0.03, 0.93, 0.01, 0.945)) as picture:
         panels = picture.subplots(3, modules, gridspec_kw=_TIGHT)
@@ -35,7 +35,11 @@ def stripes_figure(lattice: LatticeMaps) -> str:
 
 
 def grid_figure(lattice: LatticeMaps) -> str:
-    """Rate maps of two cells of every module, each with its score and peak, and their autocorrelograms; a `data:` URI."""
+    """Draw rate maps of two grid cells of every module, each with grid score and peak rate, and their autocorrelograms.
+
+    Returns:
+        A `data:` URI.
+    """
     modules, cells = lattice.grid.shape[:2]
     shown = min(2, cells)
     with style.figure(style.PAGE_WIDTH_IN, 2.45 * shown, (0.03, 0.93, 0.01, 0.925)) as picture:
@@ -57,7 +61,11 @@ def grid_figure(lattice: LatticeMaps) -> str:
 
 
 def place_figure(place: PlaceResult) -> str:
-    """Fields of place cells with and without recruitment, and how many fields they have; a `data:` URI."""
+    """Draw the firing fields of place cells that were recruited and of cells that were not, and how many fields each has.
+
+    Returns:
+        A `data:` URI.
+    """
     groups = (
         ("recruited", place.recruited),
         ("printed rule", place.printed),

@@ -25,10 +25,19 @@ _TEMPLATE = "verify.html.j2"
 
 
 def write_verification(place: Held, head: dict[str, Any], rows: Sequence[Metric], result: CellVerification) -> Path:
-    """Write `metrics.json` and `verify.html` into a folder that is locked as `VERIFICATION`; returns the page.
+    """Write `metrics.json` and `verify.html`.
+
+    Args:
+        place: the folder, locked against other writers.
+        head: facts about the run.
+        rows: the metrics in the table.
+        result: results of the experiments, for the pictures.
+
+    Returns:
+        The path of the page.
 
     Raises:
-        OutputError: it cannot be written to.
+        OutputError: the folder cannot be written to.
     """
     text = _render(head, rows, result)
     with place.replaced():
@@ -85,7 +94,7 @@ _NOISE_COLOURS = ("#fde725", "#5ec962", "#21918c", "#3b528b", "#440154")
 
 
 def heading_figure(heading: HeadDirectionResult) -> str:
-    """Tuning of six cells of the ring, and the population at four turn rates; a `data:` URI."""
+    """Draw the tuning curves of six head-direction cells, and the ring's activity at four turn rates. Returns a `data:` URI."""
     degrees = np.degrees(heading.preferred_rad)
     with style.figure(style.PAGE_WIDTH_IN, 2.7) as picture:
         ring, one = picture.subplots(1, 2)
@@ -103,7 +112,11 @@ def heading_figure(heading: HeadDirectionResult) -> str:
 
 
 def phase_figure(result: CellVerification) -> str:
-    """The worst module's phase error and the position error over distance, on every drive; a `data:` URI."""
+    """Draw the phase error of the worst grid module and the position error over distance, for every drive.
+
+    Returns:
+        A `data:` URI.
+    """
     with style.figure(style.PAGE_WIDTH_IN, 3.6) as picture:
         phase, position = picture.subplots(1, 2)
         for (rectifier, hz), drives in result.room.items():
@@ -125,7 +138,7 @@ def phase_figure(result: CellVerification) -> str:
 
 
 def module_figure(drives: Sequence[PathErrors], spacings_m: Any) -> str:
-    """Each module's phase error over distance on one drive; a `data:` URI."""
+    """Draw the phase error of each grid module over distance. Returns a `data:` URI."""
     with style.figure(style.PAGE_WIDTH_IN, 2.6) as picture:
         axes = picture.subplots()
         colours = np.linspace(0.0, 0.9, len(spacings_m))
@@ -144,7 +157,11 @@ def module_figure(drives: Sequence[PathErrors], spacings_m: Any) -> str:
 
 
 def noise_figure(result: CellVerification) -> str:
-    """RMS position and heading error over distance for every noise, with quartiles over the drives; a `data:` URI."""
+    """Draw RMS position and heading error over distance for every level of neuron noise, with quartiles over the drives.
+
+    Returns:
+        A `data:` URI.
+    """
     with style.figure(style.PAGE_WIDTH_IN, 3.4) as picture:
         position, heading = picture.subplots(1, 2)
         for colour, (share, drives) in zip(_NOISE_COLOURS[1:], result.noise.items(), strict=False):
@@ -163,7 +180,7 @@ def noise_figure(result: CellVerification) -> str:
 
 
 def shadow_figure(overwriting: Overwriting) -> str:
-    """Response of the pose to a shift of the cells' activity while the robot drives on; a `data:` URI."""
+    """Draw how the decoded pose responds when the cells' activity is shifted and the robot drives on. Returns a `data:` URI."""
     names: dict[Cells, str] = {"both": "rings and sheets", "rings": "rings alone", "sheets": "sheets alone"}
     colours: dict[Cells, str] = {"both": "#000000", "rings": style.PRIMARY, "sheets": style.ODOMETRY}
     with style.figure(style.PAGE_WIDTH_IN, 2.8) as picture:

@@ -18,11 +18,11 @@ _NODE_M = 0.5
 
 @dataclass(frozen=True, slots=True)
 class PathErrors:
-    """Errors along a drive, taken every half metre, as a mapper reads the pose at its nodes.
+    """Errors of the neural path integrator along a drive, every half metre.
 
     Attributes:
-        distance_m: (S,) driven.
-        module: (S, M) error of each module's phase, as a share of its spacing.
+        distance_m: (S,) distance driven.
+        module: (S, M) phase error of each of the M grid modules, as a share of its spacing.
         position_m: (S,) error of the position decoded from all modules together.
         heading_rad: (S,) error of the decoded heading.
     """
@@ -34,7 +34,13 @@ class PathErrors:
 
 
 def path_errors(config: NeuralConfig, drive: ExactDrive, rng: np.random.Generator | None = None) -> PathErrors:
-    """Drive a new path integrator and compare it with the exact poses; `rng` is of the neuron noise."""
+    """Drive a new path integrator and compare it with the exact poses.
+
+    Args:
+        config: settings of the cells.
+        drive: motion and exact poses.
+        rng: random generator for the neuron noise; None without noise.
+    """
     integrator = PathIntegrator(config, rng)
     dt, next_m = 1.0 / drive.hz, 0.0
     rows: list[tuple[float, Array, float, float]] = []
@@ -53,13 +59,20 @@ def path_errors(config: NeuralConfig, drive: ExactDrive, rng: np.random.Generato
 
 
 def room_errors(seed: np.random.SeedSequence, settings: dict[str, object], distance_m: float, hz: float) -> PathErrors:
-    """Errors of cells with these settings on a drive through the 10 x 3 m room."""
+    """Errors of the path integrator on a random drive through the 10 x 3 m room.
+
+    Args:
+        seed: seed of the drive.
+        settings: settings of the cells (`NeuralConfig`).
+        distance_m: length of the drive.
+        hz: steps per second.
+    """
     drive = wander(np.random.default_rng(seed), distance_m, hz)
     return path_errors(NeuralConfig.model_validate(settings), drive)
 
 
 def corridor_errors(seed: np.random.SeedSequence, settings: dict[str, object]) -> PathErrors:
-    """Errors of cells with these settings on a drive down the 16.8 m corridor, 30 Hz."""
+    """Errors of the path integrator with these settings (`NeuralConfig`) on a drive down the 16.8 m corridor, 30 Hz."""
     return path_errors(NeuralConfig.model_validate(settings), corridor(np.random.default_rng(seed), 30.0))
 
 
@@ -70,7 +83,14 @@ def noise_errors(
     noise: float,
     distance_m: float,
 ) -> PathErrors:
-    """Errors of cells with multiplicative neuron noise in every population, on a drive through the room, 30 Hz."""
+    """Errors of the path integrator with multiplicative noise on the rates of all cells, on a drive through the room, 30 Hz.
+
+    Args:
+        drive_seed, noise_seed: seeds of the drive and of the noise.
+        settings: settings of the cells (`NeuralConfig`).
+        noise: standard deviation of the noise.
+        distance_m: length of the drive.
+    """
     drive = wander(np.random.default_rng(drive_seed), distance_m, 30.0)
     config = NeuralConfig.model_validate(settings | {"neuron_noise": noise})
     return path_errors(config, drive, np.random.default_rng(noise_seed))
@@ -81,11 +101,11 @@ class HeadDirectionResult:
     """The head-direction ring after many turns.
 
     Attributes:
-        error_rad: error of the decoded heading after the last of the turns, by precision.
-        preferred_rad: (m,) preferred directions.
+        error_rad: name of the floating-point precision -> error of the decoded heading after the last turn.
+        preferred_rad: (m,) preferred directions of the cells.
         tuning: (6, 360) rates of six cells at headings of 0 to 359 degrees.
-        turn_rates_rad_s: (R,) turn rates of `rates`.
-        rates: (R, m) rates shown at those turn rates (`HeadDirectionRing.rates`; no other cell sees them).
+        turn_rates_rad_s: (R,) turn rates for `rates`.
+        rates: (R, m) rates of the ring at those turn rates, as drawn (`HeadDirectionRing.rates`).
     """
 
     error_rad: dict[str, float]
@@ -96,7 +116,7 @@ class HeadDirectionResult:
 
 
 def head_direction(seed: np.random.SeedSequence, settings: dict[str, object], steps: int) -> HeadDirectionResult:
-    """Turn rings of both precisions by the same random turns and compare with their sum."""
+    """Turn a head-direction ring of each floating-point precision by the same random turns; compare with their exact sum."""
     turns = np.random.default_rng(seed).normal(0.002, 0.02, steps)
     cells = NeuralConfig.model_validate(settings).head_direction_cells
     errors = {}
@@ -117,11 +137,11 @@ def head_direction(seed: np.random.SeedSequence, settings: dict[str, object], st
 
 @dataclass(frozen=True, slots=True)
 class StandstillResult:
-    """Standing still.
+    """What happens while the robot stands still.
 
     Attributes:
         pose_change: largest change of a coordinate of the pose over the steps without motion, m or rad.
-        ungated: by rectifier, how far a sheet crept when its dynamics ran on all the same, as a share of the spacing.
+        ungated: rectifier -> how far a grid sheet drifted when its dynamics kept running, as a share of the spacing.
     """
 
     pose_change: float
@@ -129,7 +149,7 @@ class StandstillResult:
 
 
 def standstill(seed: np.random.SeedSequence, settings: dict[str, object], steps: int) -> StandstillResult:
-    """Drive two metres, then stand; once as the integrator does, once with the dynamics of rings and sheets running on."""
+    """Drive two metres, then stand still: once with the path integrator as it is, once with its dynamics kept running."""
     drive = wander(np.random.default_rng(seed), 2.0, 30.0)
     ungated, change = {}, 0.0
     for rectifier in ("relu", "softplus"):

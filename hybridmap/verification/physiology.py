@@ -18,11 +18,11 @@ _CENTRAL_PEAK = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Stripe:
-    """The strongest wave of a rate map.
+    """The strongest plane wave of a rate map.
 
     Attributes:
         orientation_rad: direction in which the rate changes, in [0, pi).
-        period_m: distance of two stripes.
+        period_m: distance between two stripes.
     """
 
     orientation_rad: float
@@ -32,7 +32,7 @@ class Stripe:
 def autocorrelogram(rates: Array) -> Array:
     """Pearson correlation of a rate map (H, W) with itself at every lag, (2H-1, 2W-1), zero lag in the middle.
 
-    Only bins in which both maps have a value count; lags with fewer than 20 such bins are 0 (Sargolini et al. 2006).
+    Only bins that both shifted maps cover count; lags with fewer than 20 such bins are 0 (Sargolini et al. 2006).
     """
     height, width = rates.shape
     shape = (2 * height - 1, 2 * width - 1)
@@ -111,7 +111,7 @@ def ideal_map(
 
 
 def stripe_of(rates: Array, pitch_m: float) -> Stripe:
-    """Orientation and period of the strongest wave of a rate map (H, W), by its Fourier transform, between the bins too."""
+    """Orientation and period of the strongest plane wave of a rate map (H, W), by its Fourier transform, interpolated."""
     from scipy import optimize
 
     height, width = rates.shape

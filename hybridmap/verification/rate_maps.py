@@ -26,11 +26,12 @@ class LatticeMaps:
 
     Attributes:
         pitch_m: side of a pixel.
-        spacings_m: (M,).
-        grid: (M, C, H, W) of sampled grid cells.
-        gridness: (M, C).
-        bands: (M, 3, H, W) of one sampled cell a band.
-        band_orientation_error_deg, band_period_error: (M, 3) against what the band was made for; the period's as a share.
+        spacings_m: (M,) spacing of each grid module.
+        grid: (M, C, H, W) rate maps of C sampled grid cells of each module.
+        gridness: (M, C) grid score of each of these maps.
+        bands: (M, 3, H, W) rate map of one sampled cell of each band.
+        band_orientation_error_deg, band_period_error: (M, 3) deviation of the measured stripes from the orientation and
+            period for which the band was made; the period's as a share.
     """
 
     pitch_m: float
@@ -45,7 +46,15 @@ class LatticeMaps:
 def lattice_maps(
     seed: np.random.SeedSequence, settings: dict[str, object], side_m: float, pitch_m: float, cells: int
 ) -> LatticeMaps:
-    """Map sampled grid and band cells over an arena that is turned by chance against the lattices."""
+    """Record rate maps of sampled grid and band cells over a square arena that is rotated by a random angle.
+
+    Args:
+        seed: seed of the angle and of the sampled cells.
+        settings: settings of the cells (`NeuralConfig`).
+        side_m: side of the arena.
+        pitch_m: side of a pixel.
+        cells: number of sampled cells per module.
+    """
     rng = np.random.default_rng(seed)
     angle = float(rng.uniform(0.0, np.pi / 2.0))
     integrator = PathIntegrator(NeuralConfig.model_validate(settings))
@@ -77,7 +86,7 @@ def lattice_maps(
 
 @dataclass(frozen=True, slots=True)
 class PlaceMaps:
-    """Place fields of one population.
+    """Firing fields of one population of cells.
 
     Attributes:
         examples: (E, H, W) rate maps of some cells.
@@ -89,19 +98,22 @@ class PlaceMaps:
 
     @property
     def single(self) -> float:
-        """Share of the cells with exactly one field."""
+        """Share of the cells that fire which have exactly one field."""
         return float((self.fields == 1).mean()) if len(self.fields) else float("nan")
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceResult:
-    """Place cells with and without recruitment, and the sheet they project to, with and without settled competition.
+    """Place cells and the attractor sheet to which they project, in two variants each.
+
+    Place cells are `recruited` (one new cell for each new place) or `printed` (the paper's rule, from random weights). The
+    sheet shows its `input`, or is `settled` (its cells have competed through their recurrent weights).
 
     Attributes:
         pitch_m: side of a pixel.
-        recruited, printed: fields of the place cells: with recruitment; by the printed rule from random weights.
-        sheet: fields of the attractor's cells, by (`recruited` or `printed`, `input` or `settled`).
-        one_bump: share of the places at which the sheet holds a single bump, by the same.
+        recruited, printed: fields of the place cells.
+        sheet: (`recruited` or `printed`, `input` or `settled`) -> fields of the sheet's cells.
+        one_bump: same keys -> share of the places at which the sheet holds a single bump of activity.
     """
 
     pitch_m: float
@@ -114,7 +126,15 @@ class PlaceResult:
 def place_maps(
     seed: np.random.SeedSequence, settings: dict[str, object], side_m: float, pitch_m: float, cells: int, epochs: int
 ) -> PlaceResult:
-    """Learn on one drive over an arena, map the fields on another one across it."""
+    """Let place cells learn on one drive over a square arena, and record their fields on a second drive across the first.
+
+    Args:
+        seed: seed of all random choices.
+        settings: settings of the cells (`NeuralConfig`).
+        side_m: side of the arena.
+        pitch_m: side of a pixel.
+        cells, epochs: number of place cells, and of passes of learning, of the paper's rule.
+    """
     rng = np.random.default_rng(seed)
     angle, count = float(rng.uniform(0.0, np.pi / 2.0)), round(side_m / pitch_m)
     config = NeuralConfig.model_validate(settings)
@@ -146,10 +166,10 @@ def place_maps(
 
 
 class PrintedRule:
-    """Place cells by the printed rule (paper eqs. 8-9) without recruitment: random weights, competition by one inhibition.
+    """Place cells by the paper's rule (eqs. 8-9) without recruitment: random weights, competition by one common inhibition.
 
-    So that anything comes of it at all the weights are kept non-negative and of unit length; C_inh_p is what leaves one cell in
-    fifty firing.
+    Two additions make the rule work: the weights are kept non-negative and of unit length, and the inhibition C_inh_p is set
+    so that one cell in fifty fires.
     """
 
     def __init__(self, rng: np.random.Generator, cells: int, inputs: int, learning_rate: float) -> None:
@@ -158,12 +178,12 @@ class PrintedRule:
         self._rate = np.float32(learning_rate)
 
     def respond(self, drive: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the rates (cells,) or (cells, P) to inputs (inputs,) or (inputs, P)."""
+        """The rates of the place cells, (cells,) or (cells, P), to inputs (inputs,) or (inputs, P)."""
         received = self.weights @ drive
         return np.asarray(np.maximum(received - np.quantile(received, 0.98, axis=0), 0.0), dtype=np.float32)
 
     def learn(self, drive: NDArray[np.float32]) -> None:
-        """One step of the Hebbian rule, rates as shares of the strongest."""
+        """Take one step of the Hebbian rule for the inputs `drive`; rates count relative to the strongest one."""
         rates = self.respond(drive)
         active = np.flatnonzero(rates)
         share = rates[active, None] / rates.max()
@@ -190,7 +210,7 @@ def _onto_sheet(learnt: NDArray[np.float32], bumps: NDArray[np.float32], rates: 
 
 
 def settled_sheets(integrator: PathIntegrator, shown: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The sheet's activity (S, P) after its cells have competed over each input (S, P)."""
+    """Activity (S, P) of the attractor sheet after its cells have competed, starting from each of P inputs (S, P)."""
     attractor = integrator.attractor
     settled = np.zeros_like(shown)
     for pixel in np.flatnonzero(shown.sum(axis=0) > 0.0):
@@ -201,9 +221,12 @@ def settled_sheets(integrator: PathIntegrator, shown: NDArray[np.float32]) -> ND
 
 
 def one_bump_share(activity: NDArray[np.float32]) -> float:
-    """Share of the places, of those at which a square torus of cells (N * N, P) is active, with a single bump on it.
+    """Share of the places at which the sheet holds exactly one bump of activity; places without activity do not count.
 
-    A bump is a cell that no other within two cells exceeds, above 20 % of the highest.
+    A bump is a cell above 20 % of the highest activity that no other cell within two cells exceeds.
+
+    Args:
+        activity: (N * N, P) of a square sheet with opposite edges joined, at P places.
     """
     from scipy import ndimage
 

@@ -1,4 +1,4 @@
-"""The table of the verification: one figure per row, with its bar."""
+"""The table of the verification: one metric per row, with the limit (bar) that it must keep."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _AT_MOST, _AT_LEAST = "at most", "at least"
 
 
 def rows_of(result: CellVerification) -> list[Metric]:
-    """Every row of the table, `verify/<row>`; rows with a bar state whether they keep it."""
+    """All rows of the verification's table, named `verify/<row>`; a row with a limit states whether it keeps it."""
     parts: Sequence[Callable[[CellVerification], list[Metric]]] = (
         head_direction_rows,
         band_rows,
@@ -50,7 +50,7 @@ def _row(name: str, value: float, unit: str, description: str, bar: float | None
 
 
 def head_direction_rows(result: CellVerification) -> list[Metric]:
-    """The decoded heading after many turns, and the turn-rate modulation."""
+    """Rows on the head-direction ring: error of the decoded heading after many turns, and modulation by the turn rate."""
     heading = result.head_direction
     gain = float(heading.rates[-1].max() / heading.rates[0].max())
     fastest = heading.turn_rates_rad_s[-1]
@@ -69,7 +69,7 @@ def head_direction_rows(result: CellVerification) -> list[Metric]:
 
 
 def band_rows(result: CellVerification) -> list[Metric]:
-    """Orientation and period of every band, from rate maps of the rings' activity."""
+    """Rows on the band cells: orientation and period of every band, from rate maps."""
     lattice = result.lattice
     orientation = float(lattice.band_orientation_error_deg.max())
     period = 100.0 * float(lattice.band_period_error.max())
@@ -80,7 +80,7 @@ def band_rows(result: CellVerification) -> list[Metric]:
 
 
 def gridness_rows(result: CellVerification) -> list[Metric]:
-    """Gridness of the sampled cells, of an ideal map, and of the square metric."""
+    """Rows on the grid score: of the sampled cells, of an ideal map, and of cells on a square lattice."""
     scores = result.lattice.gridness
     spacings = result.lattice.spacings_m / result.lattice.pitch_m
     side = result.lattice.grid.shape[-1]
@@ -96,7 +96,7 @@ def gridness_rows(result: CellVerification) -> list[Metric]:
 
 
 def phase_rows(result: CellVerification) -> list[Metric]:
-    """The worst module's phase error of all drives, by rectifier and rate."""
+    """Rows on the phase error of the worst grid module over all drives, per rectifier and step rate."""
     return [
         _row(
             f"phase_error_{rectifier}_{hz:g}hz",
@@ -110,7 +110,7 @@ def phase_rows(result: CellVerification) -> list[Metric]:
 
 
 def position_rows(result: CellVerification) -> list[Metric]:
-    """The position decoded from all modules together: in the room and down the corridor."""
+    """Rows on the error of the position decoded from all modules, in the room and down the corridor."""
     rows = []
     for rectifier, corridor in result.corridor.items():
         drives = [path for (f, _), paths in result.room.items() if f == rectifier for path in paths]
@@ -123,7 +123,7 @@ def position_rows(result: CellVerification) -> list[Metric]:
 
 
 def shadow_rows(result: CellVerification) -> list[Metric]:
-    """Whether overwriting the activity moves the pose by exactly that shift, and which cells hold the position."""
+    """Rows on overwritten activity: whether the decoded pose moves by exactly its shift, and which cells hold the position."""
     at_once = "spacings by which the pose misses a shift written into the sheets"
     on = f"the same with rings and sheets shifted together, largest over {STEPS_ON} steps of driving on"
     rows = [
@@ -143,7 +143,7 @@ def shadow_rows(result: CellVerification) -> list[Metric]:
 
 
 def place_rows(result: CellVerification) -> list[Metric]:
-    """Single fields with and without recruitment."""
+    """Rows on the share of place cells with a single field, with and without recruitment."""
     place = result.place
     recruited = f"of {len(place.recruited.fields)} recruited place cells have one field"
     printed = f"of {len(place.printed.fields)} cells by the printed rule have one field"
@@ -154,7 +154,7 @@ def place_rows(result: CellVerification) -> list[Metric]:
 
 
 def recurrence_rows(result: CellVerification) -> list[Metric]:
-    """The effect of settled recurrent competition on the attractor's sheet."""
+    """Rows on the effect of recurrent competition on the attractor sheet of the place cells."""
     rows, place = [], result.place
     for learnt, cells in _LEARNT.items():
         for stage, how in (("input", "without competition"), ("settled", "after settled competition")):
@@ -168,7 +168,7 @@ def recurrence_rows(result: CellVerification) -> list[Metric]:
 
 
 def recurrence_verdict(place: PlaceResult) -> str:
-    """The effect of recurrence, in words."""
+    """One sentence on the effect of recurrent competition on the attractor sheet of the place cells."""
     sentences = []
     for learnt, cells in _LEARNT.items():
         before, after = (100.0 * place.sheet[learnt, stage].single for stage in ("input", "settled"))
@@ -182,14 +182,14 @@ def recurrence_verdict(place: PlaceResult) -> str:
 
 
 def verb_of_change(percent: float) -> str:
-    """The verb for a change by some per cent of all cells."""
+    """The verb that describes a change, given in per cent of all cells."""
     if abs(percent) < 0.5:
         return "does not change"
     return "hardly changes" if abs(percent) < 5.0 else "raises" if percent > 0.0 else "lowers"
 
 
 def standstill_rows(result: CellVerification) -> list[Metric]:
-    """Standing still: as the integrator does, and with the dynamics running on."""
+    """Rows on standing still: with the path integrator as it is, and with its dynamics kept running."""
     still = result.standstill
     rows = [_row("standing_still", still.pose_change, "m", "largest change of the pose over all steps without motion", 0.0)]
     for rectifier, crept in still.ungated.items():
@@ -199,7 +199,7 @@ def standstill_rows(result: CellVerification) -> list[Metric]:
 
 
 def noise_rows(result: CellVerification) -> list[Metric]:
-    """The effect of neuron noise."""
+    """Rows on the drift that neuron noise causes."""
     rows = []
     for share, drives in result.noise.items():
         curve = noise_curve(drives)
@@ -217,9 +217,9 @@ class NoiseCurve:
     """Errors of several drives over distance.
 
     Attributes:
-        distance_m: (S,) that all drives have in common.
-        rms: (S,) over the drives.
-        quartiles: (2, S) between which half of the drives are.
+        distance_m: (S,) distances that all drives reach.
+        rms: (S,) root mean square over the drives.
+        quartiles: (2, S) lower and upper quartile over the drives.
     """
 
     distance_m: Array
@@ -228,7 +228,7 @@ class NoiseCurve:
 
 
 def noise_curve(drives: Sequence[PathErrors], what: Literal["position_m", "heading_rad"] = "position_m") -> NoiseCurve:
-    """Position errors, m, or heading errors, rad, of drives with noise."""
+    """Statistics of the position errors, m, or heading errors, rad, of drives with the same noise."""
     count = min(len(drive.distance_m) for drive in drives)
     errors = np.array([getattr(drive, what)[:count] for drive in drives])
     rms = np.sqrt((errors**2).mean(axis=0))
@@ -236,6 +236,6 @@ def noise_curve(drives: Sequence[PathErrors], what: Literal["position_m", "headi
 
 
 def kernel_rows(result: CellVerification) -> list[Metric]:
-    """Whether the printed kernel's instability is detected and named."""
+    """Rows on whether the instability of the paper's printed kernel is detected and reported."""
     named = float("do not settle" in result.printed_kernel)
     return [_row("printed_kernel_refused", named, "1", "the instability of the printed kernel is named", 1.0, _AT_LEAST)]

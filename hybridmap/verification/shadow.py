@@ -1,4 +1,4 @@
-"""Test that activity alone holds the position: cells are overwritten, and the pose must follow."""
+"""Test that the cells' activity alone holds the position: activity is overwritten, and the decoded pose must follow."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ _SHIFT_SPACINGS = 0.25
 
 @dataclass(frozen=True, slots=True)
 class Overwriting:
-    """Response of the pose to a shift of the cells' activity.
+    """Response of the decoded pose when the activity of cells is shifted as if the robot stood elsewhere.
 
     Attributes:
-        at_once: (draws,) error of the pose's response to a shift of the sheets, before any step, in finest spacings.
-        shift_m: length of the shifts for the drives that go on.
-        shown: share (STEPS_ON + 1,) of the shift in the pose after each further step, relative to an unchanged network; mean
-            over some directions; by which cells are overwritten and whether stripes drive the sheets.
-        driving_on: largest error of the response if rings and sheets are overwritten together, in finest spacings.
+        at_once: (draws,) difference between the pose's response and the shift of the grid sheets, before any further step, in
+            spacings of the finest module.
+        shift_m: length of the shifts after which the robot drives on.
+        shown: (which cells are shifted, whether stripes drive the sheets) -> (STEPS_ON + 1,) share of the shift that the pose
+            shows after each further step, relative to an unchanged network; mean over some directions.
+        driving_on: largest error of the response if rings and sheets are shifted together, in spacings of the finest module.
     """
 
     at_once: Array
@@ -40,7 +41,14 @@ class Overwriting:
 
 
 def overwritten(seed: np.random.SeedSequence, settings: dict[str, object], draws: int, directions: int) -> Overwriting:
-    """Shift the activity of sheets, rings, or both; decode at once, and while driving on."""
+    """Shift the activity of grid sheets, band rings, or both, and decode the pose at once and while the robot drives on.
+
+    Args:
+        seed: seed of the drives and shifts.
+        settings: settings of the cells (`NeuralConfig`).
+        draws: number of shifts that are decoded at once.
+        directions: number of shifts after which the robot drives on.
+    """
     rng = np.random.default_rng(seed)
     config = NeuralConfig.model_validate(settings)
     at_once = _at_once(rng, config, draws)
@@ -92,7 +100,7 @@ def _positions_after(config: NeuralConfig, drive: ExactDrive, cells: Cells | Non
 
 
 def overwrite(integrator: PathIntegrator, cells: Cells, way_m: Array) -> None:
-    """Set cells to the activity of a robot displaced by `way_m` (2,)."""
+    """Shift the activity of some cells to that of a robot displaced by `way_m` (2,), m."""
     shift = integrator.bands.wave_vectors @ way_m
     if cells != "sheets":
         integrator.bands.activity = integrator.bands.rates_at(integrator.bands.phases() + shift)

@@ -27,16 +27,17 @@ RATES_HZ = (30.0, 100.0)
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Size of the experiments; the bars are stated for the defaults.
+    """Size of the experiments. The limits in the table hold for the defaults.
 
     Attributes:
-        paths: drives through the room, each of `distance_m`, at each rate with each rectifier.
-        heading_steps, still_steps, overwrites: numbers of steps and of draws.
-        overwritten_drives: directions in which cells are shifted before driving on.
+        paths: number of drives through the room, each of `distance_m`, at each step rate with each rectifier.
+        heading_steps, still_steps: number of turns of the head-direction ring, and of steps at standstill.
+        overwrites: number of shifts of the activity that are decoded at once.
+        overwritten_drives: number of directions in which activity is shifted before driving on.
         arena_m, lattice_pitch_m, lattice_cells: side and pixel of the grid cells' arena, sampled cells per module.
-        place_pitch_m, place_cells, place_epochs: pixel of the place cells' maps; cells and passes of the printed rule.
+        place_pitch_m, place_cells, place_epochs: pixel of the place cells' maps; cells and passes of the paper's rule.
         noise: standard deviations of the neuron noise; `noise_repeats` drives of `noise_distance_m` for each.
-        workers: processes; None: one per core.
+        workers: number of processes; None: one per core.
     """
 
     paths: int = 5
@@ -62,14 +63,15 @@ class CellVerification:
     """Results of the experiments.
 
     Attributes:
-        head_direction, standstill: the ring after many turns; standing still.
-        lattice, square: maps on the hexagonal and on the square metric.
+        head_direction: the head-direction ring after many turns.
+        standstill: the path integrator while the robot stands still.
+        lattice, square: rate maps with the hexagonal and with the square metric.
         place: place fields.
-        room: errors of every drive through the room, by (rectifier, rate in Hz).
-        corridor: errors down the corridor, by rectifier.
-        overwritten: response of the pose to a shift of the cells' activity, by rectifier.
-        noise: errors of every drive with neuron noise, by its standard deviation.
-        printed_kernel: error message for the printed kernel; empty if it is stable.
+        room: (rectifier, steps per second) -> errors of every drive through the room.
+        corridor: rectifier -> errors of the drive down the corridor.
+        overwritten: rectifier -> response of the pose to a shift of the cells' activity.
+        noise: standard deviation of the neuron noise -> errors of every drive with it.
+        printed_kernel: error message for the paper's printed kernel; empty if it is stable.
     """
 
     head_direction: HeadDirectionResult
@@ -90,16 +92,16 @@ Task = tuple[Callable[..., Any], tuple[Any, ...]]
 def verify_cells(
     seed: int, scale: Scale, settings: dict[str, object], progress: Callable[[int, int | None], None] | None = None
 ) -> CellVerification:
-    """Run every experiment; the same seed gives the same figures, on any number of cores.
+    """Run every experiment; the same seed gives the same results, on any number of cores.
 
     Args:
-        seed: of all drives, samples and noises.
-        scale: how much is run.
-        settings: of the cells (`NeuralConfig`), besides what an experiment varies.
-        progress: called with the number of experiments done and of all.
+        seed: seed of all drives, samples and noises.
+        scale: size of the experiments.
+        settings: settings of the cells (`NeuralConfig`), besides what an experiment varies.
+        progress: called with the number of finished experiments and of all.
 
     Raises:
-        ConfigError: with these settings no cells can be made.
+        ConfigError: the settings do not allow a working network.
     """
     PathIntegrator(NeuralConfig.model_validate(settings))  # fails at once if it cannot be made
     tasks = _tasks(np.random.SeedSequence(seed), scale, settings)
@@ -149,7 +151,7 @@ def _tasks(seed: np.random.SeedSequence, scale: Scale, settings: dict[str, objec
 
 
 def printed_kernel(settings: dict[str, object]) -> str:
-    """The error message for the printed kernel with these settings; empty if it is stable."""
+    """The error message that the paper's printed kernel causes with these settings; an empty string if it is stable."""
     try:
         PathIntegrator(NeuralConfig.model_validate(settings | {"kernel": "printed"}))
     except ConfigError as error:
