@@ -24,12 +24,12 @@ class Update:
     """What the mapper did at one instant, and why.
 
     Attributes:
-        stamp_ns: of the sample.
+        stamp_ns: time of the sample.
         pose_odom_robot: (3,) by the path integrator; `odom` begins at the start of the drive.
-        pose_map_robot: (3,) by the primary back-end.
-        poses_map_robot: the same by each back-end.
-        at_node, delta_node_robot: the node that the robot is at (-1 before the first) and its pose (3,) seen from it.
-        new_node: the node made here, if any.
+        pose_map_robot: (3,) on the map of the primary back-end.
+        poses_map_robot: (3,) on the map of each back-end, by its name.
+        at_node, delta_node_robot: the node from which the robot is seen (-1 before the first), and its pose (3,) from there.
+        new_node: number of the node made now; None if none was made.
         edges: numbers of new and changed edges.
         reason: why a node was made, or why not.
     """
@@ -46,20 +46,20 @@ class Update:
 
 
 class Position:
-    """Pose of the robot in `odom`, seen from its node, and on the map of every back-end.
+    """Pose of the robot in `odom`, seen from a node, and on the map of every back-end.
 
     Attributes:
-        stamp_ns: of the last motion.
+        stamp_ns: time of the last motion.
         pose_odom: (3,) in `odom` by the path integrator.
         pose_odom_given: (3,) in the odometry as received.
         travel_m: path length so far.
-        at_node: the node that the robot is at, -1 before the first.
+        at_node: the node from which the robot is seen, -1 before the first.
         pose_odom_at_node: (3,) of that node in `odom`.
         pose_map_at_node: (3,) of that node by every back-end, by name.
     """
 
     def __init__(self, config: EdgesConfig, primary: str) -> None:
-        """Start before the first node; `primary` is the back-end of `pose_map`."""
+        """Start before the first node; `primary` is the name of the back-end that `pose_map` uses."""
         self._config = config
         self._primary = primary
         self._driven = (0.0, 0.0)  # since the last node was made: m and rad
@@ -73,7 +73,7 @@ class Position:
 
     @property
     def moved(self) -> Array:
-        """(3,) the robot seen from the node that it is at."""
+        """(3,) pose of the robot in the frame of the node `at_node`."""
         return between(self.pose_odom_at_node, self.pose_odom)
 
     def drive(self, ready: Ready, pose_odom: Array) -> None:
@@ -84,38 +84,38 @@ class Position:
         self._driven = (self._driven[0] + travel_m, self._driven[1] + turn_rad)
 
     def odometry(self, pose_odom_before: Array) -> RelativePose:
-        """The motion from a pose (3,) in `odom` to here, with the covariance of the way since the last node."""
+        """The motion from a pose (3,) in `odom` to here; its covariance is that of the drive since the last node was made."""
         return RelativePose(between(pose_odom_before, self.pose_odom), odometry_covariance(self._config, *self._driven))
 
     def restart(self) -> None:
-        """Start the way to the next node."""
+        """Set the path length since the last node to zero: a node was made here."""
         self._driven = (0.0, 0.0)
 
     def attach(self, node: int, pose_odom_node: Array) -> None:
-        """See the robot from a node, which lies at a pose (3,) in `odom`."""
+        """From now on, see the robot from a node that lies at a pose (3,) in `odom`."""
         self.at_node, self.pose_odom_at_node = node, pose_odom_node
 
     def correct(self, poses_of: Mapping[str, Array]) -> None:
-        """Take over the poses (N, 3) of the nodes by each back-end."""
+        """Take in new poses (N, 3) of all nodes by each back-end, by name."""
         self.pose_map_at_node = {name: poses[self.at_node] for name, poses in poses_of.items()}
 
     def pose_map(self, pose_odom: Array) -> Array:
-        """A pose (3,) in `odom`, brought to the map of the primary back-end."""
+        """Transform a pose (3,) in `odom` to the map of the primary back-end."""
         at_node = self.pose_map_at_node.get(self._primary)
         return pose_odom if at_node is None else compose(at_node, between(self.pose_odom_at_node, pose_odom))
 
     def update(self, reason: str, node: int | None = None, edges: Sequence[int] = ()) -> Update:
-        """The update of this instant."""
+        """Make the `Update` of this instant."""
         moved, pose_map = self.moved, self.pose_map(self.pose_odom)
         on_map = {name: compose(pose, moved) for name, pose in self.pose_map_at_node.items()}
         return Update(self.stamp_ns, self.pose_odom, pose_map, on_map, self.at_node, moved, reason, node, tuple(edges))
 
 
 class EdgeBook:
-    """Writes proposals into the map as edges, and gives vision the state of the map.
+    """Writes edges that the front-end proposes into the map, and gives the front-end the state of the map.
 
     Attributes:
-        tried_again: numbers of the loops that were measured again because a back-end gave them no weight.
+        tried_again: numbers of the loops that were measured again because a back-end down-weighted them as outliers.
     """
 
     def __init__(self, experiences: ExperienceMap, config: EdgesConfig) -> None:
@@ -125,7 +125,10 @@ class EdgeBook:
         self.tried_again: tuple[int, ...] = ()
 
     def enter(self, proposals: Sequence[Edge]) -> list[int]:
-        """Write proposals into the map; a later one with the same key replaces the edge of the earlier. Returns the edges."""
+        """Write proposed edges into the map; a proposal with the key of an earlier one replaces that one's edge.
+
+        Returns the numbers of the new and changed edges.
+        """
         changed = []
         for proposal in proposals:
             if proposal.key in self._edge_of_proposal:
@@ -139,15 +142,15 @@ class EdgeBook:
         return changed
 
     def join(self, source: int, target: int, odometry: RelativePose) -> int:
-        """Join a new node to the one that the robot was at, by odometry; returns the edge."""
+        """Add the odometry edge from the node that the robot was at to a new node; returns its number."""
         edge = Edge.decided(source, target, EdgeKind.ODOMETRY, odometry, method=Method.ODOMETRY, search=Search.CHAIN)
         return self._map.add_edge(edge)
 
     def belief(self, poses_of: Callable[[PoseGraph], Array], outliers: Sequence[int] = ()) -> Belief:
-        """The state of the map, for vision.
+        """The state of the map, for the front-end.
 
         Args:
-            poses_of: poses (N, 3) of the nodes by the primary back-end, of a graph.
+            poses_of: returns the poses (N, 3) that the primary back-end gives the nodes of a graph.
             outliers: numbers of edges that are left out.
         """
         own, nodes = self._config.gate == "odometry", self._map.nodes
@@ -161,12 +164,12 @@ class EdgeBook:
         )
 
     def without_weight(self, report: SolveReport) -> list[Edge]:
-        """The proposed loops that a back-end gave no weight."""
+        """The loops proposed by the front-end that a back-end down-weighted as outliers."""
         proposed = set(self._edge_of_proposal.values())
         return [self._map.edge(number) for number in report.rejected_edge_ids if number in proposed]
 
     def enter_again(self, proposals: Sequence[Edge]) -> list[int]:
-        """As `enter`, for loops that were measured again because a back-end gave them no weight."""
+        """Write loops that were measured again into the map, as `enter`, and keep their numbers in `tried_again`."""
         self.tried_again = tuple(self.enter(proposals))
         return list(self.tried_again)
 

@@ -40,16 +40,16 @@ class Mapper:
     """
 
     def __init__(self, config: Config, rig: Rig | None = None, backends: Sequence[str | Backend] | None = None) -> None:
-        """Set up every stage.
+        """Set up all parts.
 
         Args:
-            config: settings of all stages.
+            config: all settings.
             rig: which sensors there are; default: those that the configuration describes.
-            backends: names, or back-ends in a fresh state, in place of those that the configuration names.
+            backends: names, or unused back-ends, in place of those that the configuration names.
 
         Raises:
             ConfigError: the configuration asks for a sensor that the rig does not have.
-            BackendError: it names an unknown back-end.
+            BackendError: a back-end's name is unknown.
         """
         self.config = config
         self.clock = StageClock()
@@ -66,36 +66,36 @@ class Mapper:
         self._position = Position(config.edges, self.backends.primary)
 
     def add_odometry(self, stamp_s: float, pose_odom_robot: ArrayLike) -> Update | None:
-        """Take in a pose (3,) of `base_link` in `odom`; returns the newest update, None while nothing is ready."""
+        """Take in a pose (3,) of `base_link` in `odom`. Returns the newest update, or None if no step was possible."""
         return _newest(self.add(SelfMotion(stamp_ns_from_s(stamp_s), np.asarray(pose_odom_robot, dtype=np.float64))))
 
     def add_velocity(self, stamp_s: float, v_m_s: float, omega_rad_s: float) -> Update | None:
-        """Take in a forward speed and a turn rate that hold until the next call."""
+        """Take in a forward speed and a turn rate that hold until the next call. Returns as `add_odometry`."""
         return _newest(self.add(Velocity(stamp_ns_from_s(stamp_s), float(v_m_s), float(omega_rad_s))))
 
     def add_rgbd(self, stamp_s: float, color: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> Update | None:
         """Take in a frame: color (H, W, 3) uint8 RGB, depth (H, W) float32 in m, 0 where invalid.
 
-        A frame waits for odometry at or after its stamp: the update may come with a later call (None until then).
+        A frame waits for odometry at or after its stamp. Until then None is returned; its update comes with a later call.
         """
         return _newest(self.add(RgbdFrame(stamp_ns_from_s(stamp_s), color, depth_m)))
 
     def add_scan(self, stamp_s: float, ranges_m: ArrayLike) -> Update | None:
-        """Take in a scan (B,), m, NaN or Inf where there is no return; waits for odometry as `add_rgbd` does."""
+        """Take in a scan (B,), m, NaN or Inf where there is no return. It waits for odometry as a frame does (`add_rgbd`)."""
         ranges = np.array(ranges_m, dtype=np.float32)
         ranges[~np.isfinite(ranges)] = np.nan
         return _newest(self.add(LaserScan(stamp_ns_from_s(stamp_s), ranges)))
 
     def add(self, sample: Sample) -> list[Update]:
-        """Take in any sample and do every step that it makes possible, in order of stamp.
+        """Take in any sample and do every step that it makes possible, in order of stamp; returns the update of each.
 
         Raises:
-            StreamError: NaN in the motion, or a stamp that goes back.
+            StreamError: NaN in the motion, or a stamp earlier than the one before.
         """
         return [self.step(ready) for ready in self._synchroniser.push(sample)]
 
     def step(self, ready: Ready) -> Update:
-        """One instant through the paper's figure: cells, view, experience, closure, correction."""
+        """One step of the algorithm: path integration, view, new node, loop closure, correction of the map."""
         self._path_integrate(ready)
         view = self._look(ready)
         if view is None and self.vision is not None:
@@ -114,7 +114,7 @@ class Mapper:
         return self._position.update(reason + self._calibrate(), node, edges)
 
     def finish(self) -> list[Update]:
-        """End of the drive: re-propose loops, solve, verify loops without weight again, register frames between nodes."""
+        """End of the drive: find more loops, solve, measure outlier loops again, and register the frames between nodes."""
         updates = [self.step(ready) for ready in self._synchroniser.flush()]
         self._position.pose_odom = self.cells.pose_odom_robot
         if len(self.map):
@@ -127,17 +127,17 @@ class Mapper:
 
     @property
     def lost_since(self) -> int | None:
-        """First node since a break of the chain, while the robot is not localised."""
+        """First node after the robot was kidnapped or lost track of its motion; None while it is localised on the map."""
         return self.vision.lost_since if self.vision is not None else None
 
     @property
     def pose_map_robot(self) -> Array:
-        """(3,) pose of the robot by the primary back-end."""
+        """(3,) pose of the robot on the map of the primary back-end."""
         return self._position.pose_map(self.cells.pose_odom_robot)
 
     @property
     def pose_map_odom(self) -> Array:
-        """(3,) the correction `map -> odom` (REP-105) for the odometry as received."""
+        """(3,) the transform `map -> odom` (REP-105), for the odometry as received."""
         return compose(self.pose_map_robot, inverse(self._position.pose_odom_given))
 
     def poses(self, backend: str | None = None) -> Array:
@@ -145,7 +145,7 @@ class Mapper:
         return self.backends.poses(self.map.pose_graph(), backend)
 
     def belief(self, outliers: Sequence[int] = ()) -> Belief:
-        """The state of the map for gating and re-proposal; edges of the numbers `outliers` are left out."""
+        """The state of the map for the front-end; edges of the numbers `outliers` are left out."""
         return self.book.belief(self.backends.poses, outliers)
 
     def _correct(self, final: bool = False) -> None:

@@ -36,9 +36,9 @@ class Gains:
     """Calibration of odometry.
 
     Attributes:
-        gain: k_m, metres a metre of odometry.
-        turn_gain: k_w, radians a radian of odometry.
-        heading_bias_rad_m: b, radians added a metre forward.
+        gain: k_m, true metres in one metre of odometry.
+        turn_gain: k_w, true radians in one radian of odometry.
+        heading_bias_rad_m: b, radians added for each metre forward.
     """
 
     gain: float = 1.0
@@ -47,17 +47,17 @@ class Gains:
 
     @classmethod
     def of(cls, config: NeuralConfig) -> Self:
-        """The gains of a configuration."""
+        """The gains that a configuration sets."""
         return cls(config.gain, config.turn_gain, config.heading_bias_rad_m)
 
     @classmethod
     def from_array(cls, values: ArrayLike) -> Self:
-        """From (3,): gain, turn gain, heading bias."""
+        """Make gains from an array (3,): gain, turn gain, heading bias."""
         gain, turn_gain, bias = (float(value) for value in np.asarray(values, dtype=np.float64))
         return cls(gain, turn_gain, bias)
 
     def checked(self, origin: str) -> Self:
-        """The same, if a configuration may hold them; `origin` names them in errors.
+        """Return the same gains if a configuration may hold them; `origin` names their source in errors.
 
         Raises:
             EvaluationError: one lies outside its limits, e.g. a gain below zero.
@@ -73,7 +73,7 @@ class Gains:
         return self
 
     def to_array(self) -> Array:
-        """(3,): gain, turn gain, heading bias."""
+        """The gains as an array (3,): gain, turn gain, heading bias."""
         return np.array([self.gain, self.turn_gain, self.heading_bias_rad_m])
 
 
@@ -81,7 +81,11 @@ NEUTRAL = Gains()
 
 
 def step_of(dx_m: float, dy_m: float, dyaw_rad: float, gains: Gains) -> tuple[float, float, float]:
-    """One raw step calibrated, quickly: its chord (forward, left; m) seen from the heading half-way, and its turn, rad."""
+    """Calibrate one raw step, quickly.
+
+    Returns:
+        Its chord (forward, left; m) seen from the heading half-way through its turn, and its turn, rad.
+    """
     cos, sin = math.cos(0.5 * dyaw_rad), math.sin(0.5 * dyaw_rad)
     forward, left = cos * dx_m + sin * dy_m, cos * dy_m - sin * dx_m
     shorter = 2.0 * sin / dyaw_rad if abs(dyaw_rad) > _STRAIGHT_RAD else 1.0
@@ -93,7 +97,7 @@ def step_of(dx_m: float, dy_m: float, dyaw_rad: float, gains: Gains) -> tuple[fl
 
 
 def twists(steps: Array) -> Array:
-    """Arcs (S, 3) of steps (S, 3): forward, left and turn; m and rad. As `geometry.log`."""
+    """Twists (forward, left and turn along an arc; m and rad) (S, 3) of steps (S, 3), as by `geometry.log`."""
     turn = wrap_angle(steps[:, 2])
     cos, sin = np.cos(0.5 * turn), np.sin(0.5 * turn)
     forward, left = cos * steps[:, 0] + sin * steps[:, 1], cos * steps[:, 1] - sin * steps[:, 0]
@@ -101,7 +105,7 @@ def twists(steps: Array) -> Array:
 
 
 def steps_of(arcs: Array) -> Array:
-    """Steps (S, 3) of arcs (S, 3), m and rad; headings are not wrapped."""
+    """Steps (S, 3) of twists (S, 3), m and rad: the inverse of `twists`, but headings are not wrapped."""
     turn = arcs[:, 2]
     cos, sin, shorter = np.cos(0.5 * turn), np.sin(0.5 * turn), chord_of_arc(turn)
     x, y = shorter * arcs[:, 0], shorter * arcs[:, 1]
@@ -109,19 +113,19 @@ def steps_of(arcs: Array) -> Array:
 
 
 def apply(steps: Array, gains: Gains) -> Array:
-    """Calibrated steps (S, 3) of raw ones (S, 3), m and rad."""
+    """Calibrate raw odometry steps (S, 3), m and rad; returns the calibrated steps (S, 3)."""
     raw = twists(steps)
     turn = gains.turn_gain * raw[:, 2] + gains.heading_bias_rad_m * raw[:, 0]
     return steps_of(np.column_stack([gains.gain * raw[:, :2], turn]))
 
 
 def remove(steps: Array, gains: Gains) -> Array:
-    """Raw steps (S, 3) of calibrated ones (S, 3): the inverse of `apply`."""
+    """Return the raw odometry steps (S, 3) of calibrated ones (S, 3): the inverse of `apply`."""
     arcs = twists(steps)
     way = arcs[:, :2] / gains.gain
     return steps_of(np.column_stack([way, (arcs[:, 2] - gains.heading_bias_rad_m * way[:, 0]) / gains.turn_gain]))
 
 
 def chord_of_arc(turn_rad: Array) -> Array:
-    """How much shorter the chord of an arc is than the arc: sin(w/2) / (w/2)."""
+    """Length of an arc's chord as a share of the arc's length: sin(w/2) / (w/2)."""
     return np.asarray(np.sinc(turn_rad / (2.0 * np.pi)))

@@ -39,9 +39,9 @@ class Session:
     """A finished session.
 
     Attributes:
-        folder: where it lies.
-        head: the keys of `metrics.json` beside its list.
-        metrics: the figures.
+        folder: the session folder.
+        head: all keys of `metrics.json` but the list of metrics.
+        metrics: the metrics.
     """
 
     folder: SessionFolder
@@ -53,19 +53,19 @@ def run(stream: Stream, config: Config, out: Path, *, overwrite: bool = False, p
     """Map a stream into a session folder.
 
     The map file is written as the run proceeds: a run that is killed leaves a readable map up to its last node. On any
-    error what this run wrote is removed and what an overwritten session held is put back.
+    error what this run wrote is removed, and an overwritten session is restored.
 
     Args:
         stream: the samples.
         config: every setting; saved resolved.
         out: the session folder itself.
-        overwrite: replace a session that is there.
-        progress: called with (observations done, observations expected).
+        overwrite: replace a session that exists.
+        progress: called with (observations done, observations expected; None if unknown).
 
     Raises:
-        StreamError: the stream is damaged or unordered, or gave nothing to map.
+        StreamError: the stream is damaged or unordered, or has no odometry and views to map.
         OutputError: the folder cannot be used, or another run is writing there.
-        ConfigError, BackendError: a sensor or back-end that there is not.
+        ConfigError, BackendError: the configuration names a sensor or back-end that does not exist.
     """
     mapper = Mapper(config, stream.rig)
     folder = SessionFolder(out)

@@ -68,7 +68,7 @@ class Trajectory:
 
 
 def known_at(trajectory: Trajectory, stamps_ns: NDArray[np.int64], max_gap_s: float = MAX_GAP_S) -> NDArray[np.bool_]:
-    """At which stamps a trajectory can be interpolated: within its span and not in a gap longer than `max_gap_s`."""
+    """At which stamps a trajectory can be interpolated: inside its span, and not inside a gap longer than `max_gap_s`."""
     if len(trajectory) == 0:
         return np.zeros(len(stamps_ns), dtype=np.bool_)
     times = trajectory.stamps_ns
@@ -81,9 +81,9 @@ def known_at(trajectory: Trajectory, stamps_ns: NDArray[np.int64], max_gap_s: fl
 
 @dataclass(frozen=True, slots=True)
 class Anchors:
-    """Poses at some stamps, measured on the final map: seen from the node before and from the node after.
+    """Poses of frames between nodes that were registered to the final map, seen from the node before and from the node after.
 
-    Both give the same pose on that map; on the map of another back-end they are blended.
+    On the map of the registration both give the same pose; on the map of another back-end they are blended.
 
     Attributes:
         stamps_ns: (S,) int64, increasing.
@@ -102,12 +102,12 @@ class Anchors:
 
 
 def anchors_on(poses: Array, stamps_ns: NDArray[np.int64], nodes: NDArray[np.int64], deltas: Array) -> Anchors:
-    """Anchors of what was measured on a map.
+    """Make the anchors of poses that were measured on a map.
 
     Args:
-        poses: (N, 3) of the nodes, m and rad.
+        poses: (N, 3) of the nodes on that map, m and rad.
         stamps_ns: (S,) int64, increasing.
-        nodes: (S,) int64, the node that the robot had made last.
+        nodes: (S,) int64, the last node before each stamp.
         deltas: (S, 3) pose of the robot in the frame of that node, m and rad.
     """
     after = np.minimum(nodes + 1, len(poses) - 1)
@@ -118,10 +118,10 @@ NO_ANCHORS = anchors_on(np.zeros((1, 3)), np.zeros(0, np.int64), np.zeros(0, np.
 
 
 def read_tum(path: Path) -> Trajectory:
-    """Read `stamp x y z qx qy qz qw` lines (seconds, m); of equal stamps the first is kept.
+    """Read a file of lines `stamp x y z qx qy qz qw` (seconds, m). Of lines with equal stamps the first is kept.
 
     Raises:
-        StreamError: the file is missing or empty, or a line is damaged, not finite or goes back in time.
+        StreamError: the file is missing or empty, or a line is damaged, not finite or earlier than the one before.
     """
     if not path.is_file():
         raise StreamError(f"{path}: no such trajectory file")
@@ -156,17 +156,17 @@ def read_tum(path: Path) -> Trajectory:
 
 
 def format_stamp(stamp_ns: int) -> str:
-    """Seconds with 9 decimals, exact."""
+    """The stamp in seconds with 9 decimals, exact."""
     return f"{stamp_ns // NS_PER_S}.{stamp_ns % NS_PER_S:09d}"
 
 
 def format_motion(moved_m: float, turned_deg: float) -> str:
-    """How far something went and turned, in words."""
+    """A distance and a turn in words: "0.123 m and 4.5 deg"."""
     return f"{moved_m:.3f} m and {turned_deg:.1f} deg"
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write the TUM format: stamps with 9 decimals, 17 significant digits, in one move."""
+    """Write a TUM file: stamps with 9 decimals, poses with 17 significant digits. The file appears at once when complete."""
     quaternions = quaternion_from_yaw(trajectory.poses[:, 2])
     lines = [
         f"{format_stamp(int(stamp))} {pose[0]:.17g} {pose[1]:.17g} 0 0 0 {q[2]:.17g} {q[3]:.17g}\n"

@@ -22,7 +22,7 @@ Ways = Callable[[Indices, Indices], RelativePose]
 
 
 def chi2_quantile(probability: float) -> float:
-    """Quantile of chi2 with 3 degrees of freedom; `scipy.stats` has it too, and takes half a second to import."""
+    """Quantile of the chi-square distribution with 3 degrees of freedom (importing `scipy.stats` would take half a second)."""
     return float(2.0 * gammaincinv(1.5, probability))
 
 
@@ -34,7 +34,7 @@ BOUND = chi2_quantile(QUANTILE)
 
 @dataclass(frozen=True, slots=True)
 class Loops:
-    """Measured loops, seen from the older node.
+    """Measured loop closures, each from its older to its newer node.
 
     Attributes:
         older, newer: (L,) nodes.
@@ -47,7 +47,7 @@ class Loops:
 
     @classmethod
     def of(cls, sources: Indices, targets: Indices, relative: RelativePose) -> Loops:
-        """Loops as they were measured: `relative` is the targets (L,) seen from the sources (L,)."""
+        """Make L loops from the poses (`relative`) of the nodes `targets` (L,) in the frames of the nodes `sources` (L,)."""
         back, forward = invert_relative(relative), sources < targets
         delta = np.where(forward[:, None], relative.delta, back.delta)
         covariance = np.where(forward[:, None, None], relative.covariance, back.covariance)
@@ -55,25 +55,25 @@ class Loops:
 
     @classmethod
     def measured(cls, loops: Sequence[tuple[int, int, RelativePose]]) -> Loops:
-        """Single loops: source, target, and the target seen from the source."""
+        """Make loops from a list of (source, target, pose of the target in the frame of the source)."""
         ends = np.array([(source, target) for source, target, _ in loops], dtype=np.int64).reshape(-1, 2)
         delta = np.array([relative.delta for *_, relative in loops]).reshape(-1, 3)
         covariance = np.array([relative.covariance for *_, relative in loops]).reshape(-1, 3, 3)
         return cls.of(ends[:, 0], ends[:, 1], RelativePose(delta, covariance))
 
     def __getitem__(self, chosen: Indices) -> Loops:
-        """Some of them (P,)."""
+        """The loops of the given indices (P,)."""
         relative = RelativePose(self.relative.delta[chosen], self.relative.covariance[chosen])
         return Loops(self.older[chosen], self.newer[chosen], relative)
 
 
 @dataclass(frozen=True, slots=True)
 class Ring:
-    """Errors of rings.
+    """Errors with which P rings close; a ring is two loops and the two chains of motion between their ends.
 
     Attributes:
         error: (P, 3) twist (m, m, rad) in the frame of the newer node of the second loop.
-        covariance: (P, 3, 3) of it.
+        covariance: (P, 3, 3) of the error.
     """
 
     error: Array
@@ -81,7 +81,10 @@ class Ring:
 
     @property
     def distance(self) -> Array:
-        """Squared Mahalanobis distance (P,): chi2 with 3 degrees of freedom where all is right; infinite where unknown."""
+        """Squared Mahalanobis distance (P,) of the error: chi-square with 3 degrees of freedom if both loops are right.
+
+        It is infinite where the covariance is unknown.
+        """
         known: NDArray[np.bool_] = np.asarray(np.isfinite(self.covariance).all(axis=(-2, -1)))
         error, covariance = self.error[known], self.covariance[known]
         out = np.full(len(known), np.inf)
@@ -90,9 +93,10 @@ class Ring:
 
 
 def ring(first: Loops, second: Loops, ways: Ways) -> Ring:
-    """Errors of rings (P,): the first loop and the newer chain, against the older chain and the second loop.
+    """Errors of the P rings that pair each of `first` with the same one of `second`.
 
-    The four parts count as independent, although the ways between older and between newer ends may overlap.
+    A ring compares two ways: the first loop and the chain between the newer nodes, and the chain between the older nodes
+    and the second loop. `ways` gives the chains. The four parts count as independent, although the chains may overlap.
     """
     with np.errstate(invalid="ignore"):  # an unknown way
         along_new = compose_relative(first.relative, ways(first.newer, second.newer))
@@ -102,18 +106,18 @@ def ring(first: Loops, second: Loops, ways: Ways) -> Ring:
 
 
 def agrees(loops: Loops, one: int, others: Indices, ways: Ways, bound: float = BOUND) -> NDArray[np.bool_]:
-    """Which others (P,) of some loops agree with one of them; see `agreement`."""
+    """Which loops of the indices `others` (P,) agree with the loop of index `one`; `ways` and `bound` as for `agreement`."""
     return np.asarray(ring(loops[np.full(len(others), one)], loops[others], ways).distance <= bound)
 
 
 def agreement(loops: Loops, ways: Ways, bound: float = BOUND, known: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
-    """Which loops agree in pairs: (L, L), symmetric, with a true diagonal. Costs a ring for each pair that is not known.
+    """Find which loops agree in pairs: (L, L), symmetric, with a true diagonal.
 
     Args:
-        loops: L of them.
-        ways: between their ends; asked for those from one loop at a time.
+        loops: L loops.
+        ways: gives the relative poses along the chain between the ends of loops; called once for each loop.
         bound: largest squared Mahalanobis distance of a pair that agrees.
-        known: (K, K) what was found for the first K before; None: nothing.
+        known: (K, K) result of an earlier call for the first K loops, which is not computed again; None: no earlier result.
     """
     count, first = len(loops.older), 0 if known is None else len(known)
     out = np.eye(count, dtype=bool)
@@ -128,15 +132,15 @@ def agreement(loops: Loops, ways: Ways, bound: float = BOUND, known: NDArray[np.
 def largest_consistent_set(
     agree: NDArray[np.bool_], weights: Array | None = None, first: int | None = None
 ) -> NDArray[np.bool_]:
-    """A set (L,) of large weight whose members all agree with each other; not always the largest.
+    """Find a set of loops of large total weight that all agree with each other: a mask (L,). It may not be the largest.
 
     Greedy: the next member is the one whose agreeing candidates, itself among them, have the largest weight (as a step
     of Pattabiraman et al., "Fast Algorithms for the Maximum Clique Problem on Massive Graphs", 2015).
 
     Args:
-        agree: (L, L) symmetric, with a true diagonal.
+        agree: (L, L) which pairs agree: symmetric, with a true diagonal.
         weights: (L,) positive; None: all 1.
-        first: a member to begin with; None: the best.
+        first: index of a loop that must be in the set; None: any.
     """
     weights = np.ones(len(agree)) if weights is None else weights
     members, possible = np.zeros(len(agree), dtype=bool), np.ones(len(agree), dtype=bool)

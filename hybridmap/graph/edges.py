@@ -26,7 +26,7 @@ class EdgeKind(IntEnum):
 
 
 class Status(StrEnum):
-    """What became of an edge; only accepted ones are in the graph.
+    """The state of an edge; only accepted edges are in the graph.
 
     A rejected edge never was in the graph; a retracted one was.
     """
@@ -50,7 +50,7 @@ class Method(StrEnum):
 
     @property
     def words(self) -> str:
-        """What it says of an edge that was accepted."""
+        """The method in words, as the reason of an accepted edge."""
         return _METHODS[self]
 
 
@@ -65,12 +65,12 @@ class Search(StrEnum):
 
     @property
     def words(self) -> str:
-        """How it is said behind the method; empty where it goes without saying."""
+        """The search in words, to be added to a reason; empty string for the usual ones."""
         return _SEARCHES[self]
 
 
 class Lack(StrEnum):
-    """What an edge that is not in the graph lacks, where that is not a check."""
+    """Why an edge is not in the graph, if it is not for a failed check."""
 
     WAITING = "waiting"
     UNSUPPORTED = "unsupported"
@@ -82,12 +82,12 @@ class Lack(StrEnum):
 
     @property
     def words(self) -> str:
-        """What it is, for people."""
+        """The lack in words."""
         return _LACKS[self][0]
 
     @property
     def needed(self) -> str:
-        """What would have had to be different."""
+        """What would have let the edge be accepted, in words."""
         return _LACKS[self][1]
 
 
@@ -128,7 +128,7 @@ _LACKS = {
 
 
 class Need(StrEnum):
-    """On which side of its limit a figure must be."""
+    """Whether a checked value must be at least or at most its limit."""
 
     AT_LEAST = "at least"
     AT_MOST = "at most"
@@ -136,14 +136,14 @@ class Need(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """A figure and its limit.
+    """A measured value and the limit that it must keep.
 
     Attributes:
-        figure: its name, which carries its unit.
-        value: what was found; NaN never passes.
-        needs: whether it must be at least or at most the limit.
-        limit: the limit as it was applied.
-        setting: dotted name of the setting that the limit comes from; None for a constant, and where it is worked out.
+        figure: name of the value, with its unit.
+        value: what was measured; NaN never passes.
+        needs: whether the value must be at least or at most the limit.
+        limit: the limit that was applied.
+        setting: dotted name of the setting that gives the limit; None if no single setting does.
     """
 
     figure: str
@@ -154,12 +154,12 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether the figure keeps to the limit."""
+        """Whether the value keeps the limit."""
         return self.value >= self.limit if self.needs is Need.AT_LEAST else self.value <= self.limit
 
     @property
     def slack(self) -> float:
-        """How far from the limit, as a share of it; negative where it is missed."""
+        """Distance of the value from the limit, divided by the limit; negative if the check failed."""
         away = self.value - self.limit if self.needs is Need.AT_LEAST else self.limit - self.value
         return away / max(abs(self.limit), 1e-12)
 
@@ -170,13 +170,13 @@ class Check:
 
     @property
     def miss(self) -> str:
-        """How a figure that does not pass misses its limit."""
+        """A failed check in words: name, value, and limit."""
         sign = "<" if self.needs is Need.AT_LEAST else ">"
         return f"{self.figure} {self.value:.3g} {sign} {self.limit:.3g}"
 
     @property
     def otherwise(self) -> str:
-        """What would have had to be different for the other outcome."""
+        """What would have had to be different for the opposite outcome of the check, in words."""
         least = self.needs is Need.AT_LEAST
         setting = self.setting if self._can_move_the_limit else None
         if self.passed:
@@ -199,12 +199,12 @@ class Check:
 
 
 def at_least(figure: str, value: float, limit: float, setting: str | None = None) -> Check:
-    """A figure that must not be below a limit."""
+    """Check that a value is at least the limit; the arguments are the attributes of `Check`."""
     return Check(figure, float(value), Need.AT_LEAST, float(limit), setting)
 
 
 def at_most(figure: str, value: float, limit: float, setting: str | None = None) -> Check:
-    """A figure that must not be above a limit."""
+    """Check that a value is at most the limit; the arguments are the attributes of `Check`."""
     return Check(figure, float(value), Need.AT_MOST, float(limit), setting)
 
 
@@ -214,7 +214,7 @@ def passed(checks: Sequence[Check]) -> bool:
 
 
 def verdict(checks: Sequence[Check], lack: Lack | None) -> Status:
-    """What becomes of an edge with such a record."""
+    """Status of an edge with these checks and this lack: rejected, pending or accepted."""
     if lack not in (None, Lack.WAITING) or not passed(checks):
         return Status.REJECTED
     return Status.ACCEPTED if lack is None else Status.PENDING
@@ -222,29 +222,29 @@ def verdict(checks: Sequence[Check], lack: Lack | None) -> Status:
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """A relative pose between two nodes, in the frame of the source, with its fate and the record of the decision.
+    """A relative pose between two nodes, its status, and the checks that decided about it.
 
-    A front-end proposes one under a key of its own; it gets its number from the map. An edge that is rejected or retracted
-    has a check that failed or something else that it lacks; one that is accepted has neither.
+    A front-end proposes an edge under a key of its own; the map gives it its number. A rejected or retracted edge has a failed
+    check or a lack; an accepted edge has neither.
 
     Attributes:
         source, target: node numbers.
-        kind: where it comes from.
-        status: what became of it.
-        relative: the measurement; None where a candidate was refused before one was made.
-        checks: the figures that decided, with their limits, in order.
-        lack: what it lacked beside checks, if anything.
-        method, search: what measured it, and why its nodes were compared; None if unknown.
+        kind: odometry, registration or loop closure.
+        status: accepted, pending, rejected or retracted.
+        relative: pose of the target in the frame of the source; None if the edge was rejected before it was measured.
+        checks: the measured values that decided, with their limits, in order.
+        lack: what the edge lacked beside checks; None if nothing.
+        method, search: what measured the edge, and why its nodes were compared; None if unknown.
         shift: columns by which the view of the target is shifted against that of the source.
-        figures: further figures for people, by name; nothing is decided by them.
-        kidnapped_m: of the edge that rejoins the chain after a kidnapping: how far from its odometry pose the robot was found;
+        figures: further measured values, by name; nothing is decided by them.
+        kidnapped_m: for the edge across a kidnapping, how far from its pose by odometry the robot was found;
             None for every other edge.
         broken_by: failed checks of whether the robot drove from the source to the target.
-        contradicts_odometry: a good registration that replaces the odometry edge of the same nodes.
-        note: the reason in words, where an earlier version stored these alone; nothing else looks at it.
-        since_node: number of the newest node when the edge got its present status (-1: let the map note it), so that a
-            replay brings an edge that was committed late at the same moment.
-        key: number within the front-end that proposed it (-1: none did): a later proposal of the same key replaces this one.
+        contradicts_odometry: whether this is a good registration that replaces the odometry edge of the same nodes.
+        note: reason of the status in words, from map files of an earlier version that have no checks; otherwise empty.
+        since_node: number of the newest node when the edge got its present status (-1: the map fills it in), so that a replay
+            shows an edge that was accepted late at the right moment.
+        key: number that the proposing front-end gave (-1: none did); a later proposal of the same key replaces this one.
     """
 
     source: int
@@ -276,22 +276,22 @@ class Edge:
         lack: Lack | None = None,
         **more: Any,
     ) -> Self:
-        """An edge whose status follows from its record."""
+        """Make an edge whose status follows from its checks and its lack."""
         return cls(source, target, kind, verdict(checks, lack), relative, checks=tuple(checks), lack=lack, **more)
 
     def settled(self, *more: Check, lack: Lack | None = None) -> Self:
-        """The same edge with further checks and with what it lacks now; its status follows from these."""
+        """The same edge with the checks `more` added and a new lack; its status follows from these."""
         checks = (*self.checks, *more)
         return replace(self, status=verdict(checks, lack), checks=checks, lack=lack)
 
     @property
     def failed(self) -> tuple[Check, ...]:
-        """The checks that it did not pass."""
+        """The checks that failed."""
         return tuple(check for check in self.checks if not check.passed)
 
     @property
     def reason(self) -> str:
-        """Reason of its status, in words."""
+        """Reason of the edge's status, in words."""
         if self.note:
             return self.note
         words = [] if self.lack is None else [self.lack.words]
@@ -310,7 +310,7 @@ class Edge:
 
     @property
     def otherwise(self) -> str:
-        """What would have changed its status; empty if unknown."""
+        """What would have changed the edge's status, in words; empty string if unknown."""
         needed = [] if self.lack is None else [self.lack.needed]
         needed += [check.otherwise for check in self.failed]
         if needed or not self.checks:

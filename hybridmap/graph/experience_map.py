@@ -18,12 +18,12 @@ from hybridmap.graph.pose_graph import PoseGraph
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """An experience e_i = (p_i, V_i, d_i), the paper's section on the cognitive map.
+    """A node of the map: an experience e_i = (p_i, V_i, d_i) of the paper (place code, view template, pose).
 
     Attributes:
-        stamp_ns: when it was made.
-        pose_odom: (3,) pose decoded from the path integrator's activity at that time, in `odom`.
-        place_code: (P,) float32 activity that identifies the place.
+        stamp_ns: time at which the node was made.
+        pose_odom: (3,) pose in `odom` by the path integrator at that time, m and rad.
+        place_code: (P,) float32 activity of the cells that identifies the place.
         template: number of the view template seen there; -1 for none.
         travel_m: path length so far.
     """
@@ -57,7 +57,7 @@ class ExperienceMap:
 
     @property
     def edges(self) -> tuple[Edge, ...]:
-        """Every edge ever considered, by number."""
+        """Every edge ever proposed, by number, whatever its status."""
         return tuple(self._edges)
 
     @property
@@ -69,15 +69,15 @@ class ExperienceMap:
         return len(self._nodes)
 
     def node(self, number: int) -> Node:
-        """One node."""
+        """The node of a number."""
         return self._nodes[number]
 
     def edge(self, number: int) -> Edge:
-        """One edge."""
+        """The edge of a number."""
         return self._edges[number]
 
     def edges_into(self, node: int) -> tuple[int, ...]:
-        """Numbers of the edges whose target is a node."""
+        """Numbers of the edges whose target is the given node."""
         return tuple(self._edges_into.get(node, ()))
 
     def add_node(self, node: Node, initial: Array) -> int:
@@ -90,7 +90,7 @@ class ExperienceMap:
         """Append an edge and return its number.
 
         Raises:
-            GraphError: an end does not exist, both ends are one node, or an accepted edge carries no measurement.
+            GraphError: a node does not exist, both nodes are the same, or an accepted edge carries no measurement.
         """
         if not (0 <= edge.source < len(self) and 0 <= edge.target < len(self)) or edge.source == edge.target:
             raise GraphError(f"map: edge {edge.source} -> {edge.target} needs two different nodes of 0..{len(self) - 1}")
@@ -103,10 +103,10 @@ class ExperienceMap:
         return len(self._edges) - 1
 
     def update_edge(self, number: int, edge: Edge) -> None:
-        """Replace an edge by a later measurement or decision between the same two nodes; what was in the graph is retracted.
+        """Replace an edge by a later measurement or decision; an accepted edge that is replaced by a rejected one is retracted.
 
         Raises:
-            GraphError: the ends differ, or an accepted edge carries no measurement.
+            GraphError: the new edge joins other nodes, or is accepted without a measurement.
         """
         before = self._edges[number]
         if (before.source, before.target) != (edge.source, edge.target):
@@ -120,7 +120,7 @@ class ExperienceMap:
         self._write(number)
 
     def pose_graph(self) -> PoseGraph:
-        """Freeze the accepted edges into arrays."""
+        """The pose graph of all nodes and the accepted edges."""
         kept = np.flatnonzero(self._accepted.view())
         ends = self._ends.view()[kept]
         return PoseGraph(
@@ -180,7 +180,7 @@ def _invert(covariance: Array) -> Array:
 
 
 class Novelty:
-    """Says whether here and now is a new experience, and why."""
+    """Decides when a new node is made."""
 
     def __init__(self, config: NodesConfig) -> None:
         self._config = config
@@ -188,12 +188,12 @@ class Novelty:
         self._count = 0
 
     def reason(self, delta_node_robot: Array, place_code: Callable[[], NDArray[np.float32]], new_template: bool) -> str | None:
-        """Why a node is due, or None.
+        """Why a new node must be made now, in words; None if none is needed.
 
         Args:
             delta_node_robot: (3,) motion since the node that the robot is at.
-            place_code: gives the current activity (P,); asked only where the rule needs it.
-            new_template: the current frame founded a view template.
+            place_code: returns the current activity (P,); called only if the rule needs it.
+            new_template: whether a new view template was made from the current frame.
         """
         if self._count == 0:
             return "first experience"
@@ -205,7 +205,7 @@ class Novelty:
         return f"place code differs by {distance:.2f} from every node's" if distance > self._config.place_threshold else None
 
     def distance(self, place_code: NDArray[np.float32]) -> float:
-        """Least distance, 1 - cosine, of a place code to that of every node (the paper's S_th is compared with it)."""
+        """Distance (1 - cosine) of a place code to the nearest one of all nodes; the paper compares it with its limit S_th."""
         if self._count == 0:
             return 1.0
         norm = float(np.linalg.norm(place_code))
@@ -213,7 +213,7 @@ class Novelty:
         return float(1.0 - similarity.max())
 
     def remember(self, place_code: NDArray[np.float32]) -> None:
-        """Take in the place code of a new node."""
+        """Add the place code of a new node to those that later ones are compared with."""
         if self._count == len(self._codes):
             grown = np.zeros((max(64, 2 * self._count), len(place_code)), dtype=np.float32)
             if self._count:

@@ -17,13 +17,13 @@ from hybridmap.trajectory import Trajectory
 
 @dataclass(frozen=True, slots=True)
 class Kidnapping:
-    """A break of the chain after which the robot was localised elsewhere.
+    """A stretch on which the robot was carried and not driven, found when it was localised elsewhere.
 
     Attributes:
-        before, after: the last node before it and the first one after.
-        found_at: the newest node when it was localised.
-        moved_m: distance of the new pose from that by odometry.
-        search_m: way driven from `after` to `found_at`.
+        before, after: the last node before the kidnapping and the first one after it.
+        found_at: the newest node when the robot was localised again.
+        moved_m: distance between the new pose and the pose by odometry.
+        search_m: path length from `after` to `found_at`.
     """
 
     before: int
@@ -38,7 +38,7 @@ class Kidnapping:
 
 
 def kidnappings(experiences: ExperienceMap) -> tuple[Kidnapping, ...]:
-    """Every kidnapping of a drive, in order: the edges with which global localisation replaced broken ones."""
+    """Every kidnapping of a drive, in order, read from the edges that global localisation put across them."""
     found = []
     for edge in experiences.edges:
         if edge.status is Status.ACCEPTED and edge.kidnapped_m is not None:
@@ -48,7 +48,7 @@ def kidnappings(experiences: ExperienceMap) -> tuple[Kidnapping, ...]:
 
 
 def pieces(trajectory: Trajectory, experiences: ExperienceMap) -> list[Trajectory]:
-    """A trajectory before, between and after kidnappings; poses after `before` and up to `after` are left out."""
+    """Split a trajectory at the kidnappings; poses during a kidnapping are left out."""
     number, aloft = np.zeros(len(trajectory), dtype=np.int64), np.zeros(len(trajectory), dtype=bool)
     for one in kidnappings(experiences):
         down = trajectory.stamps_ns > experiences.node(one.after).stamp_ns
@@ -59,12 +59,12 @@ def pieces(trajectory: Trajectory, experiences: ExperienceMap) -> list[Trajector
 
 
 def parted(poses: Array, kidnapped: Sequence[Kidnapping]) -> Array:
-    """Poses (K, 3) of the first K nodes with a row of NaN in each kidnapping, so that a line through them is interrupted."""
+    """Poses (K, 3) of the first K nodes with a row of NaN at each kidnapping, so that a plotted line is interrupted there."""
     return np.insert(poses, [one.after for one in kidnapped if one.after < len(poses)], np.nan, axis=0)
 
 
 def kidnapping_edges(graph: PoseGraph, kidnapped: Sequence[Kidnapping]) -> NDArray[np.bool_]:
-    """(E,) which edges stand for a kidnapping and not for a way that was driven."""
+    """(E,) which edges lead across a kidnapping, so that nobody drove along them."""
     ends = np.stack([graph.sources, graph.targets], axis=1)
     found = [(ends == (one.before, one.after)).all(axis=1) for one in kidnapped]
     return np.any(found, axis=0) & graph.is_motion if found else np.zeros(graph.n_edges, dtype=np.bool_)
@@ -83,14 +83,14 @@ _ALIKE = 0.7  # mean resultant length of doubled angles from which stretches are
 
 @dataclass(frozen=True, slots=True)
 class Unobserved:
-    """Stretches between consecutive nodes that odometry alone holds, in one direction or in all.
+    """Path lengths over which the motion from node to node is known by odometry alone, in one direction or in all.
 
     Attributes:
-        sliding_m: length of those where registration is no more certain than odometry in one direction.
-        blind_m: length of those without any registration.
-        travel_m: length of the whole way.
-        direction_rad: the free direction in the map, an axis in [-pi/2, pi/2), mean over the sliding stretches by length.
-        alike: how much they share that direction, 0 to 1.
+        sliding_m: length where registration is no more certain than odometry in one direction (a bare corridor).
+        blind_m: length where nothing was registered.
+        travel_m: length of the whole drive.
+        direction_rad: direction in the map that registration leaves free, an axis in [-pi/2, pi/2); mean by length.
+        alike: how much the sliding stretches share that direction, 0 to 1.
     """
 
     sliding_m: float
@@ -101,11 +101,11 @@ class Unobserved:
 
     @property
     def matters(self) -> bool:
-        """Odometry alone holds more than a tenth of the way."""
+        """Whether more than a tenth of the drive is known by odometry alone."""
         return self.sliding_m + self.blind_m > 0.1 * self.travel_m
 
     def __str__(self) -> str:
-        """One line for people."""
+        """One sentence that states these lengths."""
         parts = []
         if self.sliding_m > 0:
             degrees = round(np.degrees(self.direction_rad)) + 0
@@ -117,17 +117,17 @@ class Unobserved:
 
 
 def unobserved(experiences: ExperienceMap, poses: Array) -> Unobserved | None:
-    """Find the stretches that registration left to odometry.
+    """Find where the motion from node to node is known by odometry alone.
 
     A stretch slides where the registration's standard deviation in its loosest direction is no less than that of the
     odometry edge in the same direction.
 
     Args:
         experiences: the map.
-        poses: (N, 3) of its nodes, m and rad; they bring directions into the map.
+        poses: (N, 3) of its nodes, m and rad; they turn directions into the map's frame.
 
     Returns:
-        None where the front-end registers nothing at all.
+        None if the map has no registrations at all.
     """
     steps, registered = _by_target(experiences, EdgeKind.ODOMETRY), _by_target(experiences, EdgeKind.REGISTRATION)
     accepted = {node: [e for e in edges if e.status is Status.ACCEPTED] for node, edges in registered.items()}

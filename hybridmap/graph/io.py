@@ -41,9 +41,9 @@ class _Lines:
 def read_graph(path: Path) -> PoseGraph:
     """Read a planar g2o (`VERTEX_SE2`, `EDGE_SE2`) or TORO (`VERTEX2`, `EDGE2`) file.
 
-    Vertices are numbered anew from 0 in the order of their numbers in the file; edges keep the file's order. An edge between
-    consecutive vertices counts as odometry, every other one as a loop. A file without vertices is chained from its edges.
-    The first vertex that a `FIX` line names is the one that is `held`; nothing else is fixed.
+    Vertices are numbered again from 0 in the order of their numbers in the file; edges keep the file's order. An edge between
+    consecutive vertices counts as odometry, every other one as a loop. If the file has no vertices, initial poses are composed
+    along its edges. The first vertex that a `FIX` line names is the one that is held; nothing else is fixed.
 
     Raises:
         GraphError: no such file, a damaged line (named), a 3-D file, a vertex given twice or missing, no edge.
@@ -141,7 +141,7 @@ def _held(lines: _Lines, index: dict[int, int], path: Path) -> int | None:
 
 
 def held(graph: PoseGraph, poses: Array) -> Array:
-    """Poses (N, 3) moved as a whole, so that the node that the graph's file holds is where the file has it."""
+    """Poses (N, 3) moved rigidly, so that the node that the graph's file fixes is where the file has it."""
     node = None if graph.file is None else graph.file.held
     if not node:
         return poses
@@ -151,10 +151,11 @@ def held(graph: PoseGraph, poses: Array) -> Array:
 
 
 def write_g2o(path: Path, graph: PoseGraph, poses: Array) -> None:
-    """Write nodes at `poses` (N, 3), the one held, and all edges as g2o with 17 significant digits, in one move.
+    """Write the nodes at `poses` (N, 3), the fixed node and all edges as a g2o file.
 
-    A graph that was read from a file keeps the numbers of its vertices. The format carries no kinds: read back, every edge
-    between non-consecutive nodes is a loop.
+    Numbers have 17 significant digits; the file appears at once when it is complete. A graph that was read from a file keeps
+    the numbers of its vertices. The format has no kinds of edges: read back, every edge between non-consecutive nodes is a
+    loop.
     """
     names = np.arange(graph.n_nodes) if graph.file is None else graph.file.vertices
     rows = [f"VERTEX_SE2 {name} {_row(pose)}\n" for name, pose in zip(names, poses, strict=True)]

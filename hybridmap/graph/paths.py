@@ -59,13 +59,13 @@ class _Links:
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """The chain of consecutive nodes, with its covariance.
+    """The poses of consecutive nodes, with their covariance by dead reckoning and registrations.
 
     Attributes:
         poses: (N, 3) m and rad.
-        covariance: (N, 3, 3) of each pose from node 0 on, a perturbation in the frame of the poses; the difference of two
-            is that of the chain between them.
-        breaks: (B,) nodes without an edge of motion to the one before; across them the covariance is unknown.
+        covariance: (N, 3, 3) of each pose relative to node 0, in the common frame of the poses; the difference of two entries
+            is the covariance of the motion between the two nodes.
+        breaks: (B,) nodes without an edge of motion from the node before; across them the covariance is unknown.
     """
 
     poses: Array
@@ -73,7 +73,7 @@ class Chain:
     breaks: NDArray[np.int64]
 
     def ways(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> RelativePose:
-        """Nodes (P,) seen from nodes (P,), as `agreement.Ways`."""
+        """The poses of nodes `second` (P,) in the frames of nodes `first` (P,), with covariances."""
         back = adjoint(inverse(self.poses[second]))
         sign = np.where(second >= first, 1.0, -1.0)[:, None, None]
         covariance = back @ (sign * (self.covariance[second] - self.covariance[first])) @ back.transpose(0, 2, 1)
@@ -82,11 +82,11 @@ class Chain:
 
 
 def chain_of(graph: PoseGraph, poses: Array | None = None) -> Chain:
-    """The chain of consecutive nodes by its edges of motion; those of the same two nodes count together, as independent.
+    """Compose the poses of consecutive nodes from their edges of motion; several edges of two nodes are fused as independent.
 
     Args:
         graph: the measurements.
-        poses: (N, 3) of the chain; None: by its edges, with node 0 at the origin.
+        poses: (N, 3) poses to be used instead of the composed ones; None: compose them, with node 0 at the origin.
     """
     links = _links(graph.with_edges(graph.is_motion))
     steps = np.flatnonzero(links.high == links.low + 1)
@@ -102,14 +102,14 @@ def chain_of(graph: PoseGraph, poses: Array | None = None) -> Chain:
 
 
 def covariances_from(graph: PoseGraph) -> Callable[[int], Array]:
-    """Covariances of every node relative to one; computed once a node, what they share at the first call.
+    """Return a function from a node to the covariances of all nodes relative to it. Its results are cached.
 
     Edges of the same two nodes are fused. Paths are shortest in the trace of the position covariance; along a path covariances,
     taken as independent, are propagated by adjoints (as `geometry.compose_relative`).
 
     Returns:
         From a node to (N, 3, 3) m^2 and rad^2, right perturbation in each node's own frame: zero for the node itself, infinite
-        on the diagonal for a node that no path reaches. It raises GraphError where the node does not exist.
+        on the diagonal for a node that no path reaches. It raises GraphError if the node does not exist.
     """
     links = cache(lambda: _links(graph))
 
@@ -187,7 +187,7 @@ _TRUST[EdgeKind.LOOP], _TRUST[EdgeKind.MANUAL], _TRUST[EdgeKind.ODOMETRY], _TRUS
 
 
 def require_connected(graph: PoseGraph) -> None:
-    """Refuse a graph in which some node cannot be placed relative to node 0.
+    """Refuse a graph in which a node is not connected to node 0.
 
     Raises:
         GraphError: names the first such node.
@@ -203,9 +203,10 @@ def require_connected(graph: PoseGraph) -> None:
 
 
 def extend(graph: PoseGraph, placed: Array) -> Array:
-    """Place the nodes beyond `placed` (M, 3) by the best edge that joins each to an earlier one; (N, 3).
+    """Add poses for the nodes beyond `placed` (M, 3), each by its best edge to an earlier node; returns (N, 3).
 
-    Registration goes before odometry before loops; of equal kinds the nearest neighbour in order, then the newest edge.
+    Registrations are better than odometry, and odometry is better than loops; among edges of one kind, the earlier node nearest
+    in number is best, then the newest edge.
 
     Raises:
         GraphError: a node has no edge to an earlier one.
@@ -231,10 +232,10 @@ def extend(graph: PoseGraph, placed: Array) -> Array:
 
 
 def own_odometry(graph: PoseGraph) -> NDArray[np.int64]:
-    """Indices of the odometry edges from a node to the next."""
+    """Indices of the odometry edges that lead from a node to the next."""
     return np.flatnonzero((graph.kinds == EdgeKind.ODOMETRY) & (graph.targets == graph.sources + 1))
 
 
 def chain(graph: PoseGraph) -> PoseGraph:
-    """The graph with `initial` replaced by the chain of its edges from node 0's pose on."""
+    """The graph with initial poses that are composed along its edges, from the pose of node 0 on."""
     return replace(graph, initial=extend(graph, graph.initial[:1]))

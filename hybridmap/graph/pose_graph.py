@@ -21,13 +21,13 @@ _CLEAR = 1e-6  # determinant of correlations from which rounding cannot make it 
 
 @dataclass(frozen=True, slots=True)
 class GraphFile:
-    """The file that a graph was read from, so that errors can name what stands there.
+    """The file that a graph was read from, so that error messages can name its lines.
 
     Attributes:
-        path: the file.
-        vertices: (N,) int64, the file's own number of each node.
-        lines: (E,) int64, line of each edge, by its `edge_ids`; edges that came later have none.
-        held: the node that the file holds where it is; None: node 0, as it names none.
+        path: path of the file.
+        vertices: (N,) int64, number of each node in the file.
+        lines: (E,) int64, line number of each edge, indexed by its `edge_ids`; edges added later have none.
+        held: the node that the file fixes; None if it fixes none (then node 0 is fixed).
     """
 
     path: Path
@@ -38,17 +38,17 @@ class GraphFile:
 
 @dataclass(frozen=True, slots=True)
 class PoseGraph:
-    """Nodes and accepted edges.
+    """Nodes and accepted edges, as arrays.
 
     Attributes:
-        initial: (N, 3) pose of each node as the odometry chain gives it (or as the file says), m and rad.
+        initial: (N, 3) initial pose of each node, by odometry or from the file, m and rad.
         sources, targets: (E,) int64 node indices.
         deltas: (E, 3) measured pose of the target in the frame of the source.
         information: (E, 3, 3) inverse covariance in the frame of the target (right perturbation), x, y, yaw.
         kinds: (E,) int8, `EdgeKind`.
-        edge_ids: (E,) int64, number of the edge in the log that it comes from; strictly increasing.
-        entered: (E,) int64, newest node when the edge entered the graph; None: as soon as both its ends were there.
-        file: where it was read from; None where it was not.
+        edge_ids: (E,) int64, number of each edge in the map; strictly increasing.
+        entered: (E,) int64, newest node when the edge entered the graph; None: each edge entered with the newer of its nodes.
+        file: the file that the graph was read from; None if it was not.
     """
 
     initial: Array
@@ -63,7 +63,7 @@ class PoseGraph:
 
     @property
     def entry_nodes(self) -> NDArray[np.int64]:
-        """(E,) at which node a replay brings each edge."""
+        """(E,) the newest node at the time when each edge entered the graph."""
         return np.maximum(self.sources, self.targets) if self.entered is None else self.entered
 
     @property
@@ -78,7 +78,7 @@ class PoseGraph:
 
     @property
     def is_loop(self) -> NDArray[np.bool_]:
-        """(E,) which edges are loop closures, i.e. may be false."""
+        """(E,) which edges are loop closures."""
         return np.asarray(self.kinds == EdgeKind.LOOP)
 
     @property
@@ -87,11 +87,11 @@ class PoseGraph:
         return np.asarray(self.kinds < EdgeKind.LOOP)
 
     def only(self, *kinds: EdgeKind) -> PoseGraph:
-        """The same nodes with only the edges of some kinds."""
+        """The same nodes with only the edges of the given kinds."""
         return self.with_edges(np.isin(self.kinds, kinds))
 
     def with_edges(self, kept: NDArray[np.int64] | NDArray[np.bool_]) -> PoseGraph:
-        """The same nodes with some of the edges, by index or mask."""
+        """The same nodes with only the edges of the given indices or mask."""
         return PoseGraph(
             self.initial,
             self.sources[kept],
@@ -105,16 +105,16 @@ class PoseGraph:
         )
 
     def node_name(self, node: int) -> str:
-        """What errors call a node, after `where`: in a file, the vertex of that number."""
+        """Name of a node for error messages: "vertex" with its number in the file, or "node" with its index."""
         return f"node {node}" if self.file is None else f"vertex {self.file.vertices[node]}"
 
     @property
     def where(self) -> str:
-        """What errors about the graph begin with."""
+        """Beginning of error messages about the graph: the path of its file, or "graph"."""
         return "graph" if self.file is None else str(self.file.path)
 
     def edge_name(self, edge: int) -> str:
-        """What errors begin with that are about an edge (by index): in a file its line and vertices, else its `edge_ids`."""
+        """Name of an edge (given by index) for error messages: its line and vertices in the file, or its number and nodes."""
         name, source, target = int(self.edge_ids[edge]), int(self.sources[edge]), int(self.targets[edge])
         if self.file is None or name >= len(self.file.lines):
             return f"{self.where}: edge {name} ({source} -> {target})"
@@ -122,11 +122,11 @@ class PoseGraph:
         return f"{self.file.path}:{self.file.lines[name]}: edge {vertices[source]} -> {vertices[target]}"
 
     def validate(self) -> None:
-        """Refuse a graph that no solver could take.
+        """Refuse a graph that cannot be solved.
 
         Raises:
-            GraphError: NaN, unknown node, edge onto itself, information not symmetric positive definite, no node, numbers so
-                large or small that their squares are lost. The message names the edge, what was found and what was expected.
+            GraphError: NaN, unknown node, edge from a node to itself, information not symmetric positive definite, no node,
+                numbers whose squares overflow or underflow. The message names the edge, what was found and what was expected.
         """
         if not self._plainly_sound():
             self._judge()
@@ -195,13 +195,13 @@ _Rows = slice | NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Difference of two states of one graph; a measurement that changed counts as removed and added.
+    """Difference of two states of one graph; an edge whose measurement changed counts as removed and added.
 
     Attributes:
         added: (A,) indices into the new graph's edges.
         removed: (R,) indices into the old graph's edges.
-        closes: a loop came, an edge went, or one came between nodes that were there before: solved poses may move. Further
-            chain edges of a new node (to the last but one, say) do not count: they wait for the next closure.
+        closes: whether poses that were solved before may move: a loop was added, an edge was removed, or an edge between old
+            nodes was added. Further registrations of a new node do not count.
     """
 
     added: NDArray[np.int64]
@@ -212,7 +212,7 @@ class Change:
 def prefix(graph: PoseGraph, nodes: int) -> PoseGraph:
     """The graph as it was when it had `nodes` nodes.
 
-    Chain edges are there as soon as both of their ends are; loops that were committed late come late.
+    An edge of motion is in it as soon as both of its nodes are; a loop that was accepted later is not in it.
     """
     both = np.maximum(graph.sources, graph.targets)
     entry = np.where(graph.kinds < EdgeKind.LOOP, both, np.maximum(both, graph.entry_nodes))
@@ -220,7 +220,7 @@ def prefix(graph: PoseGraph, nodes: int) -> PoseGraph:
 
 
 def difference(old: PoseGraph | None, new: PoseGraph) -> Change:
-    """What happened between two states of one graph."""
+    """Which edges were added and removed between two states of one graph; `old` is None before the first."""
     if old is None:
         return Change(np.arange(new.n_edges), np.arange(0), closes=True)
     head = _common_head(old.edge_ids, new.edge_ids)

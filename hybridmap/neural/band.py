@@ -103,7 +103,7 @@ class BandRings:
         return self._rates(np.exp(2j * np.pi * phases.reshape(-1, 1)).astype(self._complex).view(self._weights.dtype))
 
     def step(self, displacement_m: NDArray[np.float64]) -> BandMotion:
-        """Move every ring by a displacement (2,) in the world, m; returns the output for the sheets."""
+        """Move every ring by a displacement (2,) in the world, m; returns the motion and phasors that drive the grid sheets."""
         before = self.phasors()
         self._displacement[:2] = displacement_m
         self._displacement.dot(self._turn, out=self._turn_pairs)

@@ -233,7 +233,7 @@ class Decoded:
 
     @property
     def agreed(self) -> bool:
-        """Whether the modules agree, i.e. the position can be trusted."""
+        """Whether the modules agree, so that the position can be trusted."""
         return self.misfit_cycles < _AGREEMENT_CYCLES
 
 
@@ -245,7 +245,12 @@ class PhaseDecoder:
     """
 
     def __init__(self, wave_vectors: NDArray[np.float64], box_m: float = DECODE_BOX_M) -> None:
-        """Take wave vectors (M, 3, 2), cycles per metre, and the half side of the scanned box, m."""
+        """Set up the decoder.
+
+        Args:
+            wave_vectors: (M, 3, 2) of the bands, cycles per metre.
+            box_m: half side of the box that is searched if the modules do not agree at a start, m.
+        """
         self._waves = wave_vectors.reshape(-1, 2)
         self._solve = np.linalg.pinv(self._waves)
         tick = 1.0 / (6.0 * float(np.linalg.norm(self._waves, axis=1).max()))

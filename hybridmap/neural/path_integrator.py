@@ -168,18 +168,18 @@ class PathIntegrator:
         }
 
     def restore(self, snapshot: Snapshot, weight: float = 1.0, delta_snapshot_robot: ArrayLike = (0.0, 0.0, 0.0)) -> None:
-        """Put a stored activity back: re-anchoring (paper eq. 16, the visual recalibration).
+        """Set the network to a stored activity, wholly or in part: re-anchoring (paper eq. 16, the visual recalibration).
 
         Args:
-            snapshot: what `snapshot` gave.
-            weight: 1 puts it back hard; less is a soft pull, by that share of the way: of the turn of the ring, and of the
-                shift of each band, sheet and the attractor's bump, their wraps being taken from both decoded positions.
+            snapshot: what `snapshot` returned.
+            weight: 1 sets the activity exactly; less moves the ring, each band, each sheet and the attractor's bump by that
+                share of the way to it, repetitions being resolved by both decoded positions.
             delta_snapshot_robot: (3,) pose of the robot seen from where the snapshot was taken, m and rad: the stored
                 activity is moved by it.
 
         Raises:
             ConfigError: the weight is not in 0..1.
-            StreamError: the relative pose is no finite (3,), or more than a kilometre.
+            StreamError: the relative pose is not finite, has not the shape (3,), or is more than a kilometre.
         """
         if not 0.0 <= weight <= 1.0:
             raise ConfigError(f"re-anchoring: expected a weight from 0 to 1, found {weight}")
@@ -328,7 +328,7 @@ class Reanchoring:
         return self._activity_at_node[node]
 
     def recalibrate(self, node: int, delta_node_robot: Array) -> None:
-        """Pull the cells to the activity of a matched node, shifted by the pose (3,) of the robot in the node's frame."""
+        """Move the cells towards the activity stored at a matched node, shifted by the pose (3,) of the robot in its frame."""
         if self.weight == 0.0:
             return
         before = self.pose_odom_robot

@@ -54,7 +54,7 @@ class PlaceCells:
         """One learning step: recruit where nothing responds, else move the responding cells' weights (eq. 8).
 
         Returns:
-            The rates (cells,) of all cells here, of a recruited one as it will be.
+            The rates (cells,) of all cells at this position; for a newly recruited cell, its rate after recruiting.
         """
         drive = self.inputs(sheets)
         rates = self.respond(drive)
@@ -68,7 +68,7 @@ class PlaceCells:
         return rates
 
     def respond(self, drive: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the rates (cells,) or (cells, P) to inputs (inputs,) or (inputs, P), as `inputs` gives them."""
+        """Return the rates (cells,) of the cells to one input vector (inputs,), or (cells, P) to P of them, (inputs, P)."""
         inhibition = np.float32(INHIBITION)
         above = self.weights.dot(drive)
         above -= inhibition
@@ -114,7 +114,7 @@ class PlaceProjection:
         self._weights[active] += step * (bump.astype(np.float32) - self._weights[active])
 
     def onto(self, rates: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the input (N * N,) of place cells with rates (cells,), or (N * N, P) of rates (cells, P)."""
+        """Return the input (N * N,) that place cells of rates (cells,) give the attractor; (N * N, P) for P sets (cells, P)."""
         return np.asarray(self._weights[: len(rates)].T @ rates)
 
 

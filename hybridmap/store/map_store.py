@@ -29,8 +29,8 @@ _KEYFRAME, _SNAPSHOT, _CODE = "keyframe", "snapshot", "code"
 class MapStore:
     """A map file, open either for writing (`create`) or for reading (`open`).
 
-    What was written is durable against a killed process up to the last `commit`; call it once a node. Usable as a
-    context manager; `close` leaves one file.
+    Everything up to the last `commit` survives a killed process; call it once for each node. Usable as a context manager.
+    `close` merges SQLite's log into the file, so that one file is left.
     """
 
     def __init__(self, path: Path, connection: sqlite3.Connection, *, writable: bool) -> None:
@@ -40,16 +40,16 @@ class MapStore:
 
     @classmethod
     def create(cls, folder: Path, config_yaml: str, rig: Rig, source: str) -> Self:
-        """Start the map file of a session folder.
+        """Make the map file of a session folder and open it for writing.
 
         Args:
             folder: the session folder, or the path of the file itself if it ends in `.db`.
             config_yaml: the resolved configuration.
             rig: the sensors of the stream.
-            source: what is mapped, for people.
+            source: name of what is mapped, for people.
 
         Raises:
-            StoreError: there is a map already, or it cannot be written.
+            StoreError: a map exists there, or it cannot be written.
         """
         path = _file_of(folder)
         store = cls(path, schema.create(path), writable=True)
@@ -60,10 +60,10 @@ class MapStore:
 
     @classmethod
     def open(cls, folder_or_db: Path) -> Self:
-        """Open a map for reading; also one whose run was killed, or is still going on.
+        """Open a map for reading. The run that writes it may have been killed or may still be going on.
 
         Raises:
-            StoreError: missing, not a map, or of another version.
+            StoreError: the file is missing, is not a map, or is of another version.
         """
         path = _file_of(folder_or_db)
         return cls(path, schema.open_read_only(path), writable=False)
@@ -75,10 +75,10 @@ class MapStore:
         self.close()
 
     def close(self) -> None:
-        """Commit what was written and close; closing twice does no harm.
+        """Commit what was written and close; it may be called twice.
 
         Raises:
-            StoreError: it cannot be written.
+            StoreError: the file cannot be written.
         """
         if self._writable:
             self._writable = False
@@ -100,11 +100,11 @@ class MapStore:
         """Write a node.
 
         Args:
-            number: of the node.
-            node: the experience.
-            initial: (3,) pose along the odometry chain, m and rad.
-            keyframe: what vision keeps of the frame, by name.
-            snapshot: state of the cells, by name, for re-anchoring.
+            number: number of the node.
+            node: the node.
+            initial: (3,) pose composed along odometry edges, m and rad.
+            keyframe: arrays that the front-end keeps of the node's frame, by name.
+            snapshot: arrays of the state of the path integrator, by name, for re-anchoring.
         """
         row = (
             number,
@@ -122,7 +122,7 @@ class MapStore:
                 self._write("INSERT INTO arrays VALUES (?, ?, ?, ?, ?, ?, ?)", fields)
 
     def put_edge(self, number: int, edge: Edge) -> None:
-        """Write an edge, or what has become of it since; every edge ever considered belongs here."""
+        """Write an edge, whatever its status; replaces what was written under the same number."""
         measured: tuple[Any, ...] = (None,) * 4
         if edge.relative is not None:
             measured = (*_floats(edge.relative.delta), schema.pack_floats(edge.relative.covariance))
@@ -132,16 +132,23 @@ class MapStore:
         self._write(f"INSERT OR REPLACE INTO edges VALUES ({_marks(len(row))})", row)
 
     def add_track(self, stamp_ns: int, node: int, delta_node_robot: Array, pose_odom: Array) -> None:
-        """Write where the robot was: (3,) seen from a node and (3,) in `odom`, m and rad. The last word on a stamp wins."""
+        """Write where the robot was at a stamp; replaces what was written for the same stamp.
+
+        Args:
+            stamp_ns: the stamp.
+            node: the node that the robot was at.
+            delta_node_robot: (3,) pose of the robot in the node's frame, m and rad.
+            pose_odom: (3,) pose of the robot in `odom`, m and rad.
+        """
         row = (int(stamp_ns), int(node), *_floats(delta_node_robot), *_floats(pose_odom))
         self._write(f"INSERT OR REPLACE INTO track VALUES ({_marks(len(row))})", row)
 
     def add_online(self, backend: str, stamp_ns: int, pose_map: Array) -> None:
-        """Write where the robot believed to be at the time, (3,) in `map`, m and rad. The last word on a stamp wins."""
+        """Write the pose (3,) in `map` (m, rad) that a back-end gave at that time; replaces one of the same stamp."""
         self._write("INSERT OR REPLACE INTO online VALUES (?, ?, ?, ?, ?)", (backend, int(stamp_ns), *_floats(pose_map)))
 
     def put_anchors(self, anchors: Anchors) -> None:
-        """Write where the robot was found on the final map; replaces what was there."""
+        """Write the poses of frames between nodes that were registered to the final map; replaces earlier ones."""
         self._write("DELETE FROM anchors", ())
         ends = zip(anchors.stamps_ns.tolist(), anchors.nodes.tolist(), anchors.next_nodes.tolist(), strict=True)
         for end, delta, next_delta in zip(ends, anchors.deltas, anchors.next_deltas, strict=True):
@@ -156,14 +163,14 @@ class MapStore:
         self._write("INSERT OR REPLACE INTO solutions VALUES (?, ?, ?, ?)", row)
 
     def put_info(self, key: str, value: Any) -> None:
-        """Write a value that JSON can hold under a key; `primary_backend` names the result that is judged."""
+        """Write a value that JSON can hold under a key; `primary_backend` is the key of the primary back-end's name."""
         self._write("INSERT OR REPLACE INTO info VALUES (?, ?)", (key, json.dumps(value)))
 
     def commit(self) -> None:
         """Make everything written so far survive a killed process.
 
         Raises:
-            StoreError: it cannot be written.
+            StoreError: the file cannot be written.
         """
         with self._named_errors("write"):
             self._connection.commit()
@@ -172,20 +179,20 @@ class MapStore:
 
     @property
     def path(self) -> Path:
-        """The map file."""
+        """Path of the map file."""
         return self._path
 
     @property
     def config_yaml(self) -> str:
-        """The resolved configuration of the run."""
+        """The resolved configuration of the run, as YAML."""
         return str(self.info("config_yaml"))
 
     @property
     def config_tree(self) -> dict[str, Any]:
-        """The same as a nested mapping.
+        """The resolved configuration of the run, as a nested mapping.
 
         Raises:
-            StoreError: it is damaged.
+            StoreError: the configuration in the file is damaged.
         """
         return mapping_of(self.config_yaml, f"{self._path}: configuration", StoreError)
 
@@ -196,12 +203,12 @@ class MapStore:
 
     @property
     def source(self) -> str:
-        """What was mapped."""
+        """Name of what was mapped."""
         return str(self.info("source"))
 
     @property
     def primary(self) -> str:
-        """The back-end that is judged: as the run recorded it, else the first of the configuration."""
+        """Name of the primary back-end: as the run recorded it, else the first one of the configuration."""
         recorded = self.info("primary_backend")
         if recorded is not None:
             return str(recorded)
@@ -210,16 +217,16 @@ class MapStore:
 
     @property
     def ended(self) -> bool:
-        """Whether the run that wrote it came to its end: what it writes last is there."""
+        """Whether the run that wrote the file came to its end."""
         return self.info("graph_hash") is not None
 
     def info(self, key: str) -> Any:
-        """The value under a key; None if there is none."""
+        """The value that was written under a key; None if the key is not there."""
         text = self._one("SELECT value FROM info WHERE key = ?", (key,))
         return None if text is None else json.loads(text)
 
     def map(self) -> ExperienceMap:
-        """The experience map: the same nodes and edges in the same order."""
+        """The experience map: its nodes and edges in the order in which they were made."""
         experiences, version = ExperienceMap(), int(self._one("PRAGMA user_version", ()))
         codes = {row[0]: schema.Packed(*row[1:]) for row in self._arrays(_CODE)}
         for row in self._rows("SELECT * FROM nodes ORDER BY number"):
@@ -234,15 +241,15 @@ class MapStore:
         return experiences
 
     def keyframe(self, node: int) -> dict[str, NDArray[Any]]:
-        """What vision kept of a node's frame, by name; empty for an unknown node."""
+        """The arrays that the front-end kept of a node's frame, by name; empty for an unknown node."""
         return self._named(node, _KEYFRAME)
 
     def snapshot(self, node: int) -> dict[str, NDArray[Any]]:
-        """State of the cells at a node, by name; empty for an unknown node."""
+        """The arrays of the state of the path integrator at a node, by name; empty for an unknown node."""
         return self._named(node, _SNAPSHOT)
 
     def track(self) -> Track:
-        """Where the robot was at each stamp, seen from nodes, and where it was found on the final map."""
+        """Where the robot was at each stamp, seen from nodes, and the frames registered to the final map."""
         rows = self._rows("SELECT * FROM track ORDER BY stamp_ns")
         values = np.array([row[2:] for row in rows], dtype=np.float64).reshape(-1, 6)
         ends = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2)
@@ -258,17 +265,17 @@ class MapStore:
         return Anchors(stamps, nodes, after, values[:, :3].copy(), values[:, 3:].copy())
 
     def online(self, backend: str) -> Trajectory:
-        """Where the robot believed to be at the time, by one back-end; empty if it kept none."""
+        """The poses that a back-end gave while driving; an empty trajectory if it gave none."""
         rows = self._rows("SELECT stamp_ns, x_m, y_m, yaw_rad FROM online WHERE backend = ? ORDER BY stamp_ns", (backend,))
         stamps = np.array([row[0] for row in rows], dtype=np.int64)
         return Trajectory(stamps, np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 3))
 
     def online_backends(self) -> list[str]:
-        """Back-ends with an online trajectory, by name."""
+        """Names of the back-ends that gave poses while driving, sorted."""
         return [row[0] for row in self._rows("SELECT DISTINCT backend FROM online ORDER BY backend")]
 
     def solutions(self) -> dict[str, Solution]:
-        """Name -> poses and report of every back-end, in the order in which they were written."""
+        """Poses and report of every back-end, by name, in the order in which they were written."""
         rows = self._rows("SELECT backend, poses, report FROM solutions ORDER BY position")
         return {name: Solution(schema.unpack_floats(poses, 3), schema.report_from_json(report)) for name, poses, report in rows}
 

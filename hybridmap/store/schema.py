@@ -66,11 +66,11 @@ CREATE TABLE solutions (backend TEXT PRIMARY KEY, position INTEGER NOT NULL, pos
 def create(path: Path) -> sqlite3.Connection:
     """Make an empty map file and open it for writing.
 
-    A write-ahead log keeps every committed node readable should the process be killed, without a disk sync for each,
-    and lets others read along.
+    A write-ahead log keeps every committed node readable if the process is killed, without a disk sync for each, and lets
+    other processes read at the same time.
 
     Raises:
-        StoreError: there is a file already, or it cannot be written.
+        StoreError: the file exists, or it cannot be written.
     """
     if path.exists():
         raise StoreError(f"{path}: a map is here already; choose another folder or overwrite it")
@@ -92,7 +92,7 @@ def open_read_only(path: Path) -> sqlite3.Connection:
     """Open a map file without changing it.
 
     Raises:
-        StoreError: missing, not a map, or of another version.
+        StoreError: the file is missing, is not a map, or is of another version.
     """
     if not path.is_file():
         raise StoreError(f"{path}: no such map file; expected a session folder, as `hybridmap map SOURCE --out DIR` writes it")
@@ -112,7 +112,7 @@ def open_read_only(path: Path) -> sqlite3.Connection:
 
 
 def finish(connection: sqlite3.Connection) -> None:
-    """Commit, fold the write-ahead log into the file and close: one file is left, unless somebody reads it just now."""
+    """Commit, merge the write-ahead log into the file and close. One file is left, unless another process is reading it."""
     with closing(connection):
         connection.commit()
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
@@ -152,7 +152,7 @@ def pack(array: NDArray[Any]) -> Packed:
 
 
 def unpack(packed: Packed) -> NDArray[Any]:
-    """The array that was packed.
+    """Return the array that `pack` packed.
 
     Raises:
         StoreError: the bytes are damaged.
@@ -186,17 +186,17 @@ def pack_floats(values: NDArray[np.float64]) -> bytes:
 
 
 def unpack_floats(data: bytes, columns: int) -> NDArray[np.float64]:
-    """The (-1, columns) float64 array that `pack_floats` wrote."""
+    """Return the array that `pack_floats` packed, as float64 of shape (-1, columns)."""
     return np.frombuffer(data, "<f8").astype(np.float64).reshape(-1, columns)
 
 
 def rig_to_json(rig: Rig) -> dict[str, Any]:
-    """The sensors as plain values."""
+    """The sensors of a source as nested plain values that JSON can hold."""
     return {name: _plain(asdict(sensor)) for name, sensor in rig.sensors.items()}
 
 
 def rig_from_json(tree: dict[str, Any]) -> Rig:
-    """The sensors that `rig_to_json` gave; those of kinds that are not known here are left out."""
+    """Make the sensors that `rig_to_json` wrote; sensors of unknown kinds are left out."""
     types = {kind.sensor_name: kind.sensor for kind in kinds()}
     found = {name: fields for name, fields in tree.items() if fields is not None and name in types}
     return Rig(**{name: types[name](**{key: _array(value) for key, value in found[name].items()}) for name in found})
@@ -211,7 +211,7 @@ def _plain(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def record_to_json(edge: Edge) -> str:
-    """The record of the decision about an edge as one JSON object; what says nothing is left out."""
+    """The checks, lack, method and other reasons of an edge's status as one JSON object; empty fields are left out."""
     fields = {
         "checks": [_row(check) for check in edge.checks],
         "lack": edge.lack,
@@ -227,7 +227,10 @@ def record_to_json(edge: Edge) -> str:
 
 
 def record_from_json(text: str, reason: str, version: int = VERSION) -> dict[str, Any]:
-    """The fields of an edge that `record_to_json` wrote; a file before version 3 has figures alone, and the reason in words."""
+    """The fields of an edge that `record_to_json` wrote, by name.
+
+    A file of a version before 3 has only measured values and the `reason` in words.
+    """
     fields: dict[str, Any] = json.loads(text)
     if version < 3:
         kidnapped_m = fields.pop("carried_m", None)

@@ -41,7 +41,7 @@ SESSION = Kind("session", _FILES, _is_session, useful_unfinished=True)
 
 @dataclass(frozen=True, slots=True)
 class MetricsFile:
-    """What `metrics.json` holds: the keys beside the list, and the list."""
+    """Content of `metrics.json`: the list of metrics, and in `head` all other keys."""
 
     head: dict[str, Any]
     metrics: list[Metric]
@@ -52,56 +52,57 @@ class SessionFolder:
     """Paths and files of one session.
 
     Attributes:
-        path: the folder itself, what `--out` names.
+        path: the folder.
     """
 
     path: Path
 
     @property
     def map_db(self) -> Path:
-        """The map file."""
+        """Path of the map file."""
         return self.path / MAP_NAME
 
     @property
     def config_yaml(self) -> Path:
-        """The resolved configuration."""
+        """Path of the resolved configuration."""
         return self.path / "config.yaml"
 
     @property
     def metrics_json(self) -> Path:
-        """The figures."""
+        """Path of the metrics."""
         return self.path / "metrics.json"
 
     @property
     def trajectory(self) -> Path:
-        """Folder of the estimates."""
+        """Path of the folder of estimated trajectories."""
         return self.path / "trajectory"
 
     @property
     def groundtruth(self) -> Path:
-        """The known truth, where there is one."""
+        """Path of the ground-truth trajectory; the file exists only if the source has one."""
         return self.path / "reference" / "groundtruth.tum"
 
     @property
     def report(self) -> Path:
-        """The page."""
+        """Path of the HTML report."""
         return self.path / "report.html"
 
     @contextmanager
     def writing(self, *, overwrite: bool = False) -> Iterator[None]:
-        """Write a new session in the block, and nobody else meanwhile; an error takes it back.
+        """Context in which a new session is written, locked against other runs.
 
-        So does Ctrl-C where a session was there before; where there was none, what is written so far stays.
+        On an error what was written is removed, and a session that was there before is restored. Ctrl-C restores one too; if
+        there was none, what is written so far stays.
 
         Raises:
-            OutputError: it holds a session and `overwrite` is not given, holds something else, another run is writing here,
-                or it cannot be written to.
+            OutputError: the folder holds a session and `overwrite` is not set, holds something else, is written by another run,
+                or cannot be written to.
         """
         with held(self.path, SESSION, overwrite=overwrite) as place, place.replaced():
             yield
 
     def require(self) -> None:
-        """Check that there is a session, and warn where its run did not end.
+        """Check that the folder holds a session, and warn if its run did not end.
 
         Raises:
             StoreError: the folder is missing or holds no map, or the map is damaged.
@@ -113,20 +114,20 @@ class SessionFolder:
             log.warning("%s: %s", self.path, self._why_unended())
 
     def require_map(self) -> None:
-        """Check that there is a session, whether or not its run ended.
+        """Check that the folder holds a session, whether or not its run ended.
 
         Raises:
-            StoreError: as `require`.
+            StoreError: the folder is missing or holds no map, or the map is damaged.
         """
         if not self.map_db.is_file():
             what = "holds no session (no map.db)" if self.path.is_dir() else "no such session folder"
             raise StoreError(f"{self.path}: {what}; expected what `hybridmap map SOURCE --out DIR` writes")
 
     def require_foreign(self, target: Path) -> None:
-        """Check that a file to be written is none of the session's own.
+        """Check that a file to be written is not one of the session's own files.
 
         Raises:
-            OutputError: it is.
+            OutputError: it is one of them.
         """
         folder, file = self.path.resolve(), target.resolve()
         if file.is_relative_to(folder) and {*file.relative_to(folder).parts[:1]} & {*_FILES}:
@@ -146,11 +147,11 @@ class SessionFolder:
         write_text(self.config_yaml, config_yaml)
 
     def write_metrics(self, head: dict[str, Any], metrics: Iterable[Metric]) -> None:
-        """Write `metrics.json`, replacing what was there, in one move."""
+        """Write `metrics.json` from its list of metrics and its other keys (`head`); replaces the whole file at once."""
         write_text(self.metrics_json, to_json(head, metrics) + "\n")
 
     def read_metrics(self) -> MetricsFile:
-        """The figures so far; empty if there are none.
+        """Read `metrics.json`; empty if the file does not exist.
 
         Raises:
             StoreError: the file is damaged.
@@ -165,9 +166,9 @@ class SessionFolder:
         return MetricsFile(tree, metrics)
 
     def merge_metrics(self, metrics: Iterable[Metric]) -> None:
-        """Put figures into `metrics.json`: of the same name the new one counts, others stay; order is kept.
+        """Put metrics into `metrics.json`: a new metric replaces the one of the same name, others stay; the order is kept.
 
-        Where it may not be written, it stays as it is and a warning says so.
+        If the file cannot be written, it stays as it is and a warning says so.
 
         Raises:
             StoreError: the file is damaged.
@@ -181,15 +182,15 @@ class SessionFolder:
             log.warning("%s; the figures are not kept", error)
 
     def write_trajectory(self, name: str, trajectory: Trajectory) -> None:
-        """Write an estimate: `odometry`, `<backend>` or `<backend>_online`."""
+        """Write an estimated trajectory under a name: `odometry`, `<backend>` or `<backend>_online`."""
         write_tum(self.trajectory / f"{name}.tum", trajectory)
 
     def write_groundtruth(self, trajectory: Trajectory) -> None:
-        """Write the known truth."""
+        """Write the ground-truth trajectory."""
         write_tum(self.groundtruth, trajectory)
 
     def trajectories(self) -> dict[str, Trajectory]:
-        """Name -> estimate, for every file in `trajectory/`, sorted by name."""
+        """Every estimated trajectory of the session, by name, sorted."""
         return {path.stem: read_tum(path) for path in sorted(self.trajectory.glob("*.tum"))}
 
 

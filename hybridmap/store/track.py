@@ -21,10 +21,10 @@ class Track:
 
     Attributes:
         stamps_ns: (T,) int64, strictly increasing.
-        nodes: (T,) int64, the node that the robot had last made (or been re-anchored to).
+        nodes: (T,) int64, the node from which the robot is seen: the one made last, or the one it was re-anchored to.
         deltas: (T, 3) pose of the robot in the frame of that node, m and rad.
         poses_odom: (T, 3) pose of the robot in `odom`, m and rad.
-        anchors: what was measured between nodes, at stamps of the track.
+        anchors: poses of frames between nodes that were registered to the final map, at stamps of the track.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -38,7 +38,7 @@ class Track:
 
     @property
     def odometry(self) -> Trajectory:
-        """Dead reckoning over the whole recording."""
+        """The poses in `odom` as a trajectory: dead reckoning over the whole recording."""
         return Trajectory(self.stamps_ns, self.poses_odom)
 
 
