@@ -37,11 +37,13 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         if self.poses.shape != (len(self.stamps_ns), 3):
-            raise GeometryError(f"trajectory: found poses {self.poses.shape} for {len(self.stamps_ns)} stamps")
+            raise GeometryError(
+                f"trajectory: found poses {self.poses.shape}, expected ({len(self.stamps_ns)}, 3), one for each stamp"
+            )
         if not np.isfinite(self.poses).all():
             raise GeometryError("trajectory: found NaN or Inf in its poses, expected finite numbers")
         if np.any(np.diff(self.stamps_ns) <= 0):
-            raise GeometryError("trajectory: stamps must strictly increase")
+            raise GeometryError("trajectory: found stamps that do not strictly increase; sort them and drop duplicates")
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -124,7 +126,7 @@ def read_tum(path: Path) -> Trajectory:
         StreamError: the file is missing or empty, or a line is damaged, not finite or earlier than the one before.
     """
     if not path.is_file():
-        raise StreamError(f"{path}: no such trajectory file")
+        raise StreamError(f"{path}: no such trajectory file; expected one in the TUM format")
     stamps: list[int] = []
     rows: list[list[float]] = []
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
@@ -149,7 +151,7 @@ def read_tum(path: Path) -> Trajectory:
         stamps.append(stamp_ns)
         rows.append(row)
     if not stamps:
-        raise StreamError(f"{path}: holds no pose")
+        raise StreamError(f"{path}: holds no pose; expected lines `stamp x y z qx qy qz qw`")
     table = np.asarray(rows)
     yaw = yaw_from_quaternion(table[:, 3], table[:, 4], table[:, 5], table[:, 6])
     return Trajectory(np.asarray(stamps, dtype=np.int64), np.column_stack([table[:, :2], yaw]))

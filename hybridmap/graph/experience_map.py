@@ -171,7 +171,7 @@ class _Rows:
 
 def _require_measurement(edge: Edge) -> None:
     if edge.status is Status.ACCEPTED and edge.relative is None:
-        raise GraphError(f"map: edge {edge.source} -> {edge.target} was accepted without a measurement")
+        raise GraphError(f"map: edge {edge.source} -> {edge.target} was accepted without a measurement (a relative pose)")
 
 
 def _invert(covariance: Array) -> Array:

@@ -49,7 +49,7 @@ def read_graph(path: Path) -> PoseGraph:
         GraphError: no such file, a damaged line (named), a 3-D file, a vertex given twice or missing, no edge.
     """
     if not path.is_file():
-        raise GraphError(f"{path}: no such graph file")
+        raise GraphError(f"{path}: no such graph file; expected a g2o or TORO file")
     lines = _Lines()
     text = path.read_text(encoding="utf-8", errors="replace")
     for number, line in enumerate(text.splitlines(), start=1):
@@ -73,7 +73,7 @@ def _parse(lines: _Lines, fields: list[str], where: str) -> None:
     elif tag in _VERTICES:
         (vertex,) = _integers(fields, 1, where)
         if vertex in lines.vertices:
-            raise GraphError(f"{where}: vertex {vertex} is given twice")
+            raise GraphError(f"{where}: vertex {vertex} is given twice; delete one of its lines")
         lines.vertices[vertex] = _numbers(fields, 2, 3, where)
     elif "SE3" in tag or tag in ("VERTEX3", "EDGE3"):
         raise GraphError(f"{where}: {tag} is a 3-D record; only planar graphs (SE2) can be read")

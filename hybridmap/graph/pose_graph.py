@@ -148,7 +148,7 @@ class PoseGraph:
 
     def _judge(self) -> None:
         if self.n_nodes == 0:
-            raise GraphError("graph: holds no node")
+            raise GraphError("graph: holds no node, expected at least one")
         near = (np.abs(self.initial) <= _FARTHEST).all(axis=1)  # which NaN is not
         if not near.all():
             node = int(np.flatnonzero(~near)[0])

@@ -101,10 +101,10 @@ def open_read_only(path: Path) -> sqlite3.Connection:
         application = connection.execute("PRAGMA application_id").fetchone()[0]
         version = connection.execute("PRAGMA user_version").fetchone()[0]
     except sqlite3.Error as error:
-        raise StoreError(f"{path}: not a map file: {error}") from None
+        raise StoreError(f"{path}: not a map file ({error}); expected one that `hybridmap map` wrote") from None
     if application != APPLICATION_ID:
         connection.close()
-        raise StoreError(f"{path}: an SQLite file, but not a map of hybridmap")
+        raise StoreError(f"{path}: an SQLite file, but not a map of hybridmap; expected the one in a session folder")
     if version not in READABLE:
         connection.close()
         raise StoreError(f"{path}: map of version {version}, expected {VERSION}; map the source again with this hybridmap")
@@ -160,7 +160,7 @@ def unpack(packed: Packed) -> NDArray[Any]:
     try:
         return _unpack(packed)
     except (zlib.error, ValueError, TypeError) as error:
-        raise StoreError(f"map file: an array in it is damaged: {error}") from None
+        raise StoreError(f"map file: an array in it is damaged: {error}; map the source again") from None
 
 
 def _unpack(packed: Packed) -> NDArray[Any]:
