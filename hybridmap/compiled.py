@@ -1,4 +1,4 @@
-"""Loops that numpy cannot take at once, as machine code: without fast mathematics and without threads, the same bytes."""
+"""Machine code for loops that numpy cannot vectorise, without fast mathematics and threads: results are reproducible."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ Kernel = TypeVar("Kernel", bound=Callable[..., object])
 
 
 def compiled(signature: str) -> Callable[[Kernel], Kernel]:
-    """Compile a function for one numba signature, kept beside its file or in the user's cache if there is room for it."""
+    """Make a decorator that compiles a function for one numba signature.
+
+    The compiled code is kept next to the function's file or in the user's cache, if either can be written.
+    """
 
     def compile_one(kernel: Kernel) -> Kernel:
         try:

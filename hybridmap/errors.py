@@ -8,14 +8,14 @@ _MOST_QUOTED = 40
 
 
 def quoted(found: object) -> str:
-    """What was found in a file, fit for a message: on one line, printable, and no longer than it takes to know it again."""
+    """Quote a value found in a file, for a message: on one line, printable, and shortened if long."""
     text = " ".join(str(found).split())
     text = "".join(letter if letter.isprintable() and letter != "\ufffd" else "?" for letter in text)
     return f"'{text if len(text) <= _MOST_QUOTED else text[: _MOST_QUOTED - 3] + '...'}'"
 
 
 class HybridMapError(Exception):
-    """Root of every error that the user can do something about."""
+    """Root of all errors that the user can do something about."""
 
 
 class ConfigError(HybridMapError):

@@ -1,7 +1,7 @@
 """Output files and folders: locked against other runs, replaced completely or not at all, and repaired after a kill.
 
-A folder that is written in place, such as a session, is `held`. An output that is written at once, such as a recording or
-an export, is `staged` in a folder next to its target. A `Kind` describes what differs between outputs.
+`held` gives a folder that is written in place, such as a session. `staged` gives a folder next to the target of an output
+that is written at once, such as a recording or an export. A `Kind` describes what differs between outputs.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class Kind:
     """A kind of output folder.
 
     Attributes:
-        name: its name in messages.
+        name: name of the kind in messages.
         files: names of its files and folders; nothing else in the folder is ever changed.
         is_ours: whether a folder holds an output of this kind.
-        continued: a new run continues an existing output, without `--overwrite`.
-        useful_unfinished: the output of a run interrupted by Ctrl-C is kept.
+        continued: whether a new run continues an existing output, without `--overwrite`.
+        useful_unfinished: whether the output of a run interrupted by Ctrl-C is kept.
     """
 
     name: str
@@ -55,7 +55,10 @@ class Held:
 
     @contextmanager
     def replaced(self) -> Iterator[None]:
-        """Move the old output aside while the block writes the new one; it is restored on an error and deleted at the end."""
+        """Context in which a new output is written while the old one is moved aside.
+
+        On an error the old output is restored; else it is deleted at the end.
+        """
         with _named(self.path):
             self._set_aside()
         try:
@@ -117,13 +120,13 @@ class Held:
 
 @contextmanager
 def held(folder: Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Held]:
-    """Make a folder for an output of a kind, and lock it against other runs during the block.
+    """Context in which a folder for an output of this kind is made if needed, and locked against other runs.
 
-    If the block leaves the folder empty, the folder and the parents made for it are removed.
+    If the folder is empty at the end, it is removed, with the parents made for it.
 
     Raises:
-        OutputError: it is a file, holds something else, holds an output of this kind without `overwrite`, is in use by another
-            run, or is not writable.
+        OutputError: the folder is a file, holds something else, holds an output of this kind without `overwrite`, is in use by
+            another run, or is not writable.
     """
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file; expected a folder that is empty or does not exist")
@@ -137,14 +140,14 @@ def held(folder: Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Held]
 
 @contextmanager
 def staged(*targets: Path, kind: Kind | None = None, overwrite: bool = False) -> Iterator[Path]:
-    """Yield a folder next to the targets. Files that the block writes there, named like the targets, replace them at its end.
+    """Context that gives a new folder next to the targets. Files written there replace the targets of the same name at the end.
 
     An error leaves everything as it was.
 
     Args:
         targets: files in one folder; with a `kind`, one file or folder of that kind, which is replaced completely.
-        kind: of the folder.
-        overwrite: replace existing targets.
+        kind: kind of the target folder.
+        overwrite: whether existing targets may be replaced.
 
     Raises:
         OutputError: a target exists and may not be replaced, is in use by another run, or cannot be written.
@@ -163,7 +166,7 @@ def staged(*targets: Path, kind: Kind | None = None, overwrite: bool = False) ->
 
 
 def is_held(folder: Path) -> bool:
-    """Whether a run is writing in a folder now."""
+    """Whether another run is writing in a folder now."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         return not _take(handle, fcntl.LOCK_SH)
@@ -172,22 +175,26 @@ def is_held(folder: Path) -> bool:
 
 
 def holds_only(folder: Path, names: tuple[str, ...]) -> bool:
-    """Whether a folder is not empty, and holds nothing but these names and the hidden files of this module."""
+    """Whether a folder holds at least one of `names` and nothing else, apart from this module's hidden files."""
     found = _entries(folder) - {PREVIOUS, _MOVING, _DROPPED}
     return bool(found) and found <= set(names)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically: a reader or a crash never sees a partial file. Makes the folder.
+    """Write a text file atomically: a reader or a crash never sees a partial file. Makes the file's folder if needed.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     write_bytes(path, text.encode("utf-8"))
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a binary file atomically; as `write_text`."""
+    """Write a binary file atomically: a reader or a crash never sees a partial file. Makes the file's folder if needed.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
     partial = _partial(path)
     with _named(path):
         try:

@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Table(Generic[T]):
-    """Name -> factory. Our own names come first and cannot be replaced; entry points are loaded on demand."""
+    """Table of implementations by name. Our own names come first and cannot be replaced; entry points are loaded on demand."""
 
     def __init__(self, what: str, own: Mapping[str, T], group: str, error: type[HybridMapError]) -> None:
         """Make a table.
@@ -39,11 +39,11 @@ class Table(Generic[T]):
         self._registered[name] = factory
 
     def names(self) -> tuple[str, ...]:
-        """Every name, ours first."""
+        """All names: ours first, then registered ones and those of installed packages."""
         return tuple(dict.fromkeys((*self._own, *self._registered, *(point.name for point in self._entry_points()))))
 
     def values(self) -> tuple[T, ...]:
-        """The implementations of all names, ours first."""
+        """The implementations of all names, in the order of `names`."""
         return tuple(self[name] for name in self.names())
 
     def __getitem__(self, name: str) -> T:
@@ -74,12 +74,12 @@ class Table(Generic[T]):
 
 
 def packages() -> dict[str, str]:
-    """Name and version of each installed package that extends one of our tables."""
+    """Name -> version, for each installed package that extends one of our tables."""
     points = entry_points()
     ours = (point for group in points.groups if group.startswith("hybridmap.") for point in points.select(group=group))
     return {point.dist.name: point.dist.version for point in ours if point.dist is not None}
 
 
 def loaded(path: str) -> Any:
-    """Import the object named by `module:name` now; heavy modules are imported only when needed."""
+    """Import and return the object named by `module:name`."""
     return EntryPoint(path, path, "").load()

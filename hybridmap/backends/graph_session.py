@@ -75,7 +75,7 @@ class GraphSession:
         """
         state = self._state
         if node in state.rows:
-            raise BackendError(f"node {node} exists already")
+            raise BackendError(f"node {node} exists already; choose another number")
         given = _numbers(IDENTITY if pose is None else pose, (3,), f"pose of node {node}")
         if not np.isfinite(given).all():
             raise GraphError(f"pose of node {node}: found NaN or Inf, expected finite numbers")
@@ -238,7 +238,7 @@ class GraphSession:
 
 def _fixed(state: Snapshot) -> int:
     if state.fixed is None:
-        raise BackendError("the session has no node")
+        raise BackendError("the session has no node; add one with add_node")
     return state.fixed
 
 

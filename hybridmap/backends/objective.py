@@ -38,11 +38,11 @@ _COSTS: dict[str, _Kernel] = {
 
 
 def residuals(graph: PoseGraph, poses: Array) -> Array:
-    """Residuals `(E, 3)`: log(inverse(delta) * between(source, target)) in the target's frame, m, m, rad.
+    """Residuals (E, 3) of the edges: log of the target's pose relative to its prediction by source and edge, m, m, rad.
 
     Args:
         graph: the measurements.
-        poses: (N, 3) pose of every node.
+        poses: (N, 3) pose of every node, m and rad.
     """
     source, target, delta = poses[graph.sources], poses[graph.targets], graph.deltas
     cos, sin = np.cos(source[:, 2]), np.sin(source[:, 2])  # written out, not composed: every update asks for it
@@ -71,14 +71,23 @@ def total(squared: Array) -> float:
 
 
 def unit_variance(graph: PoseGraph, squared: Array, rejected: tuple[int, ...] = ()) -> float:
-    """Sum of squared residuals (E,) of the inlier edges per degree of freedom; 1 without redundancy."""
+    """Sum of the squared residuals of the inlier edges per degree of freedom; 1 without redundancy.
+
+    Args:
+        graph: the graph.
+        squared: (E,) squared residuals of its edges.
+        rejected: ids of the edges to leave out.
+    """
     inliers = squared[~np.isin(graph.edge_ids, rejected)] if rejected else squared
     freedom = 3 * (len(inliers) - graph.n_nodes + 1)
     return float(inliers.sum()) / freedom if freedom > 0 else 1.0
 
 
 def truncated_cost(graph: PoseGraph, poses: Array, bound: float, config: RobustConfig | None = None) -> float:
-    """Chi2 with the squared residual of each loop truncated at a bound, to compare poses when some loops may be false."""
+    """Chi2 with the squared residual of each loop truncated at `bound`, to compare poses when some loops may be false.
+
+    With `config`, odometry and registration edges have the configured robust cost.
+    """
     every = squared_norms(graph, poses)
     motion = every if config is None else np.where(graph.is_motion, _COSTS[config.odometry](every, ODOMETRY_SCALE), every)
     return float(np.where(graph.is_loop, np.minimum(every, bound), motion).sum())
@@ -90,12 +99,12 @@ def gate_of(config: BackendsConfig) -> float:
 
 
 def motion_weights(graph: PoseGraph, squared: Array, config: RobustConfig) -> Array:
-    """Weight (E,) of each edge at its squared residual (E,), by the configured kernel; one for edges that are no motion."""
+    """Weight (E,) of each edge by the configured kernel on odometry and registration, at squared residuals (E,); loops: 1."""
     return np.where(graph.is_motion, _WEIGHTS[config.odometry](squared, ODOMETRY_SCALE), 1.0)
 
 
 def weak_edges(graph: PoseGraph, squared: Array, config: RobustConfig) -> dict[int, float]:
-    """`edge_ids` -> weight of the odometry and registration edges with a weight below `WEAK`."""
+    """Edge id -> weight, for the odometry and registration edges with a weight below `WEAK`."""
     if config.odometry == "none":
         return {}
     weights = motion_weights(graph, squared, config)
@@ -103,13 +112,13 @@ def weak_edges(graph: PoseGraph, squared: Array, config: RobustConfig) -> dict[i
 
 
 def softened(graph: PoseGraph, poses: Array, config: RobustConfig) -> PoseGraph:
-    """The graph with the information of odometry and registration edges multiplied by their weights at poses (N, 3)."""
+    """Copy of the graph with the information of odometry and registration edges multiplied by their weights at poses (N, 3)."""
     weights = motion_weights(graph, squared_norms(graph, poses), config)
     return replace(graph, information=graph.information * weights[:, None, None])
 
 
 def hanging_nodes(graph: PoseGraph, without: tuple[int, ...]) -> int:
-    """Number of nodes without a path to node 0 if the edges `without` (`edge_ids`) are left out."""
+    """Number of nodes without a path to node 0 if the edges with the ids `without` are left out."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 

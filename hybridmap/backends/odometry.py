@@ -18,10 +18,10 @@ def create(name: str, config: BackendsConfig) -> Driver:
 
 
 def dead_reckoning(graph: PoseGraph, placed: Array) -> Array:
-    """Place the nodes beyond `placed` (M, 3) by odometry edges alone; (N, 3).
+    """Poses (N, 3) of all nodes: those of `placed` (M, 3), and for further nodes the chain of odometry edges.
 
     A node may have no odometry edge, because a registration that contradicts it drops the edge. Then the relative pose of the
-    graph's initial poses is used: in a map these are the odometry chain.
+    graph's `initial` is used: in a map `initial` is the odometry chain.
     """
     poses = np.concatenate([placed, np.zeros((graph.n_nodes - len(placed), 3))])
     forward = (graph.kinds == EdgeKind.ODOMETRY) & (graph.sources < graph.targets) & (graph.targets >= len(placed))

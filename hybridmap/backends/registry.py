@@ -54,12 +54,12 @@ _TABLE: Table[Factory] = Table("back-end", _OURS, "hybridmap.backends", BackendE
 
 
 def names() -> tuple[str, ...]:
-    """Every name that `create` takes."""
+    """The names of all back-ends."""
     return _TABLE.names()
 
 
 def register(name: str, factory: Factory) -> None:
-    """Add a back-end, so that every command takes it by its name. Installed packages use the entry points `hybridmap.backends`.
+    """Add a back-end, so that every command accepts its name. Installed packages use the entry points `hybridmap.backends`.
 
     Raises:
         BackendError: the name is taken.
@@ -68,9 +68,9 @@ def register(name: str, factory: Factory) -> None:
 
 
 def create(backend: str | Backend, config: BackendsConfig | None = None) -> Backend:
-    """Make a back-end by its name, in a fresh state, with the pre-filter before it if configured.
+    """Make a back-end by its name, in its initial state, with the pre-filter before it if configured.
 
-    An instance is returned unchanged, with its own settings.
+    If an instance is given instead of a name, it is returned unchanged, with its own settings.
 
     Raises:
         BackendError: no such name; the message lists the known names.
@@ -85,5 +85,5 @@ def create(backend: str | Backend, config: BackendsConfig | None = None) -> Back
 
 
 def is_sequential(name: str) -> bool:
-    """Whether the back-end solves a whole graph by one sequence of iterations or sweeps on one objective."""
+    """Whether the back-end of this name solves a graph by one sequence of iterations or sweeps on one objective."""
     return name in _OURS and name not in _NOT_SEQUENTIAL

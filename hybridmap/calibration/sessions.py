@@ -79,7 +79,7 @@ def read_drive(folder: Path) -> Drive:
         changes, primary = store.info(GAIN_CHANGES) or [], store.primary
         sensors = " and ".join(words(store.rig)) or "no sensor but odometry"
     if len(track) < 2:
-        raise EvaluationError(f"{folder}: holds no odometry to calibrate")
+        raise EvaluationError(f"{folder}: holds no odometry to calibrate; give a session of a drive with wheel odometry")
     steps = between(track.poses_odom[:-1], track.poses_odom[1:])
     motion = Motion(track.stamps_ns, _raw(steps, track.stamps_ns[:-1], Gains.of(config.neural), changes))
     graph = experiences.pose_graph()

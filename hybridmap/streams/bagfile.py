@@ -1,4 +1,4 @@
-"""A bag file: its topics, its messages in recorded order, and one clear error for any damage.
+"""A bag file: its topics, its messages in recorded order, and a clear error for any damage.
 
 ROS 1 `.bag`, ROS 2 folders with `metadata.yaml`, single `.mcap` and `.db3` files, read by `rosbags` without ROS.
 """
@@ -40,8 +40,8 @@ class Topic:
     """One topic of a bag.
 
     Attributes:
-        name: with its leading slash.
-        msgtype: as `sensor_msgs/msg/LaserScan`, for ROS 1 too.
+        name: name of the topic, with its leading slash.
+        msgtype: message type, written like `sensor_msgs/msg/LaserScan`, for ROS 1 too.
         count: number of messages according to the bag.
     """
 
@@ -55,7 +55,7 @@ class RawMessage:
     """One serialised message.
 
     Attributes:
-        topic: name.
+        topic: name of its topic.
         number: index within the topic, from 0.
         data: serialised bytes.
     """

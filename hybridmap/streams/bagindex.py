@@ -38,8 +38,8 @@ class PoseTrack:
     """Poses of one frame in another, in recorded order.
 
     Attributes:
-        parent, child: frames, without leading slash.
-        stamps_ns: header stamps.
+        parent, child: names of the frames, without leading slash; poses are those of the child in the parent.
+        stamps_ns: header stamps, ns.
         poses: planar poses (x m, y m, yaw rad).
     """
 
@@ -49,7 +49,7 @@ class PoseTrack:
     poses: list[tuple[float, float, float]] = field(default_factory=list)
 
     def add(self, stamp_ns: int, position: Any, orientation: Any, what: str) -> None:
-        """Append one pose.
+        """Append the planar part of a pose, given by ROS position and orientation; `what` names it in the error.
 
         Raises:
             StreamError: NaN or Inf, or a quaternion of length zero.
@@ -68,14 +68,26 @@ class PoseTrack:
         self.poses.append(pose)
 
     def sorted(self, what: str, pose_child_base: Array | None = None) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (N,) and poses (N, 3) in order of time; of a frame fixed to the child, if its pose is given."""
+        """Stamps (N,) ns and poses (N, 3), m and rad, in order of time.
+
+        Args:
+            what: file and topic, for errors.
+            pose_child_base: (3,) pose in the child frame of a frame fixed to it; if given, the poses are those of that frame.
+
+        Raises:
+            StreamError: the stamps are out of order by more than one message.
+        """
         stamps = np.asarray(self.stamps_ns, dtype=np.int64)
         order = sorted_order(stamps, what)
         poses = np.asarray(self.poses, dtype=np.float64).reshape(-1, 3)[order]
         return stamps[order], poses if pose_child_base is None else compose(poses, pose_child_base)
 
     def trajectory(self, what: str) -> Trajectory:
-        """The poses as a trajectory; of equal stamps the first is kept."""
+        """The poses as a trajectory in order of time; of poses with equal stamps the first is kept.
+
+        Raises:
+            StreamError: the stamps are out of order by more than one message.
+        """
         stamps, poses = self.sorted(what)
         first = np.concatenate([[True], np.diff(stamps) > 0])
         return Trajectory(stamps[first], poses[first])
@@ -83,15 +95,16 @@ class PoseTrack:
 
 @dataclass(slots=True)
 class BagIndex:
-    """Result of the first pass.
+    """Result of the first pass over a bag.
 
     Attributes:
-        counts: topic -> messages read.
-        stamps_ns: topic -> header stamps in recorded order.
+        counts: topic -> number of messages read.
+        stamps_ns: topic -> header stamps in recorded order, ns.
         first: topic -> its first message, decoded.
-        odometry: topic -> its poses.
+        odometry: nav_msgs/Odometry topic -> its poses.
         unusable_transforms: names of transforms with invalid numbers, in order of appearance (a dict keeps the order).
-        transforms: the transform tree; `tf_tracks` the moving transforms in it, by (parent, child).
+        transforms: tree of all transforms, for the mountings of sensors.
+        tf_tracks: (parent, child) -> poses, for the moving transforms that may be the odometry.
     """
 
     counts: dict[str, int] = field(default_factory=dict)
@@ -103,7 +116,7 @@ class BagIndex:
     tf_tracks: dict[tuple[str, str], PoseTrack] = field(default_factory=dict)
 
     def frame_of(self, topic: str) -> str:
-        """Frame in the first header of a topic."""
+        """Frame in the header of the first message of a topic."""
         return clean_frame(self.first[topic].header.frame_id) if topic in self.first else ""
 
 
@@ -112,11 +125,11 @@ def build_index(bag: BagFile, names: Iterable[str], odom_frame: str) -> BagIndex
 
     Args:
         bag: the bag.
-        names: topics of types with a header, or with transforms.
-        odom_frame: transforms from this frame are kept as tracks, since they may be the odometry.
+        names: topics whose messages have a header or are transforms.
+        odom_frame: transforms from this frame are kept as tracks of poses, since they may be the odometry.
 
     Raises:
-        StreamError: damage, or a pose with invalid numbers.
+        StreamError: the bag is damaged, or a pose has invalid numbers.
     """
     index = BagIndex()
     types = {topic.name: topic.msgtype for topic in bag.topics}
@@ -169,10 +182,10 @@ class Selection:
 
     Attributes:
         odometry: nav_msgs/Odometry topic.
-        odometry_tf: whether self-motion comes from the transforms instead.
+        odometry_tf: whether self-motion comes from transforms instead.
         groundtruth: nav_msgs/Odometry topic with the true pose.
-        sensors: name of a sensor -> its topics by role.
-        transforms: every topic with transforms.
+        sensors: name of a sensor in the rig -> its topics by role (such as `color`, `depth`).
+        transforms: all topics with transforms.
         remarks: choices that the user may want to know.
     """
 
@@ -184,7 +197,7 @@ class Selection:
     remarks: list[str] = field(default_factory=list)
 
     def uses(self, rig: Rig) -> dict[str, str]:
-        """Role -> topic, for the sensors of a rig."""
+        """Role (such as `odometry`, `color`) -> topic, for self-motion and the sensors of a rig."""
         motion = ", ".join(self.transforms) if self.odometry_tf else self.odometry
         found = {} if motion is None else {"odometry": motion}
         for name in rig.sensors:
@@ -193,7 +206,7 @@ class Selection:
 
 
 def is_static(topic: str) -> bool:
-    """Whether a transform topic is the static one."""
+    """Whether a topic of transforms holds static ones (`/tf_static`)."""
     return topic.endswith("tf_static")
 
 
@@ -204,17 +217,17 @@ def select(
     frame_of: Callable[[str], str],
     source: str,
 ) -> Selection:
-    """Choose the topics of a bag.
+    """Choose the topics of a bag to use.
 
     Args:
         topics: all topics of the bag.
-        config: names given by the user.
+        config: topics that the user named, if any.
         kinds: kinds of sensors to look for.
-        frame_of: gives the frame in the first header of a topic.
-        source: file, for errors.
+        frame_of: topic -> the frame in the header of its first message.
+        source: path of the bag, for errors.
 
     Raises:
-        StreamError: a named topic does not exist or is of the wrong type; the message lists the possible ones.
+        StreamError: a topic that the user named does not exist or is of the wrong type; the message lists the possible ones.
     """
     chooser = TopicChooser([topic for topic in topics if topic.count], config, source)
     chosen = Selection(transforms=tuple(topic.name for topic in chooser.of(TRANSFORM)), remarks=chooser.remarks)
@@ -237,11 +250,11 @@ class TopicChooser:
         self.remarks: list[str] = []
 
     def of(self, types: Iterable[str]) -> list[Topic]:
-        """All topics of given message types."""
+        """All topics of the given message types."""
         return [topic for topic in self._topics if topic.msgtype in types]
 
     def named(self, setting: str, types: tuple[str, ...]) -> str | None:
-        """The topic given by a setting of `sensors`, if the setting is given.
+        """The topic that a setting of the section `sensors` names; None if the user left it out.
 
         Raises:
             StreamError: there is no such topic of these types.
@@ -260,7 +273,11 @@ class TopicChooser:
         )
 
     def best(self, types: tuple[str, ...], names: Sequence[str], keep: Callable[[str], bool] = lambda _: True) -> str | None:
-        """The topic with the most usual name, then with the most messages."""
+        """The most likely topic of these types; None if there is none.
+
+        The order of the usual `names` (regular expressions) counts first, then the number of messages. `keep` tells which
+        topics may be chosen.
+        """
         candidates = [topic for topic in self.of(types) if keep(topic.name)]
         if not candidates:
             return None

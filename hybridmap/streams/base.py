@@ -37,7 +37,13 @@ class SelfMotion:
 
 @dataclass(frozen=True, slots=True)
 class Velocity:
-    """One velocity command or wheel-speed reading; it is valid until the next one (zero-order hold)."""
+    """One velocity command or wheel-speed reading; it is valid until the next one (zero-order hold).
+
+    Attributes:
+        stamp_ns: stamp, ns.
+        v_m_s: forward speed, m/s.
+        omega_rad_s: turn rate, counter-clockwise positive, rad/s.
+    """
 
     precedence: ClassVar[int] = 0
     stamp_ns: int
@@ -50,7 +56,7 @@ class Observation:
     """A measurement of an exteroceptive sensor at one time; each kind of sensor has its own subclass.
 
     Attributes:
-        precedence: of samples with equal stamps, the lower precedence comes first; self-motion has 0.
+        precedence: order of samples with equal stamps, lowest first; self-motion has 0.
         stamp_ns: header stamp, ns.
     """
 
@@ -67,7 +73,7 @@ class Rig:
     """The exteroceptive sensors of a stream with their mountings: `Rig(laser=laser, camera=camera)`.
 
     Attributes:
-        sensors: name (as defined by the kind of sensor) -> sensor.
+        sensors: name of a sensor (`SensorKind.sensor_name`) -> the sensor.
     """
 
     sensors: Mapping[str, Any]
@@ -78,14 +84,15 @@ class Rig:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """The points of a keyframe, in `base_link`.
+    """The points that a sensor saw from one keyframe, in `base_link`.
 
     Attributes:
         xyz: (P, 3) points, m.
-        rgb: (P, 3) their colours in 0..1, None without colour.
+        rgb: (P, 3) their colours in 0..1; None without colour.
         origin: (2,) position of the sensor, m.
-        bearings: (P,) rad, increasing along the sweep, for a sensor that scans a level plane; None: points of any height.
-        column_rad: width of the columns in which the nearest point hides those behind it, rad.
+        bearings: (P,) bearings of the points, increasing along the sweep, rad, for a sensor that scans a level plane; None for
+            points of any height.
+        column_rad: width of the vertical columns in which the nearest point hides those behind it, rad.
     """
 
     xyz: Array
@@ -97,14 +104,19 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """An observation to be read: its stamp, and the messages that it needs."""
+    """An observation that will be read from a bag.
+
+    Attributes:
+        stamp_ns: its stamp, ns.
+        needs: keys of the messages that it is made of.
+    """
 
     stamp_ns: int
     needs: tuple[MessageKey, ...]
 
 
 class Decoder(Protocol):
-    """Makes an observation of its messages, and counts irregularities."""
+    """Makes an observation from its messages, and counts irregularities."""
 
     counts: dict[str, int]
 
@@ -114,14 +126,14 @@ class Decoder(Protocol):
 
 @dataclass(slots=True)
 class SensorPlan:
-    """All observations of a bag.
+    """All observations of one kind of sensor in a bag, before they are read.
 
     Attributes:
         rig: the sensor, with its mounting.
-        planned: in order of stamp.
-        decode: makes an observation of a stamp and the decoded messages.
-        losses: counts of messages without a partner.
-        remarks: assumptions that were made.
+        planned: the observations, in order of stamp.
+        decode: (stamp, decoded messages) -> observation.
+        losses: name -> number of messages that no observation uses.
+        remarks: assumptions that were made, for the user.
     """
 
     rig: Rig = field(default_factory=Rig)
@@ -137,9 +149,9 @@ class InBag:
 
     Attributes:
         types: message types, each with a header.
-        find: chooses the topics: role -> topic, empty if the bag has none.
-        plan: (topics, index, base frame, settings, file) -> every observation. Raises a StreamError if something is missing,
-            also for empty topics, as the user may have asked for this kind.
+        find: chooses topics: role (such as `color`) -> topic, empty if the bag has none.
+        plan: (topics by role, index of the bag, base frame, settings, path of the bag) -> all observations. Raises a
+            StreamError if something is missing, also for no topics at all, as the user may have asked for this kind.
     """
 
     types: tuple[str, ...]
@@ -152,20 +164,20 @@ class SensorKind:
     """Definition of a kind of exteroceptive sensor; `streams.sensors` has the table of kinds.
 
     Attributes:
-        name: its name in `vision.sensor`.
+        name: value of `vision.sensor` that selects it.
         sensor_name: name of its sensor in the rig and the map file.
         sensor: type of the sensor, a dataclass of numbers and arrays.
         sample: type of its observations.
         counted: name of observations in counts (`scans`).
-        needs: what a source must have (`laser scans`).
-        words: describes a sensor in a few words.
+        needs: what a source must have, in words (`laser scans`).
+        words: sensor -> short description, for people.
         front_end: makes the front-end for loop closure, a `vision.Factory`; or its `module:name`, imported when needed.
-        compact: the part of an observation that the map file stores.
-        restore: the observation from what `compact` returned; None if a keyframe has none. The stamp is the node's.
-        see: points of a keyframe up to a range, m; None if it has no data of this kind.
-        seeks_every: setting with the travel between two searches for loops, m; empty: it searches at every node.
+        compact: observation -> the part of it that the map file stores.
+        restore: (keyframe with what `compact` returned, stamp of its node) -> the observation; None if it has no such data.
+        see: (keyframe, sensor, range in m) -> its points up to that range; None if it has no data of this kind.
+        seeks_every: name of the setting with the travel between two searches for loops, m; empty string: at every node.
         in_bag: how it is found in a bag; None: never.
-        configured: the sensor described by a configuration alone, for users who feed the mapper themselves.
+        configured: configuration -> the sensor, for users who feed the mapper themselves; None if it is not configured.
     """
 
     name: str
@@ -186,13 +198,18 @@ class SensorKind:
 
 @dataclass(slots=True)
 class StreamReport:
-    """Counts by name (`odometry`, `frames`, `unmatched color`, ...) and remarks from reading a stream."""
+    """What reading a stream found.
+
+    Attributes:
+        counts: name (`odometry`, `frames`, `unmatched color`, ...) -> number.
+        remarks: choices and assumptions, for the user.
+    """
 
     counts: dict[str, int] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
 
     def count(self, name: str, increment: int = 1) -> None:
-        """Add to a count."""
+        """Add `increment` to the count of this name."""
         self.counts[name] = self.counts.get(name, 0) + increment
 
 
@@ -204,23 +221,23 @@ class Stream(Protocol):
 
     @property
     def name(self) -> str:
-        """Name in reports: of the file or world."""
+        """Name of the file or simulated world, for reports."""
 
     @property
     def rig(self) -> Rig:
-        """The sensors; known before the first sample."""
+        """The sensors with their mountings; known before the first sample is read."""
 
     @property
     def groundtruth(self) -> Trajectory | None:
-        """True poses of `base_link`, if known."""
+        """True poses of `base_link`; None if unknown."""
 
     @property
     def expected_observations(self) -> int | None:
-        """Number of observations, for a progress bar; None if unknown."""
+        """Number of observations that the stream will give, for a progress bar; None if unknown."""
 
     @property
     def report(self) -> StreamReport:
-        """The report of the last iteration."""
+        """What the last iteration over the stream found."""
 
     def __iter__(self) -> Iterator[Sample]:
         """Yield the samples.
@@ -231,5 +248,5 @@ class Stream(Protocol):
 
 
 def stamp_s(sample: Sample) -> float:
-    """Stamp in seconds."""
+    """Stamp of a sample in seconds."""
     return sample.stamp_ns / NS_PER_S

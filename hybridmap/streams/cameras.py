@@ -48,13 +48,13 @@ _DEPTH = {"16uc1": _Layout("u2", 1), "mono16": _Layout("u2", 1), "32fc1": _Layou
 
 @dataclass(frozen=True)
 class Calibration:
-    """One camera: pinhole and lens.
+    """Intrinsic calibration of one camera: a pinhole with a lens.
 
     Attributes:
         width_px, height_px: image size.
-        K: (3, 3) intrinsics.
-        distortion: (D,) coefficients of OpenCV's order; empty: none.
-        fisheye: whether they are of the equidistant model.
+        K: (3, 3) camera matrix, pixels.
+        distortion: (D,) coefficients in OpenCV's order; empty: no distortion.
+        fisheye: whether the coefficients are those of the equidistant model.
     """
 
     width_px: int
@@ -78,7 +78,7 @@ class Calibration:
         return cv2.initUndistortRectifyMap(self.K, D, np.eye(3), self.K, size, cv2.CV_32FC1)
 
     def undistort_color(self, color: ColorImage) -> ColorImage:
-        """(H, W, 3) image of an ideal pinhole; unchanged without distortion."""
+        """The image (H, W, 3) that an ideal pinhole would give; unchanged without distortion."""
         if not self.is_distorted:
             return color
         import cv2
@@ -86,7 +86,7 @@ class Calibration:
         return np.asarray(cv2.remap(color, *self._maps, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
 
     def undistort_depth(self, depth_m: DepthImage) -> DepthImage:
-        """(H, W) depth of an ideal pinhole, by the nearest pixel; 0 for pixels outside the image."""
+        """The depth (H, W) that an ideal pinhole would give, m, by the nearest pixel; 0 for pixels outside the image."""
         if not self.is_distorted:
             return depth_m
         import cv2
@@ -95,13 +95,13 @@ class Calibration:
 
 
 def from_intrinsics(given: CameraIntrinsics) -> Calibration:
-    """Calibration from the configuration."""
+    """Calibration from the intrinsics in the configuration."""
     K = np.array([[given.fx_px, 0.0, given.cx_px], [0.0, given.fy_px, given.cy_px], [0.0, 0.0, 1.0]])
     return Calibration(given.width_px, given.height_px, K, given.distortion)
 
 
 def mounted(mounting: CameraMounting) -> Array:
-    """(4, 4) pose of the optical frame in the base, from the configuration."""
+    """(4, 4) pose of the camera's optical frame in `base_link`, m, from the mounting in the configuration."""
     return matrix(mounting.translation_m, mounting.quaternion_xyzw)
 
 
@@ -162,10 +162,10 @@ class DepthRegistration:
 
 
 def check_size(picture: NDArray[Any], calibration: Calibration, what: str) -> None:
-    """Check that an image has the size of its calibration.
+    """Check that an image has the size of its calibration; `what` names it in the error.
 
     Raises:
-        StreamError: naming both sizes.
+        StreamError: the sizes differ; the message names both.
     """
     height, width = picture.shape[:2]
     if (width, height) != (calibration.width_px, calibration.height_px):

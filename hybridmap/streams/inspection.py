@@ -23,10 +23,10 @@ class Part:
     """One topic, list or file of a source.
 
     Attributes:
-        name: topic or file.
+        name: name of the topic or file.
         kind: message type, or kind of file.
-        count: messages, images or rows.
-        stamps_ns: header stamps in recorded order; empty if unknown.
+        count: number of messages, images or rows.
+        stamps_ns: header stamps in recorded order, ns; empty if unknown.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Part:
 
     @property
     def span_s(self) -> tuple[float, float] | None:
-        """First and last stamp, s."""
+        """First and last stamp, s; None if unknown."""
         if not len(self.stamps_ns):
             return None
         return float(self.stamps_ns.min() / NS_PER_S), float(self.stamps_ns.max() / NS_PER_S)
@@ -48,7 +48,7 @@ class Part:
 
     @property
     def rate_hz(self) -> float:
-        """Mean rate, Hz; NaN if unknown."""
+        """Mean rate of the messages, Hz; NaN if unknown."""
         return (len(self.stamps_ns) - 1) / self.duration_s if self.duration_s > 0 else float("nan")
 
     @property
@@ -59,17 +59,17 @@ class Part:
 
 @dataclass(slots=True)
 class Inspection:
-    """The findings.
+    """What an inspection of a source found.
 
     Attributes:
-        source: the inspected source.
-        kind: `ROS 1 bag`, `TUM RGB-D folder`, ...
-        parts: its contents.
-        uses: role -> topic or file that mapping would use.
+        source: path or name of the source.
+        kind: kind of source: `ROS 1 bag`, `TUM RGB-D folder`, ...
+        parts: topics or files of the source.
+        uses: role (such as `odometry`, `color`) -> topic or file that mapping would use.
         rig: sensors that mapping would use.
-        remarks: choices and assumptions.
+        remarks: choices and assumptions, for the user.
         problems: missing or damaged parts, one line each.
-        reason: why it cannot be mapped; None if it can.
+        reason: why the source cannot be mapped; None if it can.
     """
 
     source: str
@@ -83,7 +83,7 @@ class Inspection:
 
     @property
     def mappable(self) -> bool:
-        """Whether mapping would run."""
+        """Whether the source can be mapped."""
         return self.reason is None
 
 
@@ -91,11 +91,11 @@ def inspect_source(source: str | Path, config: Config) -> Inspection:
     """Inspect a source without mapping it.
 
     Args:
-        source: as for `open_stream`.
+        source: a path, or the name of a simulated world.
         config: topic names, mounting, sensor.
 
     Raises:
-        StreamError: it cannot be opened at all.
+        StreamError: the source cannot be opened at all.
     """
     world = world_of(source)
     if world is not None:

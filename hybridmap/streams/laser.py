@@ -33,7 +33,7 @@ class Laser:
     Attributes:
         bearings_rad: (B,) float64, bearing of each beam in the laser's frame, counter-clockwise positive.
         range_min_m, range_max_m: limits of valid ranges.
-        pose_base_laser: (3,) mounting in `base_link`, m and rad (a laser mounted upside down has its bearings negated).
+        pose_base_laser: (3,) pose in `base_link`, m and rad (a laser mounted upside down has its bearings negated).
     """
 
     bearings_rad: Array

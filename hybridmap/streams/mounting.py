@@ -27,7 +27,7 @@ def matrix(translation: tuple[float, float, float], quaternion_xyzw: tuple[float
 
 
 def invert(T_a_b: Array) -> Array:
-    """Inverse (4, 4) of a rigid transform."""
+    """Inverse (4, 4) of a rigid transform: the pose of frame a in frame b."""
     T = np.eye(4)
     T[:3, :3] = T_a_b[:3, :3].T
     T[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
@@ -47,13 +47,13 @@ class _Edge:
 
 
 class TransformTree:
-    """Frames joined by transforms; the constant ones, static or not, give the mountings."""
+    """Frames joined by transforms. Those that stay constant, on `/tf_static` or `/tf`, give the mountings of sensors."""
 
     def __init__(self) -> None:
         self._edges: dict[tuple[str, str], _Edge] = {}
 
     def add(self, parent: str, child: str, T_parent_child: Array, *, static: bool) -> None:
-        """Add one transform; a static one replaces a moving one, and a newer static one an older."""
+        """Add the pose (4, 4) of `child` in `parent`; a static one replaces a moving one, and a newer static one an older."""
         key = (clean_frame(parent), clean_frame(child))
         edge = self._edges.get(key)
         if edge is None or static:
@@ -63,11 +63,11 @@ class TransformTree:
 
     @property
     def frames(self) -> list[str]:
-        """All frames, sorted."""
+        """Names of all frames, sorted."""
         return sorted({frame for key in self._edges for frame in key})
 
     def between(self, base: str, sensor: str) -> Array | None:
-        """(4, 4) pose of the sensor's frame in the base, along constant transforms; None if there is no such path."""
+        """(4, 4) pose of the sensor's frame in the base, m, along constant transforms; None if there is no such path."""
         return self._search(clean_frame(base), clean_frame(sensor), allow_moving=False)
 
     def _search(self, base: str, sensor: str, *, allow_moving: bool) -> Array | None:
@@ -89,10 +89,10 @@ class TransformTree:
         return None
 
     def require(self, base: str, sensor: str, what: str, setting: str) -> Array:
-        """As `between`, with an error if there is no path.
+        """(4, 4) pose of the sensor's frame in the base, m, along constant transforms.
 
         Raises:
-            StreamError: naming both frames and the setting to use.
+            StreamError: there is no such path; the message names both frames and the setting that can replace it.
         """
         found = self.between(base, sensor)
         if found is not None:

@@ -1,4 +1,4 @@
-"""Open any source by its name: world, bag, folder or table."""
+"""Open any source by its name: simulated world, bag, folder or velocity table."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _SIGNS_OF_TUM = ("rgb.txt", "depth.txt", "associations.txt", "rgb", "depth")
 
 
 def world_of(source: str | Path) -> str | None:
-    """Name of the simulated world of a source (`office` or `sim:office`); None if the source is no world.
+    """Name of the simulated world that a source names (`office` or `sim:office`); None if it names none.
 
     The name of a world takes precedence over a file of that name; write `./office` for the file.
 
@@ -55,10 +55,10 @@ def world_of(source: str | Path) -> str | None:
 
 
 def kind_of(path: Path) -> str:
-    """The kind of a file or folder, by its name and content.
+    """The kind of a source (bag, folder, table), by its name and content.
 
     Raises:
-        StreamError: it does not exist, is empty, or is of no readable kind.
+        StreamError: the path does not exist, is empty, or is of no readable kind.
     """
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
@@ -82,12 +82,12 @@ def open_stream(source: str | Path, config: Config, *, start_s: float | None = N
     """Open a recording, or a simulated world by name.
 
     Args:
-        source: path, or `office` / `sim:office`.
-        config: topics, mounting, synchronisation; the simulated drive.
-        start_s, end_s: only this part, seconds from the first stamp, inclusive.
+        source: path, or name of a world: `office` or `sim:office`.
+        config: topics, mounting and synchronisation; for a world, the simulated drive.
+        start_s, end_s: use only this part, seconds from the first stamp, both inclusive; None: no limit.
 
     Raises:
-        StreamError: it cannot be opened, or cannot be mapped; the message says why.
+        StreamError: the source cannot be opened, or cannot be mapped; the message says why.
     """
     window = Window(start_s, end_s)
     world = world_of(source)
@@ -105,7 +105,7 @@ def _simulator() -> Any:
 
 
 class WindowedStream:
-    """Part of another stream."""
+    """The part of another stream between two times."""
 
     def __init__(self, stream: Stream, window: Window) -> None:
         self._stream, self._window = stream, window
@@ -114,7 +114,7 @@ class WindowedStream:
 
     @property
     def report(self) -> StreamReport:
-        """Report of the whole stream."""
+        """What the last iteration found in the whole stream, also outside the part."""
         return self._stream.report
 
     def __iter__(self) -> Iterator[Sample]:

@@ -18,7 +18,7 @@ Stamps = NDArray[np.int64]
 
 
 def sorted_order(stamps_ns: Stamps, what: str) -> NDArray[np.intp]:
-    """Indices that sort the stamps `(N,)`; a message may be swapped with its direct successor, no further.
+    """Indices that sort the stamps; a message may be swapped with its direct successor, no further.
 
     Args:
         stamps_ns: (N,) header stamps in recorded order, ns.
@@ -49,7 +49,7 @@ class Pairs:
     """Pairs of colour and depth images.
 
     Attributes:
-        color, depth: (P,) indices into either list, one to one.
+        color, depth: (P,) indices of the paired images in the lists of colour and depth images; each is used once.
         unmatched_color, unmatched_depth: number of images without a partner.
     """
 
@@ -88,7 +88,7 @@ class Window:
     """The part of a recording to use.
 
     Attributes:
-        start_s, end_s: seconds from the first stamp, both inclusive; None: open.
+        start_s, end_s: seconds from the first stamp, both inclusive; None: no limit.
     """
 
     start_s: float | None = None
@@ -99,20 +99,20 @@ class Window:
             if value is not None and not (math.isfinite(value) and value >= 0.0):
                 raise StreamError(f"{name} {value}: expected seconds from the first stamp, 0 or more")
         if self.start_s is not None and self.end_s is not None and self.end_s < self.start_s:
-            raise StreamError(f"--end {self.end_s} s lies before --start {self.start_s} s")
+            raise StreamError(f"--end {self.end_s} s lies before --start {self.start_s} s; give a later end")
 
     def limits_ns(self, first_ns: int) -> tuple[int, int]:
-        """First and last stamp of the part, ns, given the first stamp of the recording."""
+        """First and last stamp of the part, ns, given the first stamp of the recording, ns."""
         low = -(2**62) if self.start_s is None else first_ns + round(self.start_s * NS_PER_S)
         high = 2**62 if self.end_s is None else first_ns + round(self.end_s * NS_PER_S)
         return low, high
 
 
 def check_overlap(motion_ns: Stamps, observation_ns: Stamps, what: str) -> None:
-    """Refuse observations without a common time with the self-motion, with a tolerance of one second.
+    """Refuse observations that share no time with the self-motion, with a tolerance of one second.
 
     Raises:
-        StreamError: naming both spans.
+        StreamError: there is no common time; the message names both spans.
     """
     if not len(motion_ns) or not len(observation_ns):
         return
@@ -128,7 +128,7 @@ def _span(stamps_ns: Stamps) -> str:
 
 
 def sort_key(sample: Sample) -> tuple[int, int]:
-    """Order of a stream: by stamp, then by precedence, so that motion comes first."""
+    """Key that sorts samples by stamp, then by precedence, so that motion comes first."""
     return sample.stamp_ns, sample.precedence
 
 
@@ -143,7 +143,7 @@ class ReorderBuffer:
         self._arrivals = 0
 
     def push(self, sample: Sample) -> list[Sample]:
-        """Add one sample; return those that are due, in order."""
+        """Add one sample; returns the samples that have waited long enough, in order."""
         heapq.heappush(self._heap, (sort_key(sample), self._arrivals, sample))
         self._arrivals += 1
         newest = sample.stamp_ns if self._newest_ns is None else max(self._newest_ns, sample.stamp_ns)
@@ -151,7 +151,7 @@ class ReorderBuffer:
         return self._pop_until(newest - self._latency_ns)
 
     def flush(self) -> list[Sample]:
-        """Return all remaining samples, in order."""
+        """End of the stream: returns all remaining samples, in order."""
         return self._pop_until(self._newest_ns or 0)
 
     def _pop_until(self, stamp_ns: int) -> list[Sample]:

@@ -47,11 +47,11 @@ _MM_PER_M = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Pinhole camera of undistorted, registered frames.
+    """Pinhole camera of undistorted colour images, with depth registered to them.
 
     Attributes:
         width_px, height_px: image size.
-        fx_px, fy_px, cx_px, cy_px: intrinsics.
+        fx_px, fy_px, cx_px, cy_px: focal lengths and principal point.
         T_base_camera: (4, 4) pose of the camera OPTICAL frame (x right, y down, z forward) in `base_link`, m.
     """
 
@@ -80,7 +80,7 @@ class RgbdFrame(Observation):
 
 
 def pinhole(calibration: Calibration, T_base_camera: Array) -> Camera:
-    """The camera of the undistorted frames."""
+    """The camera that undistorted images of this calibration have."""
     K = calibration.K
     return Camera(
         calibration.width_px,
@@ -157,7 +157,7 @@ def _plan(topics: Mapping[str, str], index: BagIndex, base_frame: str, config: S
 
 
 class FrameDecoder:
-    """Makes one frame of a colour and a depth message: undistorted, depth in the colour camera's pixels, limits applied."""
+    """Makes one frame from a colour and a depth message: undistorted, depth registered to the colour image and limited."""
 
     def __init__(self, topics: Mapping[str, str], index: BagIndex, base_frame: str, config: SensorsConfig, source: str) -> None:
         """Read sizes, calibration and mounting from the first messages."""

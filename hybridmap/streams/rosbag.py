@@ -58,18 +58,18 @@ class BagStream:
 
     @property
     def uses(self) -> dict[str, str]:
-        """Role -> topic that the samples come from."""
+        """Role (such as `odometry`, `color`) -> topic that the samples come from."""
         return self.selection.uses(self.rig)
 
     @property
     def groundtruth(self) -> Trajectory | None:
-        """True poses of the base, from an Odometry topic whose name suggests ground truth."""
+        """True poses of the base, from an Odometry topic whose name suggests ground truth; None if there is none."""
         topic = self.selection.groundtruth
         return None if topic is None else self._index.odometry[topic].trajectory(f"{self._bag.path}: {topic}")
 
     @property
     def expected_observations(self) -> int | None:
-        """Number of observations within the window."""
+        """Number of observations in the part of the bag that is used."""
         return len(self._planned)
 
     def __iter__(self) -> Iterator[Sample]:
@@ -169,4 +169,4 @@ class BagStream:
         self._motion_ns, self._motion_poses = self._motion_ns[inside], self._motion_poses[inside]
         self._planned = [planned for planned in self._planned if low <= planned.stamp_ns <= high]
         if not inside.any():
-            raise StreamError(f"{self._bag.path}: no odometry between --start and --end")
+            raise StreamError(f"{self._bag.path}: no odometry between --start and --end; choose times within the recording")

@@ -22,7 +22,7 @@ SENSORS: Table[SensorKind] = Table(
 
 
 def register(kind: SensorKind) -> None:
-    """Add a kind of sensor for sources, map files, exports, pages and `vision.sensor`.
+    """Add a kind of sensor; sources, map files, exports, pages and `vision.sensor` then accept it.
 
     Installed packages use the entry points `hybridmap.sensors`.
 
@@ -33,19 +33,19 @@ def register(kind: SensorKind) -> None:
 
 
 def kinds() -> tuple[SensorKind, ...]:
-    """Every kind, in the order in which they are searched for."""
+    """All kinds of sensors, in the order in which a source is searched for them."""
     return SENSORS.values()
 
 
 def wanted(sensor: str) -> tuple[SensorKind, ...]:
-    """The kinds for a value of `vision.sensor`: one by its name; none for `none`; all for `auto` and other front-ends."""
+    """The kinds of sensors for a value of `vision.sensor`: one for its name, none for `none`, all for any other value."""
     if sensor == "none":
         return ()
     return tuple(kind for kind in kinds() if kind.name == sensor) or kinds()
 
 
 def carried(rig: Rig) -> Iterator[tuple[SensorKind, Any]]:
-    """Kind and sensor of everything in a rig."""
+    """Kind and sensor, for every sensor of a rig."""
     for kind in kinds():
         if kind.sensor_name in rig.sensors:
             yield kind, rig.sensors[kind.sensor_name]
@@ -62,12 +62,12 @@ def rig_of(config: SensorsConfig) -> Rig:
 
 
 def message_types() -> tuple[str, ...]:
-    """Message types of a bag that any kind of sensor reads."""
+    """All message types in bags that some kind of sensor reads."""
     return tuple(name for kind in kinds() if kind.in_bag is not None for name in kind.in_bag.types)
 
 
 def words(rig: Rig) -> list[str]:
-    """Description of each sensor of a rig, in a few words."""
+    """Short description of each sensor of a rig, for people."""
     return [kind.words(sensor) for kind, sensor in carried(rig)]
 
 

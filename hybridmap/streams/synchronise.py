@@ -1,4 +1,4 @@
-"""Synchronise self-motion and observations: the steps of a mapper, one after the other.
+"""Synchronise self-motion and observations: makes the steps that a mapper takes, one after the other.
 
 The mapper calls it, so a live robot and a recording give the same steps.
 """
@@ -24,7 +24,7 @@ class Ready:
     """One step of the mapper.
 
     Attributes:
-        stamp_ns: ns.
+        stamp_ns: stamp at the end of the step, ns.
         delta_robot: (3,) displacement since the previous step, in the robot's frame at that step, m and rad.
         dt_s: time since the previous step, s.
         pose_odom_robot: (3,) pose in `odom` at the stamp (velocities: integrated from the identity), m and rad.
@@ -67,7 +67,7 @@ class Synchroniser:
         self._waiting: deque[Observation] = deque()
 
     def push(self, sample: Sample) -> list[Ready]:
-        """Add a sample; return the steps that have become ready.
+        """Add a sample; returns the steps that have become ready.
 
         Raises:
             StreamError: stamps out of order, self-motion that is not finite, or odometry mixed with velocities.
@@ -77,7 +77,10 @@ class Synchroniser:
         return [step for ready in self._arrived.push(sample) for step in self._take(ready)]
 
     def flush(self) -> list[Ready]:
-        """End of the stream: return the steps of all remaining samples; late observations get the last pose."""
+        """End of the stream: returns the steps of all samples that still wait.
+
+        Observations shortly after the last odometry get its pose; later ones are dropped and counted.
+        """
         steps = [step for ready in self._arrived.flush() for step in self._take(ready)]
         if self._last is None:
             self._drop("observations before odometry", len(self._waiting))

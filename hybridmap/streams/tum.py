@@ -41,7 +41,10 @@ class _Pair:
 
 
 class TumStream:
-    """`rgb/`, `depth/` with their lists or `associations.txt`, `odometry.txt` of base_link, `camera.yaml`."""
+    """A folder in the TUM RGB-D format as a stream.
+
+    It holds `rgb/` and `depth/` with their lists or `associations.txt`, `odometry.txt` (poses of base_link), and `camera.yaml`.
+    """
 
     def __init__(self, folder: Path, config: Config, window: Window | None = None) -> None:
         """Read the lists, the odometry and the calibration, and check that every image exists.
@@ -74,7 +77,7 @@ class TumStream:
 
     @property
     def expected_observations(self) -> int | None:
-        """Number of frames within the window."""
+        """Number of frames in the part of the recording that is used."""
         return len(self._pairs)
 
     def __iter__(self) -> Iterator[Sample]:
@@ -90,7 +93,7 @@ class TumStream:
 
     @property
     def uses(self) -> dict[str, str]:
-        """Role -> file that the samples come from."""
+        """Role (such as `odometry`, `color`) -> file that the samples come from."""
         listed = (self._folder / "associations.txt").is_file()
         lists = {"frames": "associations.txt"} if listed else {"color": "rgb.txt", "depth": "depth.txt"}
         truths = [name for name in ("groundtruth_base.txt", "groundtruth.txt") if (self._folder / name).is_file()]
@@ -141,7 +144,7 @@ class TumStream:
         low, high = window.limits_ns(first)
         inside = (self._odometry.stamps_ns >= low) & (self._odometry.stamps_ns <= high)
         if not inside.any():
-            raise StreamError(f"{self._folder}: no odometry between --start and --end")
+            raise StreamError(f"{self._folder}: no odometry between --start and --end; choose times within the recording")
         self._odometry = Trajectory(self._odometry.stamps_ns[inside], self._odometry.poses[inside])
         self._pairs = [pair for pair in self._pairs if low <= pair.stamp_ns <= high]
 
@@ -165,12 +168,12 @@ def _read_lines(path: Path, fields: int) -> list[tuple[int, list[str]]]:
         if words:
             lines.append((number, words))
     if not lines:
-        raise StreamError(f"{path}: names no picture")
+        raise StreamError(f"{path}: names no picture; expected one line per picture")
     return lines
 
 
 def read_picture_list(path: Path, stamp_column: int = 0) -> tuple[NDArray[np.int64], list[list[str]]]:
-    """Stamps (N,) and fields of the lines of `rgb.txt`, `depth.txt` or `associations.txt`, sorted by stamp.
+    """Read the list of images `rgb.txt`, `depth.txt` or `associations.txt`: stamps (N,) ns and fields of each line, by stamp.
 
     Raises:
         StreamError: the file is missing, empty or damaged, or its stamps are out of order.

@@ -20,7 +20,7 @@ _FASTEST = 1000.0  # m/s and rad/s; no robot comes near it
 
 
 class VelocityStream:
-    """Forward speed and turn rate, each valid until the next. Its ground truth is `<name>_groundtruth.tum` next to it."""
+    """A velocity table as a stream. Its ground truth is the file `<name>_groundtruth.tum` next to it, if there is one."""
 
     def __init__(self, path: Path, config: Config, window: Window | None = None) -> None:
         """Read the table.
@@ -34,7 +34,7 @@ class VelocityStream:
         low, high = (window or Window()).limits_ns(samples[0].stamp_ns)
         self._samples = [sample for sample in samples if low <= sample.stamp_ns <= high]
         if not self._samples:
-            raise StreamError(f"{path}: no velocity between --start and --end")
+            raise StreamError(f"{path}: no velocity between --start and --end; choose times within the recording")
         truth = path.with_name(f"{path.stem}_groundtruth.tum")
         self.groundtruth: Trajectory | None = read_tum(truth) if truth.is_file() else None
         self.expected_observations: int | None = 0
@@ -48,10 +48,10 @@ class VelocityStream:
 
 
 def read_table(path: Path) -> list[Velocity]:
-    """All rows of a velocity table, in order of stamp.
+    """Read all rows of a velocity table, in order of stamp.
 
     Raises:
-        StreamError: as `VelocityStream`.
+        StreamError: the table is empty or damaged, or its stamps are out of order.
     """
     with path.open(encoding="utf-8", errors="replace", newline="") as file:
         rows = csv.reader(file)
@@ -62,7 +62,7 @@ def read_table(path: Path) -> list[Velocity]:
             )
         samples = [_read_row(path, number, row) for number, row in enumerate(rows, start=2) if row]
     if not samples:
-        raise StreamError(f"{path}: holds no velocity")
+        raise StreamError(f"{path}: holds no velocity; expected one line per reading after the header")
     order = sorted_order(np.array([sample.stamp_ns for sample in samples], dtype=np.int64), str(path))
     return [samples[i] for i in order]
 

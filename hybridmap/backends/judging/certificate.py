@@ -1,8 +1,8 @@
 """Proof that a solution is at an optimum, and that the optimum is global for the objective with isotropic noise.
 
-Three conditions are checked over the inlier edges. Levenberg-Marquardt on the true objective chi2 gains next to nothing
-from the solution. The nearby critical point of the isotropised objective F is proved to be the global optimum of F
-(`judging.dual`). F at the solution is close to F at that point. A lower bound of chi2 itself is not proved.
+Over the inlier edges, three conditions are checked: (1) Levenberg-Marquardt on the true objective chi2 gains next to nothing
+from the solution. (2) The critical point of the isotropised objective F near the solution is proved to be the global optimum
+of F (`judging.dual`). (3) F at the solution is close to F at that point. A lower bound of chi2 itself is not proved.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _ITERATIONS, _TOLERANCE = 100, 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """What was proved about a solution.
+    """What was proved about a solution; F is chi2 with the noise of every edge made isotropic.
 
     Attributes:
-        gap: upper bound of (F - F_best) / F at the optimum of F near the solution; infinite if no bound was proved or the
-            solution is not at an optimum.
+        gap: upper bound of (F - F_best) / F at the optimum of F near the solution, F_best being the global optimum; infinite if
+            no bound was proved or the solution is not at an optimum.
         message: one line for people.
         objective: F at its optimum near the solution; NaN if that was not reached or not searched for.
         objective_given: F at the solution; NaN if not computed.
@@ -47,7 +47,7 @@ class Certificate:
 
     @property
     def certified(self) -> bool:
-        """Whether the solution is at a local optimum of chi2 near the global optimum of F."""
+        """Whether the solution is at a local optimum of chi2 close to the global optimum with isotropic noise."""
         return self.gap <= CERTIFIED_GAP
 
     @property
@@ -57,12 +57,12 @@ class Certificate:
 
 
 def certify(graph: PoseGraph, poses: Array, rejected: tuple[int, ...] = ()) -> Certificate:
-    """Check a solution against the nearby optimum of chi2, and that optimum against the global optimum of F.
+    """Check a solution against the nearby optimum of chi2, and against the global optimum with isotropic noise.
 
     Args:
-        graph: connected.
-        poses: (N, 3) the solution, m and rad.
-        rejected: `edge_ids` to leave out, such as the outlier loops of a robust back-end.
+        graph: a connected graph.
+        poses: (N, 3) poses of the solution, m and rad.
+        rejected: edge ids to leave out, such as the outlier loops of a robust back-end.
     """
     kept = graph.with_edges(~np.isin(graph.edge_ids, rejected)) if rejected else graph
     cost = chi2(kept, poses)

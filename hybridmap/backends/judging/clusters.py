@@ -20,12 +20,12 @@ _LEAST = 3  # loops of a cluster
 
 
 def rejected_clusters(graph: PoseGraph, poses: Array, rejected: tuple[int, ...], gate: float) -> tuple[tuple[int, ...], ...]:
-    """Groups of rejected loops in which neighbours agree, the largest first; `edge_ids`.
+    """Groups of rejected loops in which neighbouring loops agree: tuples of edge ids, the largest group first.
 
     Args:
         graph: the graph.
-        poses: (N, 3) the solution, along which the chain is taken.
-        rejected: `edge_ids` of the loops that the solution rejects.
+        poses: (N, 3) poses of the solution, which carry one loop along the chain to the next; m and rad.
+        rejected: edge ids of the loops that the solution rejects.
         gate: squared Mahalanobis distance up to which two loops agree.
     """
     edges = np.flatnonzero(np.isin(graph.edge_ids, rejected))
@@ -39,13 +39,16 @@ def rejected_clusters(graph: PoseGraph, poses: Array, rejected: tuple[int, ...],
 
 
 def loops_of(graph: PoseGraph, edges: NDArray[np.int64]) -> Loops:
-    """Some edges (L,) of a graph as loops."""
+    """The edges of a graph with indices `edges` (L,), as loops."""
     covariance: Array = np.asarray(np.linalg.inv(graph.information[edges]))
     return Loops.of(graph.sources[edges], graph.targets[edges], RelativePose(graph.deltas[edges], covariance))
 
 
 def neighbouring_pairs(graph: PoseGraph, edges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Pairs (P, 2) of positions in `edges` whose loops are neighbours."""
+    """Pairs (P, 2) of loops that are neighbours: both ends of one are few nodes from those of the other.
+
+    The result holds positions in `edges` (L,), which are indices of loops among the graph's edges.
+    """
     if len(edges) < 2:
         return np.zeros((0, 2), dtype=np.int64)
     ends = np.sort(np.column_stack([graph.sources[edges], graph.targets[edges]]), axis=1)

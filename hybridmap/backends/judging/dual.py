@@ -33,12 +33,13 @@ _STATIONARY = 1e-12  # relative decrease of F, promised by a Newton step, that n
 
 @dataclass(frozen=True, slots=True)
 class Proof:
-    """What was proved about the critical point of the isotropised objective F near given poses.
+    """What was proved about the critical point near given poses of F, which is chi2 with the noise made isotropic.
 
     Attributes:
         objective: F at the critical point; F at the given poses if it was not reached.
         objective_given: F at the given poses.
-        gap: upper bound of (F - F_best) / F at the critical point; infinite if nothing was proved.
+        gap: upper bound of (F - F_best) / F at the critical point, F_best being the global optimum; infinite if nothing was
+            proved.
         reached: whether Newton steps led to a critical point.
     """
 
@@ -49,11 +50,11 @@ class Proof:
 
 
 def prove(graph: PoseGraph, poses: Array) -> Proof:
-    """Find the critical point of F near given poses and bound how far it is above the global optimum of F.
+    """Find the critical point near given poses of F, which is chi2 with isotropic noise; bound its gap to the global optimum.
 
     Args:
-        graph: connected, of two nodes or more.
-        poses: (N, 3) finite, m and rad.
+        graph: a connected graph of two nodes or more.
+        poses: (N, 3) finite poses, m and rad.
     """
     form = quadratic_form(graph)
     given = np.concatenate([poses[:, 0] + 1j * poses[:, 1], np.exp(1j * poses[:, 2])])
@@ -66,7 +67,7 @@ def prove(graph: PoseGraph, poses: Array) -> Proof:
 
 
 def quadratic_form(graph: PoseGraph) -> csr_array:
-    """Q (2N, 2N), Hermitian: positions, then headings."""
+    """The Hermitian matrix Q (2N, 2N) of the objective x^H Q x; x holds positions, then headings, as complex numbers."""
     n, e = graph.n_nodes, graph.n_edges
     kappa = np.sqrt(2.0 * graph.information[:, 2, 2])
     tau = np.sqrt(2.0 / np.trace(np.linalg.inv(graph.information[:, :2, :2]), axis1=1, axis2=2))

@@ -55,19 +55,32 @@ class ConsistentBackend:
 
     @property
     def name(self) -> str:
-        """See `Backend.name`."""
+        """The name from which `registry.create` makes this back-end."""
         return self._inner.name
 
     def update(self, graph: PoseGraph) -> Solution:
-        """See `Backend.update`."""
+        """Follow the graph with all loops, as it has grown (or lost edges) since the last call.
+
+        Raises:
+            BackendError: the graph cannot be solved.
+        """
         return self._inner.update(graph)
 
     def finish(self, graph: PoseGraph) -> Solution:
-        """See `Backend.finish`."""
+        """Compute the final solution at the end of a drive.
+
+        Raises:
+            BackendError: the graph cannot be solved.
+        """
         return self._filtered(graph, self._inner.finish)
 
     def solve(self, graph: PoseGraph | SupportsPoseGraph) -> Solution:
-        """See `Backend.solve`."""
+        """Solve a whole graph with its consistent loops, independently of earlier calls.
+
+        Raises:
+            GraphError: the graph is malformed.
+            BackendError: the solver failed.
+        """
         return self._filtered(graph if isinstance(graph, PoseGraph) else graph.pose_graph(), self._inner.solve)
 
     def _filtered(self, graph: PoseGraph, solve: Callable[[PoseGraph], Solution]) -> Solution:
@@ -146,10 +159,10 @@ def _without(graph: PoseGraph, edges: NDArray[np.int64]) -> PoseGraph:
 
 @dataclass(frozen=True, slots=True)
 class Consistent:
-    """Result of the pairwise test.
+    """Result of the pairwise test of loops.
 
     Attributes:
-        loops: (L,) indices of loops that agree in pairs with each other, each with at least some neighbours.
+        loops: (L,) indices among the graph's edges of the loops that agree in pairs, each also with some of its neighbours.
         variance: unit variance of neighbouring loops that agree, relative to the stated covariances; 1 if there are none.
     """
 
@@ -160,11 +173,11 @@ class Consistent:
 def consistent_loops(graph: PoseGraph) -> Consistent:
     """Find the loops that are consistent with each other.
 
-    Most graph files overstate their noise. Neighbouring loops that agree show by how much: if their rings close much better
-    than their covariances say, the bound for all pairs is tightened accordingly.
+    Most graph files overstate their noise. Neighbouring loops that agree show by how much: if two loops and the chain between
+    them close much better than their covariances say, the bound for all pairs is tightened accordingly.
 
     Args:
-        graph: with a chain of odometry or registration edges.
+        graph: a graph with a chain of odometry or registration edges.
 
     Raises:
         GraphError: no odometry or registration edge joins two consecutive nodes; the message names them.

@@ -1,1 +1,1 @@
-"""Relaxation rules: the paper's, its stable variant, and RatSLAM's."""
+"""Relaxation rules: that of the paper, a stable variant of it, and that of RatSLAM."""

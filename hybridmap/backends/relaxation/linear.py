@@ -31,12 +31,14 @@ Rate = tuple[float | Array | None, str]
 
 @dataclass(frozen=True, slots=True)
 class LinearRule:
-    """The rule on one graph: positions `d` (N, 2), transitions `w` (E, 2) in the world frame.
+    """The paper's rule on one graph of N nodes and E edges; it moves positions only.
 
     Attributes:
-        laplacian: (N, N) sparse, every edge of weight one.
-        pull: (N, 2), the constant part b of the gradient.
-        degree: (N,) links of each node.
+        sources, targets: (E,) nodes of each edge.
+        transitions: (E, 2) displacement of each edge in the world frame, m.
+        laplacian: (N, N) sparse graph Laplacian, every edge of weight one.
+        pull: (N, 2) constant part of the correction, m: the correction is `pull` minus `laplacian` times positions.
+        degree: (N,) number of edges of each node.
     """
 
     sources: NDArray[np.int64]
@@ -48,7 +50,7 @@ class LinearRule:
 
     @classmethod
     def of(cls, graph: PoseGraph) -> LinearRule:
-        """Freeze the transitions at the headings of the graph's `initial`."""
+        """Make the rule for a graph; transitions are turned to the world frame by the headings of its `initial`."""
         yaw = graph.initial[graph.sources, 2]
         cos, sin = np.cos(yaw), np.sin(yaw)
         dx, dy = graph.deltas[:, 0], graph.deltas[:, 1]
@@ -63,17 +65,17 @@ class LinearRule:
         return cls(graph.sources, graph.targets, transitions, laplacian, incidence @ transitions, degree)
 
     def correction(self, positions: Array) -> Array:
-        """The bracket of equation 16 for all nodes, (N, 2) m."""
+        """Correction of all nodes, (N, 2) m, before it is multiplied by the rate: the bracket of the paper's equation 16."""
         return np.asarray(self.pull - self.laplacian @ positions)
 
     def objective(self, positions: Array) -> float:
-        """Half the sum of squared link errors, m^2, which the rule minimises."""
+        """Half the sum of squared errors of the edges, m^2, which the rule minimises."""
         error = positions[self.targets] - positions[self.sources] - self.transitions
         return 0.5 * float(np.sum(error * error))
 
 
 def lambda_max(laplacian: csr_array) -> float:
-    """Largest eigenvalue of a graph Laplacian; theta must stay below 2 / lambda_max."""
+    """Largest eigenvalue of a graph Laplacian; the rule is stable for rates below 2 / lambda_max."""
     n = laplacian.shape[0]
     if n <= 16:
         return float(np.linalg.eigvalsh(laplacian.toarray())[-1])
@@ -82,7 +84,10 @@ def lambda_max(laplacian: csr_array) -> float:
 
 
 def relax(rule: LinearRule, positions: Array, rate: float | Array, sweeps: int, tolerance_m: float) -> tuple[Array | None, int]:
-    """Up to `sweeps` sweeps of d += rate * correction; returns positions (None: grown without bound) and the sweeps done."""
+    """Run up to `sweeps` sweeps of positions += rate * correction; returns the positions and the number of sweeps.
+
+    The positions are None if they grew without bound. The run ends early once no node moves by more than `tolerance_m`.
+    """
     before = rule.objective(positions)
     with np.errstate(over="ignore", invalid="ignore"):
         for done in range(1, sweeps + 1):
@@ -97,7 +102,7 @@ def relax(rule: LinearRule, positions: Array, rate: float | Array, sweeps: int, 
 
 
 def paper(name: str, config: BackendsConfig) -> Driver:
-    """Equation 16 as printed; `on_unstable` configures what happens beyond theta_max."""
+    """A back-end with the paper's equation 16 as printed; `on_unstable` configures what happens if its rate is too large."""
 
     def rate(rule: LinearRule, config: RelaxationConfig) -> Rate:
         largest = lambda_max(rule.laplacian)
@@ -111,7 +116,7 @@ def paper(name: str, config: BackendsConfig) -> Driver:
 
 
 def normalised(name: str, config: BackendsConfig) -> Driver:
-    """Equation 16 with theta divided by the node's degree; never raises its objective."""
+    """A back-end with equation 16 and theta divided by the node's degree; a sweep never increases its objective."""
 
     def rate(rule: LinearRule, config: RelaxationConfig) -> Rate:
         return _by_degree(rule, config), f"theta {config.theta} / degree"

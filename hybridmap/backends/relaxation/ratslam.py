@@ -41,7 +41,7 @@ class Relaxed:
     """Result of a run of sweeps.
 
     Attributes:
-        poses: (N, 3), yaw wrapped; not finite if the run grew without bound.
+        poses: (N, 3) poses, m and rad, yaw wrapped; not finite if the run grew without bound.
         sweeps: number of sweeps.
         settled: whether the last sweep moved nothing by more than the tolerance.
     """
@@ -148,16 +148,16 @@ _TOLERANCE = 1e-9  # relative decrease of the cost at which least squares is don
 
 
 def plain(name: str, config: BackendsConfig) -> Driver:
-    """RatSLAM's rule: every link moves both of its ends by theta times its error."""
+    """A back-end with RatSLAM's rule: every edge moves both of its nodes by theta times its error."""
     return relaxing(name, config, partial(_relaxed, config.relaxation))
 
 
 def robust(name: str, config: BackendsConfig) -> Driver:
-    """RatSLAM's rule with each loop's correction multiplied by a Geman-McClure weight of its error.
+    """A back-end with RatSLAM's rule and each loop's correction multiplied by a Geman-McClure weight of its error.
 
     The scale of the weight shrinks geometrically to 1 during a call. For a whole graph that takes a quarter of the sweeps; the
     others use the plain rule on the inlier loops, which are chosen once more in between.
-    The end of a drive is solved as a whole from the map of the drive, and the better of the two is kept.
+    At the end of a drive, the whole graph is solved from the map of the drive, and the better of the two maps is kept.
     """
     rules = config.relaxation
     solve = swept(partial(_in_rounds, rules), rules.solve_sweeps)
@@ -176,7 +176,7 @@ def robust(name: str, config: BackendsConfig) -> Driver:
 
 
 def then_least_squares(name: str, config: BackendsConfig) -> Driver:
-    """RatSLAM's plain rule, then Levenberg-Marquardt over all edges."""
+    """A back-end with RatSLAM's plain rule while driving, then Levenberg-Marquardt over all edges."""
     rule, rules = partial(_relaxed, config.relaxation), config.relaxation
     relax = swept(rule, rules.solve_sweeps)
 
@@ -194,7 +194,7 @@ def then_least_squares(name: str, config: BackendsConfig) -> Driver:
 
 
 def weights(graph: PoseGraph, poses: Array) -> Array:
-    """The Geman-McClure weight (E,) that each edge would have as a loop, at the final scales."""
+    """The Geman-McClure weight (E,) of each edge's error at poses (N, 3), as if every edge were a loop, at the final scales."""
     predicted = compose(poses[graph.sources], graph.deltas)
     errors = between(predicted, poses[graph.targets])
     squared = np.sum(errors[:, :2] ** 2, axis=1) / ROBUST_SCALE_M**2 + errors[:, 2] ** 2 / ROBUST_SCALE_RAD**2

@@ -20,7 +20,7 @@ Rule = Callable[[PoseGraph, Array, int], Outcome]
 
 
 def swept(rule: Rule, sweeps: int) -> Solver:
-    """A solver that runs up to this many sweeps of a rule; it refuses poses that grow without bound."""
+    """Make a solver that runs up to this many sweeps of a relaxation rule; poses that grow without bound are refused."""
 
     def solve(graph: PoseGraph, start: Array) -> Outcome:
         if graph.n_edges == 0:
@@ -35,7 +35,7 @@ def swept(rule: Rule, sweeps: int) -> Solver:
 
 
 def relaxing(name: str, config: BackendsConfig, rule: Rule) -> Driver:
-    """A back-end that sweeps after each growth of the graph; the end of the drive is one more update."""
+    """A back-end that runs sweeps of `rule` whenever the graph grows; the end of the drive is one more such update."""
     follow = swept(rule, config.relaxation.sweeps_per_node)
     solve = swept(rule, config.relaxation.solve_sweeps)
     return Driver(name, config, solve, follow=follow, last=follow, works=Works.ON_GROWTH)
