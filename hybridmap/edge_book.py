@@ -1,4 +1,4 @@
-"""Where the robot is, and which edge of the map a proposal of vision became: the mapper's bookkeeping."""
+"""The mapper's bookkeeping: where the robot is, and which edge of the map each proposed edge became."""
 
 from __future__ import annotations
 

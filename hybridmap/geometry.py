@@ -141,7 +141,7 @@ def compose_relative(first: RelativePose, second: RelativePose) -> RelativePose:
 
 
 def invert_relative(relative: RelativePose) -> RelativePose:
-    """Turn a relative pose round: the source seen from the target."""
+    """Invert a relative pose: the source seen from the target, with its covariance."""
     carry = adjoint(relative.delta)
     return RelativePose(inverse(relative.delta), carry @ relative.covariance @ np.swapaxes(carry, -1, -2))
 

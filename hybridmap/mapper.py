@@ -1,4 +1,4 @@
-"""The whole algorithm on one page: the cells integrate self-motion, views close loops, back-ends correct the map."""
+"""The whole algorithm on one page: the path integrator tracks self-motion, views close loops, back-ends correct the map."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ def stamp_ns_from_s(stamp_s: float) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """Poses of one frame over time, sorted by stamp.
+    """Poses in one frame over time, sorted by stamp.
 
     Attributes:
         stamps_ns: (N,) int64, nanoseconds, strictly increasing.

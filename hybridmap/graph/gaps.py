@@ -1,4 +1,4 @@
-"""Gaps of the measured way: kidnappings, and stretches that odometry alone holds (a bare corridor)."""
+"""Where the motion was not measured: kidnappings, and stretches known by odometry alone (a bare corridor)."""
 
 from __future__ import annotations
 

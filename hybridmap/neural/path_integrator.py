@@ -46,24 +46,24 @@ _WRAPS = np.array(sorted(((x, y) for x in range(-8, 9) for y in range(-8, 9)), k
 
 
 class PathIntegrator:
-    """Head direction -> band -> grid -> place -> place attractor.
+    """Path integrator made of cells: head direction -> band -> grid -> place -> place attractor.
 
     The pose is decoded from the head-direction ring and the phases of all grid sheets together; no other state integrates the
-    position. The code repeats, so decoding needs a start: the last decoded position and the place attractor's bump. If the
-    modules do not agree there, the box around it is scanned, and then the attractor's other wraps (8 each way). The start
-    selects a repetition and has no other effect: other activity means another pose.
+    position. The phases repeat, so decoding needs a start: the last decoded position and the place attractor's bump. If
+    the modules do not agree there, the box around it is searched, and then the attractor's other repetitions (8 each way). The
+    start selects a repetition and has no other effect.
 
     Attributes:
         gains: calibration of the next steps; may be changed at any time.
     """
 
     def __init__(self, config: NeuralConfig, rng: np.random.Generator | None = None, dtype: DTypeLike = np.float64) -> None:
-        """Make every population and let it settle at the origin.
+        """Make every population of cells and let it settle at the origin.
 
         Args:
             config: settings of the cells.
-            rng: of the neuron noise; by default one is made from `NEURON_NOISE_SEED`.
-            dtype: precision of every population.
+            rng: random generator of the neuron noise; by default one is made from `NEURON_NOISE_SEED`.
+            dtype: floating-point type of every population.
 
         Raises:
             ConfigError: the grid sheets do not settle with this kernel.
@@ -126,9 +126,9 @@ class PathIntegrator:
 
     @property
     def place_code(self) -> NDArray[np.float32]:
-        """Rates (P,) of the place attractor, of unit length and unique beyond its wrap; novelty is 1 - the dot product.
+        """Rates (P,) of the place attractor, of unit length; the distance of two places is 1 - the dot product of their codes.
 
-        It is a function of the present activity alone: the same place gives the same code whenever it is visited.
+        The code is a function of the present activity alone: the same place gives the same code whenever it is visited.
         """
         return self.attractor.code(self.attractor.unwrapped_m(self._last_decoded_m))
 
@@ -296,13 +296,13 @@ def _grid(config: NeuralConfig, dtype: DTypeLike) -> GridModules:
 
 
 class Reanchoring:
-    """Re-anchoring: sets the path integrator to matched nodes (paper eq. 16), and keeps `odom` continuous.
+    """Re-anchoring: sets the path integrator to a matched node's activity (paper eq. 16), and keeps `odom` continuous.
 
     The cells jump to the matched node's activity, so that a visited place has its old place code again. The jump is subtracted
-    from the pose in `odom` (REP-105), so that odometry edges stay odometry.
+    from the pose in `odom` (REP-105), so that odometry edges do not contain it.
 
     Attributes:
-        weight: how far the cells are pulled, 0..1; 0 leaves them alone.
+        weight: how far the cells are moved, 0..1; 0 leaves them alone.
     """
 
     def __init__(self, integrator: PathIntegrator, weight: float) -> None:

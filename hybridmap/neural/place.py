@@ -157,7 +157,7 @@ class PlaceAttractor:
 
     @property
     def extent_m(self) -> float:
-        """The sheet repeats after this many metres."""
+        """Distance after which the sheet repeats, m."""
         return self._side * self.cell_m
 
     def step(self, displacement_m: NDArray[np.float64]) -> None:
@@ -200,7 +200,7 @@ class PlaceAttractor:
         return np.asarray(np.angle(z) / (2.0 * np.pi) % 1.0 * self.extent_m)
 
     def unwrapped_m(self, near_m: Array) -> Array:
-        """Return the repetition of the bump's position (2,) that is nearest to `near_m`, m."""
+        """Return the bump's position (2,), m, in that repetition of the sheet that is nearest to `near_m` (2,)."""
         offset = self.position_m() - near_m
         return near_m + offset - self.extent_m * np.round(offset / self.extent_m)
 

@@ -1,4 +1,7 @@
-"""Frame -> profile and template -> match -> verified relative pose. It knows no cells, no graph and no solver."""
+"""The visual side: frames become profiles and view templates, are matched, and give verified relative poses.
+
+It knows nothing of the neural network, the graph and the solvers.
+"""
 
 from __future__ import annotations
 

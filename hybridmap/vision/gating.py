@@ -1,4 +1,4 @@
-"""The gate: where in the map a robot may be, and which nodes are worth comparing."""
+"""Gating: where on the map a robot may be by its uncertainty, and which nodes are therefore compared."""
 
 from __future__ import annotations
 

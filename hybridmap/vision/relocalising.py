@@ -63,7 +63,7 @@ class Whereabouts:
 
     @property
     def lost(self) -> bool:
-        """Whether the pose on the map may be wrong."""
+        """Whether the robot is lost: its pose on the map may be wrong."""
         return bool(self._breaks) or (self._wanted > 0 and self._unrecognised >= self._wanted)
 
     @property

@@ -1,4 +1,4 @@
-"""Stored profiles, their comparison over shifts (eq. 12) and the combined score G (eq. 13) in its several readings."""
+"""Stored profiles, their comparison over shifts (eq. 12), and the score G (eq. 13) in several variants."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Laser front-end: scans to submaps, submaps to relative poses, hypotheses to committed clusters."""
+"""Laser front-end: scans are merged into submaps, submaps are registered, and loops that agree with each other are accepted."""

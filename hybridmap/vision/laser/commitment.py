@@ -1,4 +1,4 @@
-"""Late commitment: hypotheses are pending until a cluster of them, consistent through the chain, beats its best rival."""
+"""Late decision on loops: hypotheses are pending until enough of them agree with each other and outweigh those that do not."""
 
 from __future__ import annotations
 

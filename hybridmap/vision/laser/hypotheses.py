@@ -1,4 +1,4 @@
-"""Hypotheses of loop closure: the submap of the last metres against the old submaps inside the gate."""
+"""Hypotheses of loop closure: the submap of the last metres is registered to old submaps that may be nearby."""
 
 from __future__ import annotations
 

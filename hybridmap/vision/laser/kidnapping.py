@@ -1,4 +1,4 @@
-"""Whether a laser robot was kidnapped, by the free space of its scans; and its global localisation."""
+"""Finds from the free space of its scans whether a laser robot was kidnapped (carried), and localises it on the whole map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Re-proposal: nodes near each other on the optimised map are registered again, finely."""
+"""Nodes near each other on the optimised map are registered again, for more and more precise loops."""
 
 from __future__ import annotations
 

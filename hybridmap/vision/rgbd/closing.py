@@ -1,4 +1,4 @@
-"""Loop closure by camera: gate, candidates by profile, verification, support by a second edge."""
+"""Loop closure by camera: nearby nodes, of these the most similar profiles, verification, and agreement with a second loop."""
 
 from __future__ import annotations
 

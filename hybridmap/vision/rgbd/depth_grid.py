@@ -113,7 +113,7 @@ def make_grid(depth_m: NDArray[np.float32], camera: Camera, cell_px: int, depth_
 
 
 def place(grid: DepthGrid, stance: Stance) -> Surface:
-    """Put a grid into the robot's frame, with the camera as it was at that keyframe."""
+    """Put a depth grid into the robot's frame, by the camera's pose (stance) at that keyframe."""
     valid, T_base_camera = grid.valid, stance.T_base_camera
     number = np.full(valid.shape, -1, dtype=np.int32)
     rows = np.empty((7, np.count_nonzero(valid)))

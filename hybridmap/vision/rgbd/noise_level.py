@@ -1,4 +1,4 @@
-"""The noise of registrations, learnt while driving from rings of three of them."""
+"""The noise of registrations, learnt while driving from the error with which three of them close a ring."""
 
 from __future__ import annotations
 

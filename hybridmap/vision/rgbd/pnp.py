@@ -1,4 +1,4 @@
-"""Verification of a loop candidate: features with depth, PnP both ways, planarity, then a joint refinement."""
+"""Verification of a loop candidate: PnP by features in both directions, planarity, then a joint refinement with depth."""
 
 from __future__ import annotations
 

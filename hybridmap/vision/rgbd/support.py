@@ -1,4 +1,4 @@
-"""Measured loops wait until another one agrees; none enters the map alone."""
+"""Measured loops are pending until another one agrees; none enters the map alone."""
 
 from __future__ import annotations
 
