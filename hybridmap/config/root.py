@@ -137,7 +137,7 @@ def _find(source: str | Path, beside: Path | None) -> Path:
 def _read_tree(source: str | Path, seen: tuple[Path, ...], beside: Path | None = None) -> dict[str, Any]:
     path = _find(source, beside)
     if path in seen:
-        raise ConfigError(f"{path}: `extends` forms a cycle")
+        raise ConfigError(f"{path}: `extends` forms a cycle; remove it from one of the files")
     tree = read_mapping(path)
     parent = tree.pop("extends", None)
     if parent is None:

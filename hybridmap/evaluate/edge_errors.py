@@ -1,4 +1,6 @@
-"""The edges of a map against ground truth: precision and recall of loops, errors by kind, and calibration of covariances."""
+"""The edges of a map against ground truth: precision and recall of loops, errors by kind of edge, and whether the edges'
+covariances are as large as their errors.
+"""
 
 from __future__ import annotations
 
@@ -38,10 +40,10 @@ class ClosureErrors:
     """Quality of a set of loop edges. Only edges between nodes whose true poses are known are evaluated.
 
     Attributes:
-        precision: share of the evaluated edges that are correct; NaN if there is none.
+        precision: share of the evaluated edges that are correct; NaN if no edge is evaluated.
         recall: share of the revisits that a correct edge found; NaN without any revisit.
         judged, right: number of evaluated edges, and of the correct ones among them.
-        revisits, found: number of revisits, and of those that a correct edge found.
+        revisits, found: number of revisits (nodes at a place visited before), and of those that a correct edge found.
         trans_median_m, trans_p95_m, rot_median_deg, rot_p95_deg: median and 95th percentile of the errors of the correct
             edges; NaN without any.
     """

@@ -188,7 +188,7 @@ class Explainer:
         self._map: ExperienceMap = self._store.map()
         if len(self._map) == 0:
             self._store.close()
-            raise EvaluationError(f"{folder}: its map holds no node: there is nothing to explain")
+            raise EvaluationError(f"{folder}: its map holds no node, so there is nothing to explain")
         self._settings: dict[str, Any] = self._store.config_tree
 
     def __enter__(self) -> Explainer:

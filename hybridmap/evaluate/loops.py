@@ -263,7 +263,7 @@ def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
         settings = view_settings(store)
         profiles, stamps = stored_profiles(store), node_stamps(store)
     if not profiles:
-        raise EvaluationError(f"{folder}: its nodes hold no views: there are no candidates to judge")
+        raise EvaluationError(f"{folder}: its nodes hold no views, which --loops evaluates; leave --loops out")
     if len(profiles[0]) == 1:
         settings = replace(settings, mode="plain")
     mode, matching, circular = settings.mode, settings.matching, settings.circular and len(profiles[0]) == 1
@@ -294,7 +294,7 @@ def candidate_metrics(mode: str, errors: CandidateErrors) -> list[Metric]:
 
 
 def truth_of(folder: Path, reference: Path | None) -> Trajectory:
-    """Read the given ground truth, or if it is None the session's own.
+    """Read the ground truth of a session: the file `reference` in the TUM format, or if it is None the session's own.
 
     Raises:
         EvaluationError: no reference is given, and the session has none.
@@ -302,7 +302,7 @@ def truth_of(folder: Path, reference: Path | None) -> Trajectory:
     session = SessionFolder(folder)
     session.require()
     if reference is None and not session.groundtruth.is_file():
-        raise EvaluationError(f"{folder}: no truth to judge candidates by; give --reference GT.tum")
+        raise EvaluationError(f"{folder}: --loops needs ground truth, and the session has none; give --reference GT.tum")
     return read_tum(reference or session.groundtruth)
 
 
@@ -319,7 +319,7 @@ def view_settings(store: MapStore) -> ViewSettings:
 
 
 def node_stamps(store: MapStore) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """(N,) stamps of the nodes, ns."""
+    """(N,) stamps of the nodes of a session's map, ns."""
     return np.array([node.stamp_ns for node in store.map().nodes], dtype=np.int64)
 
 

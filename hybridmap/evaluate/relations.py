@@ -35,7 +35,7 @@ class Relations:
 
     @property
     def is_loop(self) -> NDArray[np.bool_]:
-        """(R,) which relations span more than 60 s."""
+        """(R,) whether each relation spans more than 60 s, and so measures a loop rather than odometry."""
         return np.asarray(np.abs(np.diff(self.stamps_ns, axis=1)[:, 0]) > LOOP_GAP_S * NS_PER_S)
 
 
@@ -65,7 +65,7 @@ class RelationErrors:
 
 
 def read_relations(path: Path) -> Relations:
-    """Read lines `t1 t2 dx dy dyaw` (s, m, rad); `#` starts a comment.
+    """Read verified relative poses from a file with lines `t1 t2 dx dy dyaw` (s, m, rad); `#` starts a comment.
 
     Raises:
         EvaluationError: the file is missing or empty, or a line is damaged.
@@ -88,7 +88,7 @@ def read_relations(path: Path) -> Relations:
         stamps.append((first, second))
         deltas.append(delta)
     if not stamps:
-        raise EvaluationError(f"{path}: holds no relation")
+        raise EvaluationError(f"{path}: holds no relation; expected lines `t1 t2 dx dy dyaw`")
     return Relations(np.array(stamps, dtype=np.int64), np.array(deltas))
 
 

@@ -1,4 +1,4 @@
-"""One self-contained page per session: the map, its errors, its corrections, its loop closures and its figures."""
+"""Self-contained pages: one per session (map, errors, corrections, loop closures), study and comparison of back-ends."""
 
 from hybridmap.report.session_page import write_report
 

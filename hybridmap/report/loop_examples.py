@@ -32,7 +32,7 @@ _NEW, _OLD = style.PRIMARY, style.ODOMETRY
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """One example of a loop closure on the page.
+    """One example of a loop closure on a session's page.
 
     Attributes:
         title: its two nodes, and whether it was accepted.
@@ -170,7 +170,7 @@ def _overlay(scene: SessionScene, edge: Edge, points_of: Mapping[int, Array]) ->
 
 
 def overlay_title(edge: Edge) -> str:
-    """How the two views were aligned, in words."""
+    """Describe how the two views of a loop edge were aligned."""
     return f"laid over each other {'as the map has them' if edge.relative is None else 'by the measured pose'}"
 
 

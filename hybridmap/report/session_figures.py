@@ -42,7 +42,13 @@ def trajectories_figure(scene: SessionScene, building: Raster | None) -> str:
 
 
 def draw_trajectories(axes: Any, scene: SessionScene, building: Raster | None) -> None:
-    """Draw every back-end's trajectory over the ground truth and the building on matplotlib axes."""
+    """Draw every back-end's trajectory over the ground truth and the building on matplotlib axes.
+
+    Args:
+        axes: matplotlib axes.
+        scene: content of the session's page.
+        building: picture of the building from above; None without one.
+    """
     style.draw_building(axes, building)
     if scene.truth is not None:
         _draw_ways(axes, scene.truth, scene, color=style.TRUTH, linewidth=3.2, alpha=0.28, label="ground truth", zorder=3)
@@ -201,7 +207,7 @@ def error_figure(scene: SessionScene) -> str | None:
     """Draw position and heading error over time, with a mark at every accepted loop.
 
     Returns:
-        A `data:` URI; None if no trajectory has errors.
+        A `data:` URI; None if no error is known.
     """
     series = error_series(scene)
     if not series:

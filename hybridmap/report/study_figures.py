@@ -97,21 +97,21 @@ def _gathered(entries: Sequence[tuple[str, str, Cell, CellResult]], ticks: Seque
 
 
 def having(plan: Layout, figure: Figure) -> Layout:
-    """The layout without the panels in which no result has a value of the metric."""
+    """The layout without the panels in which no run has a value of the metric that the function `figure` returns."""
     kept = (panel for panel in plan.panels if any(figure(result) is not None for _, _, result in panel.cells))
     return replace(plan, panels=tuple(kept))
 
 
 def merit_figure(study: Study, plan: Layout, label: str, figure: Figure, *, logarithmic: bool) -> str:
-    """Draw one metric, an error or a share in percent: a dot per result, lines or bars through the medians.
+    """Draw one metric of a study, an error or a share in percent: a dot per run, lines or bars through the medians.
 
     Panels without a value of the metric are left out.
 
     Args:
         study: the finished study.
         plan: its panels.
-        label: text along the axis.
-        figure: returns the metric of a result.
+        label: text along the metric's axis.
+        figure: function that returns the metric of a run's result.
         logarithmic: whether the metric's axis is logarithmic.
 
     Returns:

@@ -68,7 +68,15 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """One row of the table that compares a study's results with the limits (bars) stated for them."""
+    """One row of the table that compares a study's results with their stated limits.
+
+    Attributes:
+        what: the metric.
+        where: the runs that it covers.
+        median, worst: its median and worst value as text.
+        bar: the limit.
+        passed: whether the limit is kept.
+    """
 
     what: str
     where: str

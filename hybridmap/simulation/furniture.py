@@ -21,7 +21,7 @@ def _beside(at: Spot, yaw_deg: float, forward_m: float, left_m: float) -> Spot:
 def table(
     at: Spot, yaw_deg: float, size: tuple[float, float], height_m: float = 0.74, color: Color = (168, 126, 84)
 ) -> list[Facet]:
-    """A table of `size` (depth, width) on four legs."""
+    """Surfaces of a table at (x, y), m: `size` is its depth and width, and it stands on four legs."""
     out = box(at, (*size, 0.04), paints.wood(color), bottom_m=height_m - 0.04, yaw_deg=yaw_deg)
     leg = paints.metal((88, 90, 96))
     for forward in (-0.5 * size[0] + 0.05, 0.5 * size[0] - 0.05):
@@ -31,7 +31,7 @@ def table(
 
 
 def desk(at: Spot, yaw_deg: float, width_m: float = 1.4) -> list[Facet]:
-    """A desk with drawers, papers, and a screen that faces `yaw_deg`."""
+    """Surfaces of a desk at (x, y), m, with drawers, papers, and a screen that faces `yaw_deg`."""
     out = table(at, yaw_deg, (0.7, width_m))
     drawers = {"front": paints.metal((128, 132, 140), drawers=3)}
     out += box(
@@ -54,7 +54,7 @@ def desk(at: Spot, yaw_deg: float, width_m: float = 1.4) -> list[Facet]:
 
 
 def chair(at: Spot, yaw_deg: float, color: Color = (52, 74, 116)) -> list[Facet]:
-    """A chair looking towards `yaw_deg`."""
+    """Surfaces of a chair at (x, y), m, whose front faces `yaw_deg`."""
     cloth = paints.fabric(color)
     out = box(at, (0.44, 0.44, 0.07), cloth, bottom_m=0.43, yaw_deg=yaw_deg)
     out += box(_beside(at, yaw_deg, -0.22, 0.0), (0.05, 0.42, 0.46), cloth, bottom_m=0.52, yaw_deg=yaw_deg)
@@ -66,7 +66,7 @@ def chair(at: Spot, yaw_deg: float, color: Color = (52, 74, 116)) -> list[Facet]
 
 
 def book_case(at: Spot, yaw_deg: float, width_m: float = 1.0, height_m: float = 2.0, depth_m: float = 0.3) -> list[Facet]:
-    """A filled book case facing `yaw_deg`."""
+    """Surfaces of a filled book case at (x, y), m, whose front faces `yaw_deg`."""
     front = {"front": pictures.books(max(2, round(height_m / 0.38)))}
     return box(at, (depth_m, width_m, height_m), paints.wood((128, 94, 64)), yaw_deg=yaw_deg, faces=front, px_per_m=160)
 
@@ -74,19 +74,19 @@ def book_case(at: Spot, yaw_deg: float, width_m: float = 1.0, height_m: float = 
 def cabinet(
     at: Spot, yaw_deg: float, width_m: float = 0.5, height_m: float = 1.3, color: Color = (150, 154, 158)
 ) -> list[Facet]:
-    """A filing cabinet facing `yaw_deg`, with something on top."""
+    """Surfaces of a filing cabinet at (x, y), m, whose front faces `yaw_deg`, with something on top."""
     front = {"front": paints.metal(color, drawers=4)}
     out = box(at, (0.45, width_m, height_m), paints.metal(color), yaw_deg=yaw_deg, faces=front, px_per_m=140)
     return out + crate(at, yaw_deg + 12, (0.3, 0.32, 0.24), bottom_m=height_m)
 
 
 def crate(at: Spot, yaw_deg: float, size: tuple[float, float, float] = (0.4, 0.5, 0.4), bottom_m: float = 0.0) -> list[Facet]:
-    """A cardboard box of `size` (depth, width, height), m, with its lower face at the height `bottom_m`."""
+    """Surfaces of a cardboard box at (x, y), m: `size` is depth, width and height, `bottom_m` the height of its lower face."""
     return box(at, size, pictures.parcel(), yaw_deg=yaw_deg, bottom_m=bottom_m, px_per_m=170)
 
 
 def plant(at: Spot, height_m: float = 1.3) -> list[Facet]:
-    """A pot plant."""
+    """Surfaces of a pot plant at (x, y), m."""
     out = box(at, (0.34, 0.34, 0.36), paints.fabric((168, 96, 66)), yaw_deg=20)
     crown, middle = height_m - 0.42, 0.42
     out += box(at, (0.5, 0.5, crown * 0.6), pictures.leaves(), bottom_m=middle, yaw_deg=35, px_per_m=140)
@@ -94,7 +94,7 @@ def plant(at: Spot, height_m: float = 1.3) -> list[Facet]:
 
 
 def sofa(at: Spot, yaw_deg: float, width_m: float = 1.8, color: Color = (146, 62, 52)) -> list[Facet]:
-    """A sofa facing `yaw_deg`."""
+    """Surfaces of a sofa at (x, y), m, whose front faces `yaw_deg`."""
     cloth = paints.fabric(color)
     out = box(at, (0.8, width_m, 0.42), cloth, yaw_deg=yaw_deg)
     out += box(_beside(at, yaw_deg, -0.32, 0.0), (0.18, width_m, 0.4), cloth, bottom_m=0.42, yaw_deg=yaw_deg)
@@ -106,5 +106,5 @@ def sofa(at: Spot, yaw_deg: float, width_m: float = 1.8, color: Color = (146, 62
 
 
 def bin_(at: Spot, color: Color = (60, 110, 90)) -> list[Facet]:
-    """A waste bin."""
+    """Surfaces of a waste bin at (x, y), m."""
     return box(at, (0.3, 0.3, 0.5), paints.metal(color, drawers=1), yaw_deg=30)

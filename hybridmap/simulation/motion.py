@@ -184,7 +184,7 @@ def carry(drive: Array, distance_m: float, step_s: float) -> KidnappedDrive:
             break
     if best is None:
         raise ConfigError(
-            "simulation.carried_m: this drive visits no place twice, so the robot cannot be kidnapped to a visited place"
+            "simulation.carried_m: this drive visits no place twice, to which the robot could be carried; leave it out"
         )
     return _cut(drive, *best, step_s)
 

@@ -60,7 +60,7 @@ def material(draw: Callable[Concatenate[Rng, Shape, float, P], Image]) -> Callab
 
 @material
 def plain(_rng: Rng, shape: Shape, _px_per_m: float, color: Color) -> Image:
-    """A single colour: a featureless wall."""
+    """Texture of a featureless wall: a single colour."""
     return np.full((*shape, 3), color, dtype=np.uint8)
 
 
@@ -68,7 +68,7 @@ def plain(_rng: Rng, shape: Shape, _px_per_m: float, color: Color) -> Image:
 def plaster(
     rng: Rng, shape: Shape, px_per_m: float, color: Color, *, skirting: Color | None = (92, 84, 76), scuffs: float = 0.5
 ) -> Image:
-    """A painted wall: faint clouds, `scuffs` marks per metre of wall, and a skirting board of that colour (None: no board)."""
+    """Texture of a painted wall: faint clouds, `scuffs` marks a metre, and a skirting board of the colour `skirting`."""
     tone = 1.0 + 0.012 * smooth_noise(rng, shape, 0.6 * px_per_m) + 0.012 * smooth_noise(rng, shape, 0.03 * px_per_m)
     image = tint(color, tone)
     for _ in range(rng.poisson(scuffs * shape[1] / px_per_m)):
@@ -83,7 +83,7 @@ def plaster(
 
 @material
 def carpet(rng: Rng, shape: Shape, px_per_m: float, color: Color, *, tile_m: float = 0.5, contrast: float = 0.05) -> Image:
-    """Carpet tiles: each with its own tone and pile, a few stains."""
+    """Texture of carpet tiles with the side `tile_m`: each has its own tone, and there are a few stains."""
     tile_px = max(2, round(tile_m * px_per_m))
     rows, columns = -(-shape[0] // tile_px), -(-shape[1] // tile_px)
     tones = 1.0 + contrast * rng.standard_normal((rows, columns), dtype=np.float32)
@@ -99,7 +99,7 @@ def carpet(rng: Rng, shape: Shape, px_per_m: float, color: Color, *, tile_m: flo
 
 @material
 def wood(rng: Rng, shape: Shape, px_per_m: float, color: Color = (150, 108, 70), *, plank_m: float = 0.0) -> Image:
-    """Wood with its grain along the surface's edge `along`; with `plank_m` > 0 it consists of planks of that width."""
+    """Texture of wood, its grain parallel to the surface's edge `along`; with `plank_m` > 0 it has planks of that width."""
     stretched = smooth_noise(rng, (shape[0], max(2, shape[1] // 12)), 0.02 * px_per_m)
     grain = cv2.resize(stretched, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
     rings = np.sin(4.0 * smooth_noise(rng, shape, 0.35 * px_per_m) + 2.0 * grain)
@@ -118,7 +118,7 @@ def wood(rng: Rng, shape: Shape, px_per_m: float, color: Color = (150, 108, 70),
 
 @material
 def bricks(rng: Rng, shape: Shape, px_per_m: float, color: Color = (156, 82, 62), mortar: Color = (178, 170, 160)) -> Image:
-    """A brick wall, every brick with its own tone."""
+    """Texture of a brick wall; every brick has its own tone."""
     image = np.full((*shape, 3), mortar, dtype=np.uint8)
     height, width = max(3, round(0.077 * px_per_m)), max(6, round(0.25 * px_per_m))
     gap = max(1, round(0.012 * px_per_m))
@@ -132,7 +132,7 @@ def bricks(rng: Rng, shape: Shape, px_per_m: float, color: Color = (156, 82, 62)
 
 @material
 def ceiling_tiles(rng: Rng, shape: Shape, px_per_m: float, color: Color = (226, 224, 216)) -> Image:
-    """A suspended ceiling: tiles of 60 cm, seams, pinholes."""
+    """Texture of a suspended ceiling: tiles of 60 cm with seams and pinholes."""
     tone = 1.0 - 0.10 * (rng.random(shape, dtype=np.float32) > 0.985)
     tile_px = max(2, round(0.6 * px_per_m))
     tones = 1.0 + 0.012 * rng.standard_normal((-(-shape[0] // tile_px), -(-shape[1] // tile_px)), dtype=np.float32)
@@ -144,14 +144,14 @@ def ceiling_tiles(rng: Rng, shape: Shape, px_per_m: float, color: Color = (226, 
 
 @material
 def fabric(rng: Rng, shape: Shape, px_per_m: float, color: Color) -> Image:
-    """Woven cloth with a stripe or two."""
+    """Texture of woven cloth with a stripe or two."""
     tone = 1.0 + 0.05 * rng.standard_normal(shape, dtype=np.float32) + 0.06 * smooth_noise(rng, shape, 0.1 * px_per_m)
     return tint(color, tone)
 
 
 @material
 def metal(rng: Rng, shape: Shape, px_per_m: float, color: Color = (150, 154, 158), *, drawers: int = 0) -> Image:
-    """Sheet metal, with drawers, handles and name plates where `drawers` > 0."""
+    """Texture of sheet metal, with drawers, handles and name plates if `drawers` > 0."""
     image = tint(color, 1.0 + 0.02 * smooth_noise(rng, shape, 0.2 * px_per_m))
     dark = vary(rng, (70, 72, 76), 10)
     for index in range(drawers):

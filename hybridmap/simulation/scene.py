@@ -50,7 +50,11 @@ class Caster:
         )
 
     def cast(self, rays: NDArray[np.float32]) -> Hits:
-        """First hits of rays `(..., 6)` float32: origin, direction."""
+        """The first surface that each ray hits.
+
+        Args:
+            rays: (..., 6) float32, origin (m) and direction of each ray.
+        """
         found = self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays))
         length = found["t_hit"].numpy()
         hit = np.isfinite(length)

@@ -40,7 +40,7 @@ _SKY = 205.0
 
 
 def camera_of(config: CameraConfig) -> Camera:
-    """Intrinsics and mounting of the simulated camera."""
+    """Intrinsics of the simulated RGB-D camera, and its mounting on the robot."""
     focal = 0.5 * config.width_px / float(np.tan(np.deg2rad(0.5 * config.field_of_view_deg)))
     mounting = np.eye(4)
     mounting[:3, :3] = rotation_from_quaternion(OPTICAL_QUATERNION_XYZW)

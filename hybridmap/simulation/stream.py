@@ -87,7 +87,7 @@ class SimulatedStream:
 
     @property
     def odometry(self) -> Trajectory:
-        """Wheel odometry: poses of `base_link` in `odom`."""
+        """Wheel odometry of the whole drive: poses of `base_link` in `odom`."""
         return self._odometry
 
     @property

@@ -74,7 +74,7 @@ def box(
     faces: Mapping[str, Paint] | None = None,
     px_per_m: float = 100.0,
 ) -> list[Facet]:
-    """An upright box.
+    """Surfaces of an upright box.
 
     Args:
         center: x and y of its middle, m.
@@ -159,7 +159,7 @@ def partition(
     height_m: float = 2.6,
     thickness_m: float = 0.12,
 ) -> list[Facet]:
-    """A straight wall with door openings; above an opening the wall continues.
+    """Surfaces of a straight wall with door openings; above an opening the wall continues.
 
     Args:
         start, end: (2,) end points of the wall, m.

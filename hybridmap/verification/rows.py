@@ -182,7 +182,7 @@ def recurrence_verdict(place: PlaceResult) -> str:
 
 
 def verb_of_change(percent: float) -> str:
-    """The verb that describes a change, given in per cent of all cells."""
+    """The verb that describes a change (such as `raises` or `lowers`), given in per cent of all cells."""
     if abs(percent) < 0.5:
         return "does not change"
     return "hardly changes" if abs(percent) < 5.0 else "raises" if percent > 0.0 else "lowers"

@@ -60,7 +60,7 @@ class Scale:
 
 @dataclass(frozen=True, slots=True)
 class CellVerification:
-    """Results of the experiments.
+    """Results of all experiments of the verification.
 
     Attributes:
         head_direction: the head-direction ring after many turns.
