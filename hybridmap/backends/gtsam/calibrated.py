@@ -2,8 +2,8 @@
 
 A heading bias bends every metre by the same amount. No robust kernel removes that: true loops that contradict the bent
 chain are rejected instead. Estimating the bias straightens the whole chain. A wrong winding of the chain is a local
-minimum, so the solution starts from several biases. The lowest truncated cost wins, with odometry in full and a
-rejected loop counted at the gate.
+minimum, so the solver runs from several initial biases. The result with the lowest truncated cost is taken: chi2 in which a
+rejected loop counts as much as one at the limit of rejection.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def with_calibrated_odometry(graph: PoseGraph, gains: Gains) -> PoseGraph:
 
 
 def create(name: str, config: BackendsConfig) -> Driver:
-    """A back-end that runs graduated non-convexity while driving, and adds the calibration when it solves a whole graph."""
+    """A back-end with Cauchy's kernel on loops while driving; it calibrates odometry when it solves a whole graph."""
     return gnc.create(name, config, best)
 
 

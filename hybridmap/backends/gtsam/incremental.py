@@ -58,7 +58,7 @@ def create(name: str, config: BackendsConfig) -> Driver:
 
 
 class Isam2:
-    """The two solvers of the back-end: `follow` for updates and `conclude` for the end of the drive.
+    """The solvers of the ISAM2 back-end: `follow` for updates while driving, and `conclude` for the end of the drive.
 
     Loop closures that agree with the map are delayed. To first order, adding measurements with residuals r to a least-squares
     map moves no pose by more than sqrt(sum of r' information r) of its standard deviations (Cauchy-Schwarz on the Kalman
