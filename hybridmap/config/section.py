@@ -94,10 +94,10 @@ def read_mapping(path: Path, error: type[HybridMapError] = ConfigError) -> dict[
 
     Args:
         path: the file.
-        error: type of the error to raise.
+        error: class of the exception to raise.
 
     Raises:
-        HybridMapError: of the type `error`: the file is not YAML (the message names the line), or holds no mapping.
+        HybridMapError: of the class `error`: the file is not YAML (the message names the line), or holds no mapping.
     """
     try:
         text = path.read_text(encoding="utf-8")

@@ -166,7 +166,7 @@ class EdgeErrors:
 def edge_errors(
     experiences: ExperienceMap, truth: Trajectory, weights: Mapping[int, float] | None = None
 ) -> dict[EdgeKind, EdgeErrors]:
-    """Evaluate the accepted edges of a map, kind by kind.
+    """Evaluate the accepted edges of a map: kind of edge -> errors.
 
     Args:
         experiences: the map.

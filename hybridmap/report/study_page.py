@@ -88,7 +88,14 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """Runs of a study that gave no solution, with the same message."""
+    """Runs of a study that gave no solution and ended with the same status and message.
+
+    Attributes:
+        status: status with which the runs ended, such as `diverged`.
+        where, backend: the conditions and the back-ends of these runs, as text.
+        count: number of runs.
+        message: message of the first one.
+    """
 
     status: str
     where: str

@@ -137,7 +137,7 @@ def head_direction(seed: np.random.SeedSequence, settings: dict[str, object], st
 
 @dataclass(frozen=True, slots=True)
 class StandstillResult:
-    """What happens while the robot stands still.
+    """How far the path integrator's state moves while the robot stands still.
 
     Attributes:
         pose_change: largest change of a coordinate of the pose over the steps without motion, m or rad.
