@@ -307,7 +307,7 @@ def truth_of(folder: Path, reference: Path | None) -> Trajectory:
 
 
 def view_settings(store: MapStore) -> ViewSettings:
-    """Read how a session computes and compares its profiles; settings that an older session lacks get their defaults."""
+    """Settings with which a session computed its scanline profiles and compared them; missing ones get their defaults."""
     tree: dict[str, Any] = without_gone(store.config_tree).get("vision") or {}
     rgbd = tree.get("rgbd") or {}
     return ViewSettings(

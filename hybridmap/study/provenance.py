@@ -45,7 +45,7 @@ def solving() -> str:
 
 @cache
 def mapping() -> str:
-    """Digest of all that determines graph and figures of a drive: our code, versions of libraries, the kind of machine."""
+    """Hash of our code, the versions of libraries and the kind of machine; a stored drive is reused only if it is the same."""
     return digest({"code": digest_of_code(solving_only=False), **_surroundings()})
 
 

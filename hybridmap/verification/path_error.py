@@ -98,14 +98,14 @@ def noise_errors(
 
 @dataclass(frozen=True, slots=True)
 class HeadDirectionResult:
-    """The head-direction ring after many turns.
+    """The error of the head-direction ring after many full turns, and its firing rates.
 
     Attributes:
         error_rad: name of the floating-point precision -> error of the decoded heading after the last turn.
         preferred_rad: (m,) preferred directions of the cells.
-        tuning: (6, 360) rates of six cells at headings of 0 to 359 degrees.
-        turn_rates_rad_s: (R,) turn rates for `rates`.
-        rates: (R, m) rates of the ring at those turn rates, as drawn (`HeadDirectionRing.rates`).
+        tuning: (6, 360) firing rates of six cells at headings of 0 to 359 degrees.
+        turn_rates_rad_s: (R,) turn rates shown in the figure.
+        rates: (R, m) firing rates of all cells at those turn rates.
     """
 
     error_rad: dict[str, float]

@@ -64,7 +64,7 @@ class ProfileStore:
 
     @property
     def shifts(self) -> Indices:
-        """(S,) the shifts tried, ascending."""
+        """(S,) horizontal shifts, in columns, at which a new profile is compared with the stored ones; ascending."""
         return self._shifts
 
     def add(self, profile: Profile) -> int:

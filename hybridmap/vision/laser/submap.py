@@ -144,7 +144,7 @@ class Atlas:
         return self.pieces[bisect_right(self._pieces, node) - 1]
 
     def along(self, node: int, before_m: float, after_m: float) -> NDArray[np.int64]:
-        """Nodes of the same piece that lie at most `before_m` of travel before a node and at most `after_m` after it."""
+        """Nodes from `before_m` of travel before a node to `after_m` after it, without those beyond a break of the chain."""
         travel, piece = self.travel_m[node], self.piece(node)
         first = int(np.searchsorted(self.travel_m, travel - before_m - 1e-9))
         stop = int(np.searchsorted(self.travel_m, travel + after_m + 1e-9, side="right"))

@@ -38,7 +38,7 @@ def of_step(depth_inliers: float, slack_m: float, odometry_sigma: float) -> tupl
 
 
 def of_depth(depth_inliers: float) -> tuple[Check, ...]:
-    """Check a depth registration: share of the points in common view that fit."""
+    """Check that enough of the points in common view fit after depth registration; `depth_inliers` is their share."""
     return (at_least("depth_inliers", depth_inliers, DEPTH_INLIERS_MIN),)
 
 
