@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +38,11 @@ def odometry_covariance(config: EdgesConfig, travel_m: float, turn_rad: float) -
     return np.array([[position, 0.0, 0.0], [0.0, sideways, cross], [0.0, cross, heading]])
 
 
+Indices = NDArray[np.int64]
 _MIN_WEIGHT = 1e-12  # csgraph takes an explicit zero for a missing edge
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class _Links:
     """Pairs of nodes that edges join, the lower number first.
 
@@ -49,12 +50,32 @@ class _Links:
         low, high: (L,) nodes.
         delta: (L, 3) pose of the high one in the frame of the low one.
         covariance: (L, 3, 3) of that, in the frame of the high one.
+        n_nodes: number N of nodes of the graph.
     """
 
-    low: NDArray[np.int64]
-    high: NDArray[np.int64]
+    low: Indices
+    high: Indices
     delta: Array
     covariance: Array
+    n_nodes: int
+
+    @cached_property
+    def keys(self) -> Indices:
+        """One number (L,) for each pair of nodes, ascending."""
+        return self.low * self.n_nodes + self.high
+
+    @cached_property
+    def lengths(self) -> csr_array:
+        """The trace of the position covariance of each link, m^2, as a symmetric matrix (N, N)."""
+        weight = np.maximum(self.covariance[:, 0, 0] + self.covariance[:, 1, 1], _MIN_WEIGHT)
+        ends = np.concatenate([self.low, self.high]), np.concatenate([self.high, self.low])
+        return csr_array((np.concatenate([weight, weight]), ends), shape=(self.n_nodes, self.n_nodes))
+
+    @cached_property
+    def steps(self) -> tuple[Array, Array]:
+        """Adjoint and covariance (2, L, 3, 3) with which a covariance is propagated along each link: up, then down."""
+        up, down = adjoint(inverse(self.delta)), adjoint(self.delta)
+        return np.stack([up, down]), np.stack([self.covariance, down @ self.covariance @ down.transpose(0, 2, 1)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +91,9 @@ class Chain:
 
     poses: Array
     covariance: Array
-    breaks: NDArray[np.int64]
+    breaks: Indices
 
-    def ways(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> RelativePose:
+    def ways(self, first: Indices, second: Indices) -> RelativePose:
         """The poses of nodes `second` (P,) in the frames of nodes `first` (P,), with covariances."""
         back = adjoint(inverse(self.poses[second]))
         sign = np.where(second >= first, 1.0, -1.0)[:, None, None]
@@ -116,29 +137,53 @@ def covariances_from(graph: PoseGraph) -> Callable[[int], Array]:
     def from_node(node: int) -> Array:
         if not 0 <= node < graph.n_nodes:
             raise GraphError(f"graph: node {node} does not exist, expected one of 0..{graph.n_nodes - 1}")
-        return _relative_covariances(links(), graph.n_nodes, node)
+        return _relative_covariances(links(), node)
 
     return cache(from_node)
 
 
-def _relative_covariances(links: _Links, n: int, node: int) -> Array:
-    parent, edge = _shortest_tree(links, n, node)
+def _relative_covariances(links: _Links, node: int) -> Array:
+    parent, edge = _shortest_tree(links, node)
     child = np.flatnonzero(edge >= 0)
-    delta, step = np.zeros((n, 3)), np.zeros((n, 3, 3))
-    delta[child], step[child] = _away_from_parent(links, child, edge[child])
-    pose, above = delta, parent.copy()
-    while np.any(above != node):
-        pose, above = compose(pose[above], pose), above[above]
-    carry = adjoint(pose)
-    total, above = carry @ step @ carry.transpose(0, 2, 1), parent.copy()
-    while np.any(above != node):
-        total, above = total + total[above], above[above]
-    back = adjoint(inverse(pose))
-    out = back @ total @ back.transpose(0, 2, 1)
+    down = np.zeros(links.n_nodes, dtype=np.int64)
+    down[child] = links.low[edge[child]] == child
+    out = np.zeros((links.n_nodes, 3, 3))
+    _along_tree()(parent, edge, down, *links.steps, out)
     unreached = edge < 0
     unreached[node] = False
     out[unreached] = np.diag(np.full(3, np.inf))
-    return np.asarray(out)
+    return out
+
+
+@cache
+def _along_tree() -> Callable[..., None]:
+    """The compiled loop; compiled on first use, as few commands need it."""
+    from hybridmap.compiled import compiled
+
+    tree = "int64[::1], int64[::1], int64[::1]"
+    return compiled(f"void({tree}, float64[:, :, :, ::1], float64[:, :, :, ::1], float64[:, :, ::1])")(_propagate)
+
+
+def _propagate(parent: Indices, edge: Indices, down: Indices, carry: Array, step: Array, out: Array) -> None:
+    """Covariances (N, 3, 3) of the nodes of a tree; `out` holds that of the root. `edge` is -1 where a node has no parent."""
+    done = edge < 0
+    waiting = np.empty(len(parent), dtype=np.int64)
+    for first in range(len(parent)):
+        node, count = first, 0
+        while not done[node]:
+            waiting[count] = node
+            node, count = parent[node], count + 1
+        for position in range(count - 1, -1, -1):
+            node = waiting[position]
+            above, by, added = out[parent[node]], carry[down[node], edge[node]], step[down[node], edge[node]]
+            for i in range(3):
+                for j in range(3):
+                    total = added[i, j]
+                    for k in range(3):
+                        for m in range(3):
+                            total += by[i, k] * above[k, m] * by[j, m]
+                    out[node, i, j] = total
+            done[node] = True
 
 
 def _links(graph: PoseGraph) -> _Links:
@@ -154,32 +199,20 @@ def _links(graph: PoseGraph) -> _Links:
     total = np.add.reduceat(information[order], first, axis=0) if len(first) else information
     pairs = key[order[first]]
     covariance: Array = np.asarray(np.linalg.inv(total))
-    return _Links(pairs // graph.n_nodes, pairs % graph.n_nodes, delta[order[first]], covariance)
+    return _Links(pairs // graph.n_nodes, pairs % graph.n_nodes, delta[order[first]], covariance, graph.n_nodes)
 
 
-def _shortest_tree(links: _Links, n: int, node: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _shortest_tree(links: _Links, node: int) -> tuple[Indices, Indices]:
     """Parent of each node (`node` for itself and for the unreached) and the link to it (-1 for those)."""
-    weight = np.maximum(links.covariance[:, 0, 0] + links.covariance[:, 1, 1], _MIN_WEIGHT)
-    matrix = csr_array((weight, (links.low, links.high)), shape=(n, n))
-    _, found = dijkstra(matrix, directed=False, indices=np.array([node]), return_predecessors=True)
+    _, found = dijkstra(links.lengths, indices=np.array([node]), return_predecessors=True)
     predecessor = found[0]
     reached = predecessor >= 0
     parent = np.where(reached, predecessor, node).astype(np.int64)
-    edge = np.full(n, -1, dtype=np.int64)
+    edge = np.full(links.n_nodes, -1, dtype=np.int64)
     child = np.flatnonzero(reached)
-    key = np.minimum(child, parent[child]) * n + np.maximum(child, parent[child])
-    edge[child] = np.searchsorted(links.low * n + links.high, key)
+    key = np.minimum(child, parent[child]) * links.n_nodes + np.maximum(child, parent[child])
+    edge[child] = np.searchsorted(links.keys, key)
     return parent, edge
-
-
-def _away_from_parent(links: _Links, child: NDArray[np.int64], edge: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Pose and covariance of each child in its parent's frame; links of the other direction are inverted."""
-    delta, covariance = links.delta[edge].copy(), links.covariance[edge]
-    turned = links.low[edge] == child
-    carry = adjoint(delta[turned])
-    covariance[turned] = carry @ covariance[turned] @ carry.transpose(0, 2, 1)
-    delta[turned] = inverse(delta[turned])
-    return delta, covariance
 
 
 _TRUST = np.zeros(len(EdgeKind), dtype=np.int64)  # of a kind of edge, when a new node is placed
@@ -231,7 +264,7 @@ def extend(graph: PoseGraph, placed: Array) -> Array:
     return poses
 
 
-def own_odometry(graph: PoseGraph) -> NDArray[np.int64]:
+def own_odometry(graph: PoseGraph) -> Indices:
     """Indices of the odometry edges that lead from a node to the next."""
     return np.flatnonzero((graph.kinds == EdgeKind.ODOMETRY) & (graph.targets == graph.sources + 1))
 

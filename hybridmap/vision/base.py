@@ -40,10 +40,10 @@ class Belief:
     def ways(self, first: Indices, second: Indices) -> RelativePose:
         """Return the poses of nodes `second` (P,) in the frames of nodes `first` (P,), with covariances.
 
-        Costs a shortest-path search of the graph for each distinct node in `first`.
+        Costs a shortest-path search of the graph for each distinct node in `first` that is not seen from itself alone.
         """
-        covariance = np.empty((len(first), 3, 3))
-        for node in np.unique(first).tolist():
+        covariance = np.zeros((len(first), 3, 3))
+        for node in np.unique(first[first != second]).tolist():
             covariance[first == node] = self.covariance_from(node)[second[first == node]]
         return RelativePose(between(self.poses_map_node[first], self.poses_map_node[second]), covariance)
 
