@@ -147,11 +147,11 @@ class EdgeBook:
         return self._map.add_edge(edge)
 
     def belief(self, poses_of: Callable[[PoseGraph], Array], outliers: Sequence[int] = ()) -> Belief:
-        """The state of the map, for the front-end.
+        """Poses of the nodes and their covariances, with which the front-end looks for loops.
 
         Args:
-            poses_of: returns the poses (N, 3) that the primary back-end gives the nodes of a graph.
-            outliers: numbers of edges that are left out.
+            poses_of: solves a graph with the primary back-end; returns the poses (N, 3) of its nodes.
+            outliers: numbers of edges that are left out of the graph.
         """
         own, nodes = self._config.gate == "odometry", self._map.nodes
         graph = self._map.pose_graph().only(EdgeKind.ODOMETRY) if own else self._map.pose_graph()

@@ -202,7 +202,10 @@ def align(poses_a: ArrayLike, poses_b: ArrayLike) -> Array:
 
 
 def loosest_direction(covariance: Array) -> tuple[float, float]:
-    """Largest standard deviation (m) of a position with covariance (3, 3), and its direction: an axis in [-pi/2, pi/2) rad."""
+    """Largest standard deviation (m) of the position of a planar pose, and its direction: an axis in [-pi/2, pi/2) rad from x.
+
+    `covariance` is (3, 3), of x, y and yaw.
+    """
     values, vectors = np.linalg.eigh(covariance[:2, :2])
     angle = float(np.arctan2(vectors[1, 1], vectors[0, 1]))
     return float(np.sqrt(max(values[1], 0.0))), (angle + 0.5 * np.pi) % np.pi - 0.5 * np.pi

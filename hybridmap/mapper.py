@@ -145,7 +145,7 @@ class Mapper:
         return self.backends.poses(self.map.pose_graph(), backend)
 
     def belief(self, outliers: Sequence[int] = ()) -> Belief:
-        """The state of the map for the front-end; edges of the numbers `outliers` are left out."""
+        """Poses of the nodes, solved without the edges whose numbers are in `outliers`, and their covariances."""
         return self.book.belief(self.backends.poses, outliers)
 
     def _correct(self, final: bool = False) -> None:

@@ -104,10 +104,13 @@ def solve(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config
 
 
 def told_by_the_drive(estimate: Estimate) -> Estimate:
-    """Make a gain or delay neutral, with infinite variance, if the drive says less about it than the prior does.
+    """Return an estimate without the values about which the drive says less than the prior does.
+
+    Of the distance gain and the delay, such a value becomes neutral (1, 0 s) with infinite variance. The turn gain and the
+    heading bias cannot be left out.
 
     Raises:
-        NotToldError: the drive says less than the prior about turn gain or heading bias.
+        NotToldError: the drive says less than the prior about the turn gain or the heading bias.
     """
     open_ = np.diag(estimate.covariance) > _OPEN * estimate.unit_variance * PRIOR**2
     if open_[1] or open_[2]:

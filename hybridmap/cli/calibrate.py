@@ -24,11 +24,11 @@ def calibrate(
     leg: Annotated[
         float | None,
         typer.Option(
-            help="Length of the pieces of the drive that are compared, 0.1 m or more; not with `joint`. Default: 1 to 16 m."
+            help="Length of the pieces of the drive that are compared, 0.1 m or more; not with `joint`. Default: a sixteenth of the drive, 1 to 16 m."
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE.yaml", help="Write the session's configuration with the estimate to this file.")
+        Path | None, typer.Option(metavar="FILE.yaml", help="Write the session's configuration, corrected, to this file.")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
@@ -36,8 +36,8 @@ def calibrate(
     """Estimate the systematic errors of wheel odometry: gain, turn gain, heading bias (rad/m), with standard deviations.
 
     The estimate comes from the loop closures of the sessions, or from reference trajectories if they are given.
-    --out writes a configuration with the estimate. Its values change only if one of them differs from the
-    estimate by more than three standard deviations.
+    --out writes the session's configuration. If one of its values differs from the estimate by more than three
+    standard deviations, all of them are replaced by the estimate; otherwise they stay as they are.
     """
     from hybridmap.calibration.estimate import calibrated, changes, metrics_of, verdict
     from hybridmap.calibration.sessions import common_tree, estimate_of, read_drive, require_options

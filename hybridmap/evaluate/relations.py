@@ -109,7 +109,10 @@ def relations_of(path: Path, trajectory: Trajectory) -> Relations:
 
 
 def relation_errors(trajectory: Trajectory, relations: Relations) -> RelationErrors:
-    """Compare a trajectory with verified relations, as far as it covers them."""
+    """Errors (m, degrees) of a trajectory's relative poses against verified ones, over all relations and over loops alone.
+
+    A relation counts if the trajectory covers both of its stamps.
+    """
     first, second = relations.stamps_ns[:, 0], relations.stamps_ns[:, 1]
     known = known_at(trajectory, first) & known_at(trajectory, second)
     loop = relations.is_loop

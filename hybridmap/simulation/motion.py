@@ -156,15 +156,15 @@ class KidnappedDrive:
 
 
 def carry(drive: Array, distance_m: float, step_s: float) -> KidnappedDrive:
-    """Kidnap the robot: cut a piece out of a drive, so that it is carried to a place that it has visited before.
+    """Kidnap the robot: leave out a piece of a drive, so that it is carried to a place that it has visited before.
 
-    The robot is picked up after the middle of the drive, and put down at a later place of the drive at this distance. If no
-    visited place is that far away, the most distant one is used.
+    The robot is picked up after the middle of the drive. It is put down at a pose of the rest of the drive that lies
+    `distance_m` from there and near a pose of the first half. If there is none, the most distant such pose is used.
 
     Args:
         drive: (N, 3) true poses, m and rad.
         distance_m: straight distance over which the robot is carried, m.
-        step_s: time between two poses, s.
+        step_s: time between two poses, s; it gives the speed at which the robot is carried.
 
     Raises:
         ConfigError: the drive visits no place twice.

@@ -39,14 +39,15 @@ class Ready:
 
 
 class Synchroniser:
-    """Turns sorted samples into steps, strictly in order of stamp; at equal stamps motion comes before observations.
+    """Sorts samples by stamp and turns them into steps; at equal stamps motion comes before observations.
 
     Every distinct stamp of self-motion gives one step without observation. Every observation gives one step, at the odometry
     interpolated to its stamp, once odometry at or after that stamp has arrived. Of odometry messages with equal stamps the
     first counts; of velocities the last, since each is valid until the next.
 
-    A live robot's messages arrive out of order across topics: samples wait `latency_s` to be sorted. The steps do not depend on
-    the latency as long as it covers the delay; an observation that comes later is dropped and counted.
+    The samples of a recording come in order, and `latency_s` is 0. A live robot's messages arrive out of order across topics:
+    each sample waits `latency_s`, so that earlier ones can still come. An observation that comes later than that is dropped
+    and counted.
     """
 
     def __init__(self, latency_s: float = 0.0, odometry_delay_s: float = 0.0) -> None:

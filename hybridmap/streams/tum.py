@@ -173,7 +173,10 @@ def _read_lines(path: Path, fields: int) -> list[tuple[int, list[str]]]:
 
 
 def read_picture_list(path: Path, stamp_column: int = 0) -> tuple[NDArray[np.int64], list[list[str]]]:
-    """Read the list of images `rgb.txt`, `depth.txt` or `associations.txt`: stamps (N,) ns and fields of each line, by stamp.
+    """Read the list of images `rgb.txt`, `depth.txt` or `associations.txt`.
+
+    Returns the stamps (N,), ns, ascending, and in the same order all fields of each line. `stamp_column` is the column of the
+    stamp; `associations.txt` has two. Two neighbouring lines may be swapped in the file.
 
     Raises:
         StreamError: the file is missing, empty or damaged, or its stamps are out of order.

@@ -92,12 +92,12 @@ class Whereabouts:
             self._breaks[node] = chain
 
     def recognised(self) -> None:
-        """Note that a loop closure localised the robot."""
+        """Record that a loop closure has localised the robot: it no longer counts as lost."""
         self._breaks.clear()
         self._unrecognised = 0
 
     def unrecognised(self) -> None:
-        """Note that the robot failed to recognise a known place."""
+        """Record that the robot failed to recognise a known place; several times in a row make it count as lost."""
         self._unrecognised += 1
 
 
@@ -114,8 +114,8 @@ class Settlement:
     """What the matches of a lost robot led to.
 
     Attributes:
-        proposals: new and changed edges of all kinds.
-        accepted: the matches that entered the map; empty while the robot is not localised.
+        proposals: every edge that the map must add or replace: accepted, pending and rejected ones.
+        accepted: those of the proposals that now constrain the map; empty while the robot is not localised.
         kidnapped_to: the first node after the kidnapping; None while the robot is not localised, or if it was not kidnapped.
     """
 

@@ -225,7 +225,10 @@ class Matcher:
         return self.store.add(profile)
 
     def score(self, query: Profile, indices: Indices) -> Match:
-        """Score a query against some of the stored profiles; a mean over stored profiles (`g_bar`) is over all of them."""
+        """Return the scores (n,) of a query against the stored profiles with the numbers `indices`, in their order.
+
+        If the score uses the mean difference `g_bar`, that is the mean over all stored profiles, not only over `indices`.
+        """
         weights = band_weights(len(query), *self._mu)
         every = self.store.differences(query) if self._mode in RELATIVE and self._g_bar == "templates" else None
         g = self.store.differences(query, indices) if every is None else every[indices]
