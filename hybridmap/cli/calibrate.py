@@ -24,7 +24,8 @@ def calibrate(
     leg: Annotated[
         float | None,
         typer.Option(
-            help="Length of the pieces of the drive that are compared, 0.1 m or more; not with `joint`. Default: a sixteenth of the drive, 1 to 16 m."
+            help="Length of the pieces of the drive that are compared, 0.1 m or more; not with `joint`. "
+            "Default: a sixteenth of the drive, 1 to 16 m."
         ),
     ] = None,
     out: Annotated[
