@@ -206,7 +206,7 @@ class GridModules:
     def band_phases(self) -> NDArray[np.float64]:
         """Return the phases (M, 3) of the modes (1,0), (1,1) and (0,1) of the activity, cycles in [-0.5, 0.5]."""
         modes, k = self.modes.forward(self._stack), self._centre
-        first = np.stack([modes[k + 1, :, 0], modes[k + 1, :, 1], modes[k, :, 1]], axis=1)
+        first = modes[[k + 1, k + 1, k], :, [0, 1, 1]].T
         return np.asarray(-np.angle(first.astype(np.complex128)) / (2.0 * np.pi))
 
     def phases(self) -> NDArray[np.float64]:
@@ -289,7 +289,7 @@ class PhaseDecoder:
             position = self._solve @ (phases - wraps)
             offset = phases - self._waves @ position
             before, wraps = wraps, np.round(offset)
-            if np.array_equal(before, wraps):
+            if (before == wraps).all():
                 break
         residual = offset - wraps
         return Decoded(position, math.sqrt(float(residual @ residual) / residual.size))

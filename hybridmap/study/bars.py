@@ -69,7 +69,11 @@ class Verdict:
 
 
 def judge(grid: Grid, results: Mapping[str, CellResult]) -> list[Verdict]:
-    """Check every bar of a study against every group of cells that it applies to, in the order of the bars."""
+    """Check every bar (limit of a figure) of a study against every group of its runs to which the bar applies.
+
+    `results` holds the result of each cell of the grid (a run with one combination of settings) by the cell's name. Returns one
+    verdict for each bar and group, in the order of the bars.
+    """
     groups = grid.groups()
     return [
         _verdict(bar, cells, groups, results)

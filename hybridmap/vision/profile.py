@@ -96,7 +96,7 @@ def _cell_means(image: NDArray[np.generic], width: int, bands: int) -> NDArray[n
     import cv2
 
     height = image.shape[0]
-    edges = np.linspace(0, height, bands + 1).round().astype(int)
+    edges = [round(height * band / bands) for band in range(bands + 1)]
     rows = [cv2.reduce(image[a:b], 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F) for a, b in pairwise(edges)]
     return np.asarray(cv2.resize(np.concatenate(rows), (width, bands), interpolation=cv2.INTER_AREA), dtype=np.float64)
 

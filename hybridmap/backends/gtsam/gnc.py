@@ -231,9 +231,10 @@ def _step(factor_graph: Any, poses: Array, current: Any) -> tuple[Array, Any]:
 
 
 def grow(graph: PoseGraph, config: BackendsConfig, negligible: float) -> Truncated:
-    """Solve the graph part by part, in the order of the drive, each part begun by odometry from the last solution.
+    """Solve the first part of the drive, then ever longer parts up to the whole graph, by truncated least squares.
 
-    Rejected loops are considered again in every part. Loops of a weight below `negligible` are left out of an annealing round.
+    The new nodes of a part begin where odometry leads from the last solution. Rejected loops are considered again in every
+    part. Loops of a weight below `negligible` are left out of an annealing round.
     """
     poses, rounds = graph.initial[:1], 0
     for end in range(CHUNK_NODES, graph.n_nodes, CHUNK_NODES):

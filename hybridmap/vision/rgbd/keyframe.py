@@ -31,7 +31,13 @@ class WorkingImage:
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """A node's frame: profile, features, and surface of the depth image."""
+    """What is kept of a node's RGB-D image.
+
+    Attributes:
+        profile: means of intensity and depth in columns of the image, with which similar views are found.
+        features: keypoints with their points in space.
+        surface: points and normals of the depth image, on a coarse grid.
+    """
 
     profile: Profile
     features: Features

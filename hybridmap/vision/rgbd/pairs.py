@@ -54,9 +54,9 @@ class PointPairs:
         return PointPairs(self.fixed[keep], self.moving[keep], self.ray[keep], self.across[keep], self.excess[keep])
 
     def terms(self, T_fixed_moving: Array) -> tuple[Array, Array]:
-        """H (6, 6) and b (6,) of the normal equations at a pose (4, 4), with Cauchy weights.
+        """H (6, 6) and b (6,) of the normal equations H xi = b at a pose (4, 4), with Cauchy weights.
 
-        The information across depends on sums over the arms alone; what is added along the ray gives one wrench a pair.
+        xi is a shift (3) and a small turn (3) in the fixed frame, applied from the left.
         """
         arm = T_fixed_moving[:3, :3] @ self.moving.T
         error = arm + T_fixed_moving[:3, 3:] - self.fixed.T

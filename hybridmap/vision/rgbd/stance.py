@@ -9,6 +9,8 @@ import numpy as np
 
 from hybridmap.geometry import Array
 
+_IDENTITY = np.eye(4)
+
 
 @dataclass(frozen=True, slots=True)
 class Stance:
@@ -58,7 +60,7 @@ def camera_on(up: Array, height_m: float, T_base_camera_nominal: Array) -> Array
     heading = math.atan2(nominal[1, axis], nominal[0, axis])
     cos, sin = math.cos(heading), math.sin(heading)
     left = (uy * z - uz * y, uz * x - ux * z, ux * y - uy * x)
-    out = np.eye(4)
+    out = _IDENTITY.copy()
     out[0, :3] = cos * x - sin * left[0], cos * y - sin * left[1], cos * z - sin * left[2]
     out[1, :3] = sin * x + cos * left[0], sin * y + cos * left[1], sin * z + cos * left[2]
     out[2, :3] = up
@@ -104,7 +106,7 @@ class FloorPose:
 
 def inverse_rigid(T_a_b: Array) -> Array:
     """Return T_b_a (4, 4)."""
-    out = np.eye(4)
+    out = _IDENTITY.copy()
     out[:3, :3] = T_a_b[:3, :3].T
     out[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
     return out
@@ -113,7 +115,7 @@ def inverse_rigid(T_a_b: Array) -> Array:
 def from_planar(pose: Array) -> Array:
     """Lift (x, y, yaw) to (4, 4)."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    out = np.eye(4)
+    out = _IDENTITY.copy()
     out[:2, :2] = [[cos, -sin], [sin, cos]]
     out[:2, 3] = pose[:2]
     return out
@@ -132,8 +134,8 @@ def rotation_of(rotvec: Array) -> Array:
     angle = math.hypot(x, y, z)
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     if angle < 1e-9:
-        return np.asarray(np.eye(3) + K)
-    return np.asarray(np.eye(3) + math.sin(angle) / angle * K + (1.0 - math.cos(angle)) / angle**2 * K @ K)
+        return np.asarray(_IDENTITY[:3, :3] + K)
+    return np.asarray(_IDENTITY[:3, :3] + math.sin(angle) / angle * K + (1.0 - math.cos(angle)) / angle**2 * K @ K)
 
 
 def wrenches(arm: Array, direction: Array) -> Array:
