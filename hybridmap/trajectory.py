@@ -104,12 +104,12 @@ class Anchors:
 
 
 def anchors_on(poses: Array, stamps_ns: NDArray[np.int64], nodes: NDArray[np.int64], deltas: Array) -> Anchors:
-    """Make the anchors of poses that were measured on a map.
+    """Tie robot poses, measured on a map, to the nodes before and after each, so that they move with these nodes.
 
     Args:
-        poses: (N, 3) of the nodes on that map, m and rad.
-        stamps_ns: (S,) int64, increasing.
-        nodes: (S,) int64, the last node before each stamp.
+        poses: (N, 3) of the map's nodes at the time of the measurement, m and rad.
+        stamps_ns: (S,) int64, of the robot poses, increasing.
+        nodes: (S,) int64, number of the last node before each stamp.
         deltas: (S, 3) pose of the robot in the frame of that node, m and rad.
     """
     after = np.minimum(nodes + 1, len(poses) - 1)

@@ -214,7 +214,7 @@ def passed(checks: Sequence[Check]) -> bool:
 
 
 def verdict(checks: Sequence[Check], lack: Lack | None) -> Status:
-    """Status of an edge with these checks and this lack: rejected, pending or accepted."""
+    """Status of an edge: rejected if a check failed or support is lacking for good, pending if it still waits for support."""
     if lack not in (None, Lack.WAITING) or not passed(checks):
         return Status.REJECTED
     return Status.ACCEPTED if lack is None else Status.PENDING

@@ -202,7 +202,7 @@ def convergence(rows: Sequence[Row]) -> str:
     if not ways:
         return ""
     looks = _looks(rows)
-    with style.figure(style.PAGE_WIDTH_IN, 4.0) as picture:
+    with style.figure(style.PAGE_WIDTH_IN, 3.6 + 0.25 * np.ceil(len(traced) / 4)) as picture:
         panels = picture.subplots(1, len(ways), squeeze=False).ravel()
         for axes, way in zip(panels, ways, strict=True):
             for row in traced:

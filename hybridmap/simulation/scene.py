@@ -127,7 +127,8 @@ class TextureAtlas:
     Attributes:
         image: (H, W, 3) uint8, RGB.
         levels: (S,) int32, number of resolutions of each surface.
-        places: (S * L, 4) float32: left, top, width - 1, height - 1 in texels of surface s at resolution l in row s * L + l.
+        places: (S * L, 4) float32, L being the largest number of resolutions: left, top, width - 1 and height - 1, texels, of
+            surface s at resolution l (0 is the finest) in row s * L + l.
     """
 
     image: Image

@@ -116,7 +116,13 @@ class HeadDirectionResult:
 
 
 def head_direction(seed: np.random.SeedSequence, settings: dict[str, object], steps: int) -> HeadDirectionResult:
-    """Turn a head-direction ring of each floating-point precision by the same random turns; compare with their exact sum."""
+    """Turn a ring of head-direction cells by random turns, in float32 and in float64; compare its heading with their sum.
+
+    Args:
+        seed: of the turns.
+        settings: the section `neural` of a configuration.
+        steps: number of turns.
+    """
     turns = np.random.default_rng(seed).normal(0.002, 0.02, steps)
     cells = NeuralConfig.model_validate(settings).head_direction_cells
     errors = {}

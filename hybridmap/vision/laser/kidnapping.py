@@ -263,7 +263,10 @@ class GlobalLocalisation:
         return self._relocaliser.dismiss()
 
     def search(self, node: int, belief: Belief) -> Settlement:
-        """While the robot is lost, register its last metres to the whole map: first at each node, later less often."""
+        """While the robot is lost, register its last metres to the whole map: just after the loss at every call, later not.
+
+        Call it at each node. The settlement is empty if the robot is not lost, or if this node is skipped.
+        """
         if not self._whereabouts.lost or not self._due(node):
             return Settlement([])
         self._searched_m = self._atlas.travel_m[node]

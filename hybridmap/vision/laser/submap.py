@@ -105,7 +105,13 @@ class Atlas:
         return len(self.clouds)
 
     def add(self, cloud: Cloud, ranges_m: NDArray[np.float32], pose: Array, scatter: Array) -> None:
-        """Append a node: its scan, its pose (3,) by scan matching, and the covariance (3, 3) of that relative to its submap."""
+        """Append a node.
+
+        Args:
+            cloud, ranges_m: its scan, as points and as measured.
+            pose: (3,) in the frame of node 0, by scan matching from node to node, m and rad.
+            scatter: (3, 3) covariance of its pose relative to the submap to which it was registered, m^2 and rad^2.
+        """
         step = float(np.hypot(*(pose - self.chain[-1])[:2])) if self.chain else 0.0
         self.travel_m.append(self.travel_m[-1] + step if self.travel_m else 0.0)
         self.clouds.append(cloud)
