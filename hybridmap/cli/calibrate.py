@@ -24,8 +24,7 @@ def calibrate(
     leg: Annotated[
         float | None,
         typer.Option(
-            help="Length of the pieces of the drive that are compared, 0.1 m or more; not with `joint`. "
-            "Default: a sixteenth of the drive, 1 to 16 m."
+            help="Pieces of the drive of this length, m, are compared; not with `joint`. Default: 1/16 of it, 1 to 16 m."
         ),
     ] = None,
     out: Annotated[
