@@ -14,7 +14,7 @@ _SHOWN = ("nodes", "loops_accepted", "travel", "duration", "largest_correction",
 
 def demo(
     out: Annotated[Path, typer.Option(help="Session folder to write.")] = Path("hybridmap-demo"),
-    world: Annotated[str, typer.Option(help="World to simulate: lab, office, corridor or corridor-landmarks.")] = "lab",
+    world: Annotated[str, typer.Option(help="World to simulate: lab, office, corridor, corridor-landmarks or campus.")] = "lab",
     seed: Annotated[int, typer.Option(help="Random seed of the drive and its noise.", min=0)] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,

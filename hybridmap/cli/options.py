@@ -12,7 +12,7 @@ Source = Annotated[
     str,
     typer.Argument(
         help="Recording (.bag, .mcap or .db3 file, ROS 2 bag folder, TUM folder, .csv) "
-        "or simulated world: lab, office, corridor, corridor-landmarks."
+        "or simulated world: lab, office, corridor, corridor-landmarks, campus."
     ),
 ]
 Topic = Annotated[

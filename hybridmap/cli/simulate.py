@@ -20,7 +20,7 @@ _FORMAT_OF_SUFFIX: dict[str, Format] = {".bag": "rosbag1", ".mcap": "mcap", ".db
 
 
 def simulate(
-    world: Annotated[str, typer.Argument(help="World: lab, office, corridor or corridor-landmarks.")],
+    world: Annotated[str, typer.Argument(help="World: lab, office, corridor, corridor-landmarks or campus (outdoors).")],
     out: Annotated[
         Path,
         typer.Option(
@@ -32,7 +32,9 @@ def simulate(
         str | None,
         typer.Option(help="Configuration: a name (an unknown one gives the list) or a YAML file. Default: that of the world."),
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Random seed of the sensor errors.", min=0)] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Random seed of the sensor errors, and of the layout of campus.", min=0)
+    ] = None,
     duration: Annotated[float | None, typer.Option(help="Stop the drive after this many seconds.")] = None,
     kidnap: Annotated[
         bool,
@@ -41,6 +43,10 @@ def simulate(
             help="Kidnap the robot: carry it 20 m (simulation.carried_m) to a visited place while its sensors are off.",
         ),
     ] = False,
+    clock_offset: Annotated[
+        float | None,
+        typer.Option(help="Seconds by which scans and frames are stamped later than odometry (simulation.clock_offset_s)."),
+    ] = None,
     setting: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. simulation.sensors=laser. Keys: docs/configuration.md.")
     ] = None,
@@ -55,6 +61,7 @@ def simulate(
     _check_world(world)
     chosen = format_ or _FORMAT_OF_SUFFIX.get(out.suffix.lower(), "tum")
     overrides: dict[str, Any] = {"simulation.world": world, "simulation.duration_s": duration, "seed": seed}
+    overrides["simulation.clock_offset_s"] = clock_offset
     if kidnap:
         overrides["simulation.carried_m"] = CARRIED_M
     overrides = {key: value for key, value in overrides.items() if value is not None} | parse_settings(setting)

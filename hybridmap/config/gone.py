@@ -8,7 +8,8 @@ from typing import Any
 
 # section, module, keys: each key is now the constant KEY in the module (`key:NAME` where it has another name)
 _CONSTANTS = """
-simulation simulation/stream.py speed_m_s turn_rate_rad_s odometry_rate_hz
+simulation simulation/surfaces.py speed_m_s
+simulation simulation/stream.py turn_rate_rad_s odometry_rate_hz
 simulation.wheels simulation/motion.py translation_m_per_sqrt_m rotation_deg_per_sqrt_m rotation_per_turn
 simulation.wheels simulation/motion.py slips_per_m slip_m slip_deg
 simulation.camera simulation/sensor_models.py forward_m:CAMERA_FORWARD_M height_m:CAMERA_HEIGHT_M

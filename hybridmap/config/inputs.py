@@ -170,7 +170,7 @@ class SimulationConfig(Section):
     """The simulated world and drive, the robot's sensors, and their noise."""
 
     world: str = "lab"
-    """Name of the world and its drive: `lab`, `office`, `corridor` or `corridor-landmarks`."""
+    """Name of the world and drive: `lab`, `office`, `corridor`, `corridor-landmarks` or `campus` (outdoors; laser only)."""
     sensors: Literal["rgbd", "laser", "both"] = "rgbd"
     """Sensors of the robot besides its wheels."""
     noise: float = Field(default=1.0, ge=0, le=10)
@@ -182,6 +182,11 @@ class SimulationConfig(Section):
     odometry reports no motion and there are no frames. None: never.
 
     Watch: in a smaller world the distance is that of the farthest visited place.
+    """
+    clock_offset_s: float = Field(default=0.0, ge=-60, le=60)
+    """How much later scans and frames are stamped than odometry of the same moment, s; negative: earlier.
+
+    Watch: the ground truth has the clock of scans and frames.
     """
     wheels: WheelErrorConfig = WheelErrorConfig()
     """Errors of the wheel odometry."""

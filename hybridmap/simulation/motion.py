@@ -159,7 +159,8 @@ def carry(drive: Array, distance_m: float, step_s: float) -> KidnappedDrive:
     """Kidnap the robot: leave out a piece of a drive, so that it is carried to a place that it has visited before.
 
     The robot is picked up after the middle of the drive. It is put down at a pose of the rest of the drive that lies
-    `distance_m` from there and near a pose of the first half. If there is none, the most distant such pose is used.
+    `distance_m` from there, to a step of the drive, and near a pose of the first half. If all such poses are nearer, the most
+    distant one is used; if all are farther, the nearest.
 
     Args:
         drive: (N, 3) true poses, m and rad.
@@ -186,7 +187,15 @@ def carry(drive: Array, distance_m: float, step_s: float) -> KidnappedDrive:
         raise ConfigError(
             "simulation.carried_m: this drive visits no place twice, to which the robot could be carried; leave it out"
         )
-    return _cut(drive, *best, step_s)
+    return _cut(drive, best[0], _nearest_at(drive, *best, distance_m), step_s)
+
+
+def _nearest_at(drive: Array, start: int, end: int, distance_m: float) -> int:
+    """The first step since the moment tried before `end` that is this far from `start`, if it was seen before; else `end`."""
+    steps = np.arange(max(start + 2, end - _EVERY + 1), end + 1)
+    reached = steps[np.hypot(*(drive[steps, :2] - drive[start, :2]).T) >= distance_m]
+    near = [int(step) for step in reached if _seen_before(drive, int(step), len(drive) // 2)]
+    return near[0] if near else end
 
 
 def _onward(drive: Array) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

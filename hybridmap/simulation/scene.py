@@ -78,6 +78,8 @@ class Scene:
         normals: (S, 3) float32, unit normal of each surface, towards the painted side.
         px_per_m: (S,) float32, texels per metre.
         in_depth: (S,) bool, whether a depth camera sees the surface.
+        foliage_m: (S,) how far a laser beam goes on behind the surface at most, m.
+        walkers: people who move.
     """
 
     def __init__(self, world: World) -> None:
@@ -87,6 +89,8 @@ class Scene:
         self.normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
         self.px_per_m = np.array([s.px_per_m for s in surfaces], dtype=np.float32)
         self.in_depth = np.array([s.in_depth for s in surfaces])
+        self.foliage_m = np.array([s.foliage_m for s in surfaces])
+        self.walkers = world.walkers
         self._world = world
 
     @cached_property

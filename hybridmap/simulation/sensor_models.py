@@ -177,17 +177,41 @@ class LaserModel:
         self._noise = noise
         self.laser = laser_of(config)
 
-    def scan(self, stamp_ns: int, pose_world_base: Array, rng: np.random.Generator) -> LaserScan:
-        """The scan at a true pose (3,) of the robot, m and rad, with noise drawn from `rng`."""
+    def scan(self, stamp_ns: int, time_s: float, pose_world_base: Array, rng: np.random.Generator) -> LaserScan:
+        """Simulate one scan; its beams are all measured at once.
+
+        Args:
+            stamp_ns: stamp of the scan, ns.
+            time_s: time since the drive began, s; where people walk depends on it.
+            pose_world_base: (3,) true pose of the robot, m and rad.
+            rng: random generator for the noise of this scan.
+        """
         x, y, yaw = pose_world_base
         angle = self.laser.bearings_rad + yaw
         rays = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))]).astype(np.float32)
         origin = np.array([x + LASER_FORWARD_M * np.cos(yaw), y + LASER_FORWARD_M * np.sin(yaw), LASER_HEIGHT_M])
         hits = self._scene.cast(origin, rays)
         ranges = np.where(hits.hit, hits.length, np.inf).astype(np.float64)
+        ranges = np.minimum(ranges + self._foliage(hits, rng), self._people(origin[:2], rays[:, :2], time_s))
         ranges = ranges + self._noise * LASER_NOISE_M * rng.standard_normal(len(ranges))
         dropped = rng.random(len(ranges)) < self._noise * DROP_FRACTION
         return LaserScan(stamp_ns, self._valid(ranges.astype(np.float32), dropped))
+
+    def _foliage(self, hits: Hits, rng: np.random.Generator) -> Array:
+        """How far (B,), m, each beam goes on between leaves: any way up to the depth of what it meets."""
+        most = np.where(hits.hit, self._scene.foliage_m[hits.surface], 0.0)
+        return np.asarray(most * rng.random(len(most))) if most.any() else most
+
+    def _people(self, origin: Array, directions: NDArray[np.float32], time_s: float) -> Array:
+        """Distance (B,), m, at which each beam meets a person; infinite if it meets none."""
+        nearest = np.full(len(directions), np.inf)
+        for walker in self._scene.walkers:
+            away = walker.at(time_s) - origin
+            along = directions @ away
+            depth2 = walker.radius_m**2 - (away @ away - along**2)
+            met = (along > 0.0) & (depth2 > 0.0)
+            nearest[met] = np.minimum(nearest[met], along[met] - np.sqrt(depth2[met]))
+        return nearest
 
     def _valid(self, ranges: NDArray[np.float32], dropped: NDArray[np.bool_]) -> NDArray[np.float32]:
         inside = (ranges >= np.float32(self.laser.range_min_m)) & (ranges < np.float32(self.laser.range_max_m))

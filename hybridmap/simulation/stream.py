@@ -21,8 +21,8 @@ from hybridmap.trajectory import NS_PER_S, Trajectory
 if TYPE_CHECKING:
     from hybridmap.simulation.scene import Scene
 
-SPEED_M_S, TURN_RATE_RAD_S = 0.5, 0.8
-"""Cruising speed and fastest turn of the drives: a robot that moves among people."""
+TURN_RATE_RAD_S = 0.8
+"""Fastest turn of the drives: a robot that moves among people."""
 ODOMETRY_RATE_HZ = 30.0
 """Odometry messages a second."""
 _START_NS = 1_700_000_000 * NS_PER_S
@@ -32,8 +32,12 @@ _WHEELS, _CAMERA, _LASER = range(3)
 class SimulatedStream:
     """A drive through a simulated world, as a stream of odometry, camera frames and laser scans.
 
-    The drive and the world are the same for every seed; the seed determines the errors of the sensors. Samples are rounded to
-    the precision of bags and folders, so a recording of the stream reads back to the same bits.
+    The seed determines the errors of the sensors. Indoors the drive and the world are the same for every seed; the world
+    `campus` is another for each. Samples are rounded to the precision of bags and folders, so a recording of the stream reads
+    back to the same bits.
+
+    Scans, frames and the ground truth have the stamps of the moment they belong to. With `clock_offset_s` those of odometry are
+    that much earlier: scans and frames are late against it.
     """
 
     def __init__(self, config: SimulationConfig, seed: int) -> None:
@@ -41,17 +45,23 @@ class SimulatedStream:
 
         Args:
             config: world, drive, sensors.
-            seed: of the sensors' errors.
+            seed: of the sensors' errors, and of a world that is drawn by chance.
 
         Raises:
-            ConfigError: there is no such world, or no visited place in it to which the robot could be kidnapped.
+            ConfigError: there is no such world, no visited place in it to which the robot could be kidnapped, or nothing in it
+                for the camera that is asked for.
         """
         self._config = config
         self._seed = seed
-        self._world: World = build_world(config.world)
+        self._world: World = build_world(config.world, seed)
+        if self._world.laser_only and config.sensors != "laser":
+            raise ConfigError(
+                f"simulation.sensors: found {config.sensors!r}, but {config.world} has nothing for a camera to see; "
+                f"expected laser"
+            )
         self._report = StreamReport()
         step_s = 1.0 / ODOMETRY_RATE_HZ
-        truth = felt = drive(self._world.legs, DriveLimits(SPEED_M_S, TURN_RATE_RAD_S), step_s)
+        truth = felt = drive(self._world.legs, DriveLimits(self._world.speed_m_s, TURN_RATE_RAD_S), step_s)
         self._carry = None if config.carried_m is None else carry(truth, config.carried_m, step_s)
         if self._carry is not None:
             truth, felt = self._carry.truth, self._carry.felt
@@ -59,7 +69,8 @@ class SimulatedStream:
         count = len(truth) if config.duration_s is None else max(3, int(config.duration_s * ODOMETRY_RATE_HZ) + 1)
         stamps = _stamps_ns(len(truth), ODOMETRY_RATE_HZ)[:count]
         self._truth = Trajectory(stamps, np.column_stack([truth[:, :2], as_transmitted(truth[:, 2])])[:count])
-        self._odometry = Trajectory(stamps, odometry[:count])
+        late_ns = round(config.clock_offset_s * NS_PER_S)
+        self._odometry = Trajectory(stamps - late_ns, odometry[:count])
         if self._carry is not None and self._carry.last >= count:
             raise ConfigError(
                 f"simulation.carried_m: the robot is put down again after {self._carry.last * step_s:.1f} s, "
@@ -82,12 +93,12 @@ class SimulatedStream:
 
     @property
     def groundtruth(self) -> Trajectory:
-        """True poses of `base_link` in the world at the stamps of the odometry."""
+        """True poses of `base_link` in the world, one for each odometry message; on the clock of scans and frames."""
         return self._truth
 
     @property
     def odometry(self) -> Trajectory:
-        """Wheel odometry of the whole drive: poses of `base_link` in `odom`."""
+        """Wheel odometry of the whole drive: poses of `base_link` in `odom`, on the clock of the wheels."""
         return self._odometry
 
     @property
@@ -131,13 +142,13 @@ class SimulatedStream:
         due = [(int(stamp), 0, index) for index, stamp in enumerate(self._frame_stamps)]
         due += [(int(stamp), 1, index) for index, stamp in enumerate(self._scan_stamps)]
         for stamp, kind, index in sorted(due):
-            pose = self._true_pose(stamp)
+            pose, time_s = self._true_pose(stamp), (stamp - _START_NS) / NS_PER_S
             if kind == 0:
                 self._report.count("frames")
-                yield camera.frame(stamp, (stamp - _START_NS) / NS_PER_S, pose, frame_noise[index])
+                yield camera.frame(stamp, time_s, pose, frame_noise[index])
             else:
                 self._report.count("scans")
-                yield laser.scan(stamp, pose, scan_noise[index])
+                yield laser.scan(stamp, time_s, pose, scan_noise[index])
 
     def _true_pose(self, stamp_ns: int) -> Array:
         return np.asarray(self._truth.at([stamp_ns])[0])

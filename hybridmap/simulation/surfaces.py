@@ -16,6 +16,8 @@ Paint = Callable[[np.random.Generator, tuple[int, int], float], NDArray[np.uint8
 
 UP: Array = np.array([0.0, 0.0, 1.0])
 DOOR_HEIGHT_M = 2.05
+SPEED_M_S = 0.5
+"""Cruising speed indoors: a robot that moves among people."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,6 +33,7 @@ class Facet:
         glow: light given off, arbitrary unit; 0 for all but lamps and windows.
         decal: whether it is so thin that it casts no shadow (posters, doors).
         in_depth: whether a depth camera sees it (not glass and screens).
+        foliage_m: how far a laser beam goes on behind it at most, m, by chance: the leaves of a hedge; 0: a solid face.
     """
 
     corner: Array
@@ -41,23 +44,54 @@ class Facet:
     glow: float = 0.0
     decal: bool = False
     in_depth: bool = True
+    foliage_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Walker:
+    """A person who walks to and fro between two points, seen by the laser as an upright cylinder.
+
+    Attributes:
+        start, end: (2,) the two points, m.
+        speed_m_s: walking speed.
+        radius_m: radius of the cylinder.
+        ahead_m: way that the person has walked when the drive begins.
+    """
+
+    start: Array
+    end: Array
+    speed_m_s: float
+    radius_m: float
+    ahead_m: float
+
+    def at(self, time_s: float) -> Array:
+        """Position (2,), m, some time after the beginning of the drive."""
+        length = float(np.linalg.norm(self.end - self.start))
+        walked = (self.ahead_m + self.speed_m_s * time_s) % (2.0 * length)
+        return np.asarray(self.start + (self.end - self.start) * (min(walked, 2.0 * length - walked) / length))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """A furnished building and the drive through it.
+    """Surroundings and the drive through them.
 
     Attributes:
         name: name of the world on the command line.
         surfaces: every surface that a sensor can see.
         legs: way points (N, 2), m, of each piece of the drive; between pieces the robot stops and turns on the spot.
         texture_seed: seed of the textures, independent of the seed of the sensor noise.
+        walkers: people who move; only a laser sees them.
+        speed_m_s: cruising speed of the drive.
+        laser_only: whether there is nothing for a camera to see: no ground, no textures.
     """
 
     name: str
     surfaces: tuple[Facet, ...]
     legs: tuple[Array, ...]
     texture_seed: int = 1
+    walkers: tuple[Walker, ...] = ()
+    speed_m_s: float = SPEED_M_S
+    laser_only: bool = False
 
 
 def _direction(yaw_rad: float) -> Array:
@@ -73,6 +107,7 @@ def box(
     yaw_deg: float = 0.0,
     faces: Mapping[str, Paint] | None = None,
     px_per_m: float = 100.0,
+    foliage_m: float = 0.0,
 ) -> list[Facet]:
     """Surfaces of an upright box.
 
@@ -84,6 +119,7 @@ def box(
         yaw_deg: direction of its own x axis.
         faces: paints of `front` (+x), `back`, `left` (+y), `right`, `top`, `bottom`.
         px_per_m: texels per metre.
+        foliage_m: how far a laser beam gets into it at most, m.
     """
     ex = _direction(np.deg2rad(yaw_deg)) * size[0]
     ey = _direction(np.deg2rad(yaw_deg + 90.0)) * size[1]
@@ -100,7 +136,7 @@ def box(
     if bottom_m <= 0.0:
         del rectangles["bottom"]
     paints = faces or {}
-    return [Facet(*edges, paints.get(name, paint), px_per_m) for name, edges in rectangles.items()]
+    return [Facet(*edges, paints.get(name, paint), px_per_m, foliage_m=foliage_m) for name, edges in rectangles.items()]
 
 
 def panel(

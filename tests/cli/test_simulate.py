@@ -12,6 +12,7 @@ from hybridmap.config import Config
 from hybridmap.evaluate.association import travel
 from hybridmap.simulation import world_names
 from hybridmap.streams import open_stream
+from hybridmap.streams.base import SelfMotion
 from hybridmap.streams.laser import LaserScan
 from tests.narrowing import known
 
@@ -49,6 +50,14 @@ def test_a_named_format_makes_a_bag_folder(run, tmp_path):
     assert sorted(file.name for file in (tmp_path / "bag").iterdir()) == ["bag.mcap", "metadata.yaml"]
 
 
+def test_a_clock_offset_reaches_the_recording(run, tmp_path):
+    arguments = ["--set", "simulation.sensors=laser", "--duration", "3", "--clock-offset", "0.25"]
+    assert run("simulate", "corridor", "--out", str(tmp_path / "late.mcap"), *arguments)[0] == 0
+    samples = list(open_stream(tmp_path / "late.mcap", Config()))
+    first = {type(sample): sample.stamp_ns for sample in reversed(samples)}
+    assert first[LaserScan] - first[SelfMotion] == 250_000_000
+
+
 def test_settings_and_seed_reach_the_stream(run, tmp_path):
     for seed in ("1", "2"):
         code, _, _ = run(
@@ -67,7 +76,7 @@ def test_settings_and_seed_reach_the_stream(run, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["atlantis"], "atlantis: no such world; worlds: lab, office, corridor, corridor-landmarks"),
+        (["atlantis"], "atlantis: no such world; worlds: lab, office, corridor, corridor-landmarks, campus"),
         (["corridor", "--duration", "-1"], "simulation.duration_s"),
         (["corridor", "--set", "simulation.sensors=sonar"], "simulation.sensors"),
         (["corridor", "--set", "simulation.sensors=laser"], "no camera; write a bag"),

@@ -49,6 +49,20 @@ def test_where_the_world_is_smaller_it_is_carried_as_far_as_there_is_a_known_pla
     assert 5.0 < stream("lab").carry.distance_m < 10.0
 
 
+@pytest.mark.parametrize("world", ["lab", "office"])
+@pytest.mark.parametrize("distance_m", [0.3, 0.5, 1.0, 1.5, 2.0, 3.0])
+def test_it_can_be_carried_any_distance(world, distance_m):
+    camera = CameraConfig(width_px=32, height_px=24, rate_hz=0.5)
+    carried = SimulatedStream(SimulationConfig(world=world, carried_m=distance_m, camera=camera), 3)
+    carry = carried.carry
+    assert carry is not None
+    assert carry.distance_m == pytest.approx(distance_m, abs=0.02)
+    last = carried.groundtruth.poses[carry.last]
+    before = carried.groundtruth.poses[: carry.first // 2]
+    near = np.hypot(*(before[:, :2] - last[:2]).T) < 0.5
+    assert np.any(np.abs(wrap_angle(before[near, 2] - last[2])) < 0.4)
+
+
 def test_until_it_is_picked_up_it_is_the_same_drive():
     whole, carried = SimulatedStream(SimulationConfig(world="lab"), 3), stream("lab")
     first = carried.carry.first

@@ -113,7 +113,7 @@ def test_laser_measures_the_corridor(monkeypatch):
     np.testing.assert_array_equal(bearings, bearings[0] + np.arange(180) * np.float64(np.float32(np.pi / 179)))
     errors = []
     for seed in range(20):
-        ranges = model.scan(0, np.array([9.0, 1.0, 0.0]), np.random.default_rng(seed)).ranges_m
+        ranges = model.scan(0, 0.0, np.array([9.0, 1.0, 0.0]), np.random.default_rng(seed)).ranges_m
         assert ranges.dtype == np.float32
         y = ranges * np.sin(bearings)
         errors.append(np.where(bearings > 0, y - 1.4, y + 1.0) / np.abs(np.sin(bearings)))

@@ -91,7 +91,7 @@ def test_sensors_that_were_not_asked_for_are_absent():
 
 
 def test_an_unknown_world_names_those_that_there_are():
-    with pytest.raises(ConfigError, match=r"atlantis.*lab, office, corridor, corridor-landmarks"):
+    with pytest.raises(ConfigError, match=r"atlantis.*lab, office, corridor, corridor-landmarks, campus"):
         short(world="atlantis")
 
 
@@ -110,7 +110,7 @@ def test_drives_keep_to_their_world_and_length(world, travel_m, extent_m):
 
 @pytest.mark.parametrize("world", world_names())
 def test_drives_come_back_to_old_places_with_the_same_heading(world):
-    poses = SimulatedStream(SimulationConfig(world=world), 0).groundtruth.poses
+    poses = SimulatedStream(SimulationConfig(world=world, sensors="laser"), 0).groundtruth.poses
     last = poses[-1]
     earlier = poses[: len(poses) // 2]
     near = np.hypot(*(earlier[:, :2] - last[:2]).T) < 0.3
@@ -119,7 +119,7 @@ def test_drives_come_back_to_old_places_with_the_same_heading(world):
 
 @pytest.mark.parametrize("world", world_names())
 def test_the_robot_never_touches_the_furniture(world):
-    stream = SimulatedStream(SimulationConfig(world=world), 0)
+    stream = SimulatedStream(SimulationConfig(world=world, sensors="laser"), 0)
     from hybridmap.simulation.scene import Caster
 
     caster = Caster(build_world(world).surfaces)
@@ -129,6 +129,17 @@ def test_the_robot_never_touches_the_furniture(world):
         start = np.column_stack([stream.groundtruth.poses[::15, :2], np.full(len(stream.groundtruth.poses[::15]), height_m)])
         rays = np.concatenate(np.broadcast_arrays(start[:, None], around[None]), axis=-1).astype(np.float32)
         assert caster.cast(rays).length.min() > 0.28
+
+
+def test_a_late_clock_moves_the_odometry_against_everything_else():
+    on_time, late = short(), short(clock_offset_s=0.21)
+    np.testing.assert_array_equal(on_time.groundtruth.stamps_ns, late.groundtruth.stamps_ns)
+    np.testing.assert_array_equal(on_time.odometry.stamps_ns - late.odometry.stamps_ns, 210_000_000)
+    np.testing.assert_array_equal(on_time.odometry.poses, late.odometry.poses)
+    views = [[s for s in stream if not isinstance(s, SelfMotion)] for stream in (on_time, late)]
+    assert fingerprint(views[0]) == fingerprint(views[1])
+    stamps = [sample.stamp_ns for sample in late]
+    assert stamps == sorted(stamps)
 
 
 def test_the_drive_keeps_to_its_limits():

@@ -78,6 +78,13 @@ def test_scans_read_back_to_the_same_bits(name, laser_stream, tmp_path):
     assert_same_drive(tmp_path / name, laser_stream)
 
 
+@pytest.mark.parametrize("offset_s", [-0.11, 0.11])
+def test_a_late_clock_reads_back_to_the_same_bits(offset_s, tmp_path):
+    config = SimulationConfig(world="corridor", duration_s=2.0, sensors="laser", clock_offset_s=offset_s)
+    write_rosbag2(SimulatedStream(config, 4), tmp_path / "drive.mcap")
+    assert_same_drive(tmp_path / "drive.mcap", SimulatedStream(config, 4))
+
+
 @pytest.mark.parametrize("name", ["drive.bag", "folder-of-pictures"])
 def test_the_same_drive_gives_the_same_files(name, stream, tmp_path):
     contents = []

@@ -12,7 +12,9 @@ _BUILDERS: dict[str, tuple[str, str]] = {
     "office": ("office", "office"),
     "corridor": ("corridor", "corridor"),
     "corridor-landmarks": ("corridor", "corridor_landmarks"),
+    "campus": ("campus", "campus"),
 }
+_BY_CHANCE = frozenset({"campus"})
 
 
 def world_names() -> tuple[str, ...]:
@@ -20,8 +22,12 @@ def world_names() -> tuple[str, ...]:
     return tuple(_BUILDERS)
 
 
-def build_world(name: str) -> World:
+def build_world(name: str, seed: int = 0) -> World:
     """Build a world.
+
+    Args:
+        name: one of `world_names()`.
+        seed: of the layout of a world that is drawn by chance (`campus`); the others are always the same.
 
     Raises:
         ConfigError: there is none of that name.
@@ -29,5 +35,6 @@ def build_world(name: str) -> World:
     if name not in _BUILDERS:
         raise ConfigError(f"simulation.world: no world called {name!r}; there are {', '.join(_BUILDERS)}")
     module, function = _BUILDERS[name]
-    world: World = getattr(import_module(f"{__name__}.{module}"), function)()
+    build = getattr(import_module(f"{__name__}.{module}"), function)
+    world: World = build(seed) if name in _BY_CHANCE else build()
     return world

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from heapq import merge
 from pathlib import Path
 from typing import Any, Literal
 
 from hybridmap.errors import StreamError
 from hybridmap.output import staged
 from hybridmap.simulation.writers.messages import (
+    ODOM_FRAME,
     RECORDING,
     TF_TYPE,
     WORLD_FRAME,
@@ -17,7 +19,7 @@ from hybridmap.simulation.writers.messages import (
     silent,
     twist_between,
 )
-from hybridmap.streams.base import SelfMotion, Stream
+from hybridmap.streams.base import Sample, SelfMotion, Stream
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
 
@@ -32,6 +34,8 @@ _TYPES = {
     CAMERA_INFO: "sensor_msgs/msg/CameraInfo",
     SCAN: "sensor_msgs/msg/LaserScan",
 }
+_PARENTS = {ODOMETRY: ODOM_FRAME, TRUTH: WORLD_FRAME}
+_ORDER = (ODOMETRY, TRUTH, "")
 _TF_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
 _SUFFIXES = {"mcap": ".mcap", "sqlite3": ".db3"}
 _Written = tuple[str, int, Any]
@@ -135,25 +139,20 @@ def _record(
 
 
 def _messages(stream: Stream, make: MessageFactory, progress: Progress) -> Iterator[_Written]:
-    """Topic, stamp and message of every sample: first the mounting, and the ground truth after each odometry."""
-    truth, total = stream.groundtruth, stream.expected_observations
+    """Topic, stamp and message of every sample and of the ground truth, in order of stamp; first the mounting."""
+    total = stream.expected_observations
     camera, laser = (stream.rig.sensors.get(name) for name in ("camera", "laser"))
-    true_pose = {} if truth is None else dict(zip(truth.stamps_ns.tolist(), truth.poses, strict=True))
     before: dict[str, SelfMotion] = {}
     mounted = False
     done = 0
-    for sample in stream:
+    for topic, sample in _with_truth(stream):
         stamp = sample.stamp_ns
         if not mounted:
             mounted = True
             yield TF_STATIC, stamp, make.mounting(stamp, camera, laser)
         if isinstance(sample, SelfMotion):
-            yield ODOMETRY, stamp, make.odometry(sample, twist_between(before.get(ODOMETRY), sample))
-            before[ODOMETRY] = sample
-            if stamp in true_pose:
-                real = SelfMotion(stamp, true_pose[stamp])
-                yield TRUTH, stamp, make.odometry(real, twist_between(before.get(TRUTH), real), WORLD_FRAME)
-                before[TRUTH] = real
+            yield topic, stamp, make.odometry(sample, twist_between(before.get(topic), sample), _PARENTS[topic])
+            before[topic] = sample
             continue
         if isinstance(sample, RgbdFrame) and camera is not None:
             yield COLOR, stamp, make.color(sample)
@@ -165,6 +164,15 @@ def _messages(stream: Stream, make: MessageFactory, progress: Progress) -> Itera
             raise StreamError(f"{stream.name}: a bag holds poses, frames and scans; found {type(sample).__name__}")
         done += 1
         progress(done, total)
+
+
+def _with_truth(stream: Stream) -> Iterator[tuple[str, Sample]]:
+    """The samples of a stream and its true poses by stamp, each with its topic; at equal stamps odometry, truth, views."""
+    truth = stream.groundtruth
+    poses = [] if truth is None else zip(truth.stamps_ns.tolist(), truth.poses, strict=True)
+    true_poses = ((TRUTH, SelfMotion(stamp, pose)) for stamp, pose in poses)
+    samples = ((ODOMETRY if isinstance(sample, SelfMotion) else "", sample) for sample in stream)
+    return merge(samples, true_poses, key=lambda written: (written[1].stamp_ns, _ORDER.index(written[0])))
 
 
 def _quality(topic: str) -> list[Any]:
