@@ -26,8 +26,9 @@ from hybridmap.metrics import Metric, figure
 from hybridmap.store import MapStore
 from hybridmap.store.session_folder import SessionFolder
 from hybridmap.store.track import trajectory_of
-from hybridmap.streams.base import Observation, Stream
+from hybridmap.streams.base import Observation, Stream, StreamReport
 from hybridmap.trajectory import NS_PER_S
+from hybridmap.verdict import Facts, reasons_of, verdict_of
 
 log = logging.getLogger(__name__)
 
@@ -184,7 +185,10 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
                 folder.write_trajectory(name, trajectory_of(track, solution.poses))
             folder.write_trajectory(f"{name}_online", store.online(name))
     free = unobserved(mapper.map, mapper.poses())
+    reasons = reasons_of(facts_of(mapper, stream.report))
     head = {
+        "verdict": str(verdict_of(reasons)),
+        "reasons": [reason.to_json() for reason in reasons],
         "graph_hash": graph_hash(mapper.map),
         "primary_backend": mapper.backends.primary,
         "backends": list(mapper.backends.names),
@@ -194,10 +198,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
         "remarks": [
             *stream.report.remarks,
             *map(str, _gain_changes(mapper)),
-            *([str(free)] if free is not None and free.matters else []),
             *map(str, kidnappings(mapper.map)),
-            *_lost(mapper),
-            *_doubts(mapper),
         ],
     }
     metrics = _figures(mapper, recorder, float(track.stamps_ns[-1] - track.stamps_ns[0]) / NS_PER_S)
@@ -213,19 +214,17 @@ def _gain_changes(mapper: Mapper) -> list[GainChange]:
     return mapper.calibration.changes if mapper.calibration is not None else []
 
 
-def _lost(mapper: Mapper) -> list[str]:
-    """A remark if the robot was not localised at the end."""
-    if mapper.lost_since is None:
-        return []
-    rest = "lies where the odometry has it; the robot may have been kidnapped: its views there fit none before"
-    return [f"the map from node {mapper.lost_since} of {len(mapper.map)} on {rest}, and no loop since then says where it was"]
-
-
-def _doubts(mapper: Mapper) -> list[str]:
-    """A remark if rejected loops put the primary back-end's map in doubt."""
-    solution = mapper.backends.solutions.get(mapper.backends.primary)
-    doubt = solution.report.doubt if solution is not None else ""
-    return [f"{mapper.backends.primary}: {doubt}"] if doubt else []
+def facts_of(mapper: Mapper, report: StreamReport) -> Facts:
+    """What the verdict on a finished drive is made from."""
+    primary = mapper.backends.primary
+    return Facts.of_drive(
+        mapper.map,
+        mapper.backends.solutions.get(primary),
+        primary,
+        failure=mapper.backends.failures.get(primary, ""),
+        lost_since=mapper.lost_since,
+        lost=report.lost,
+    )
 
 
 def _weak(name: str, report: SolveReport) -> list[Metric]:

@@ -111,10 +111,11 @@ def test_scans_between_nodes_are_put_right_on_the_final_map(finished, tmp_path):
 
 def test_a_drive_that_ends_lost_says_so(tmp_path, monkeypatch):
     lost = session.run(RoomDrive(laps=0.2), Config.load("laser", OVERRIDES), tmp_path / "known")
-    assert lost.head["remarks"] == []
+    assert (lost.head["verdict"], lost.head["reasons"]) == ("trusted", [])
     monkeypatch.setattr(LaserFrontEnd, "lost_since", 3)
     lost = session.run(RoomDrive(laps=0.2), Config.load("laser", OVERRIDES), tmp_path / "lost")
-    assert [remark[:24] for remark in lost.head["remarks"]] == ["the map from node 3 of 4"]
+    assert lost.head["verdict"] == "doubtful"
+    assert [(reason["kind"], reason["node"]) for reason in lost.head["reasons"]] == [("not localised", 3)]
 
 
 def test_a_session_is_not_overwritten_by_chance_but_on_demand(tmp_path):

@@ -130,10 +130,12 @@ class Solution:
     Attributes:
         poses: (N, 3) poses in the map frame, m and rad; node 0 keeps its pose of the graph's `initial`.
         report: how the solution was reached.
+        calibrated: the graph with the odometry as the back-end calibrated it; None if it did not. It is not stored.
     """
 
     poses: Array
     report: SolveReport
+    calibrated: PoseGraph | None = None
 
 
 class SupportsPoseGraph(Protocol):

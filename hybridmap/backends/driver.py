@@ -236,7 +236,7 @@ class Driver:
             hanging_nodes=hanging,
             figures=outcome.figures,
         )
-        return Solution(outcome.poses, report)
+        return Solution(outcome.poses, report, outcome.calibrated)
 
 
 def replay(backend: Backend, graph: PoseGraph) -> Iterator[Solution]:

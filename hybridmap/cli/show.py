@@ -26,7 +26,7 @@ def emit(head: dict[str, Any], metrics: Iterable[Metric], *, as_json: bool, titl
     """Print results on standard output: one JSON object, or tables with units and the remarks of the run.
 
     Args:
-        head: facts about the run; in a table only its `remarks` are shown.
+        head: facts about the run; below a table only its `remarks`, `reasons` and `verdict` are shown.
         metrics: the values to print.
         as_json: print JSON.
         title: title of the tables.
@@ -48,8 +48,11 @@ def emit(head: dict[str, Any], metrics: Iterable[Metric], *, as_json: bool, titl
         console.print(_plain_table(plain))
     if columns:
         console.print(_table_by_backend([row for row in rows if row not in plain], columns))
-    for remark in head.get("remarks", ()):
-        console.print(f"note: {remark}", soft_wrap=True, markup=False, highlight=False)
+    lines = [f"note: {remark}" for remark in head.get("remarks", ())]
+    lines += [f"reason: {reason['words']}" for reason in head.get("reasons", ())]
+    lines += [f"verdict: {head['verdict']}"] if "verdict" in head else []
+    for line in lines:
+        console.print(line, soft_wrap=True, markup=False, highlight=False)
 
 
 def print_title(console: Console, title: str) -> None:

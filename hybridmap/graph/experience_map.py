@@ -105,6 +105,8 @@ class ExperienceMap:
     def update_edge(self, number: int, edge: Edge) -> None:
         """Replace an edge by a later measurement or decision; an accepted edge that is replaced by a rejected one is retracted.
 
+        A retracted edge keeps its measurement if the rejected one has none: it is what the edge claimed while in the graph.
+
         Raises:
             GraphError: the new edge joins other nodes, or is accepted without a measurement.
         """
@@ -114,7 +116,8 @@ class ExperienceMap:
                 f"map: edge {number} joins {before.source} -> {before.target}, found {edge.source} -> {edge.target}"
             )
         if edge.status is Status.REJECTED and before.status in (Status.ACCEPTED, Status.RETRACTED):
-            edge = replace(edge, status=Status.RETRACTED)
+            relative = before.relative if edge.relative is None else edge.relative
+            edge = replace(edge, status=Status.RETRACTED, relative=relative)
         _require_measurement(edge)
         self._edges[number] = self._dated(edge)
         self._write(number)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,11 +99,6 @@ class Unobserved:
     direction_rad: float
     alike: float
 
-    @property
-    def matters(self) -> bool:
-        """Whether more than a tenth of the drive is known by odometry alone."""
-        return self.sliding_m + self.blind_m > 0.1 * self.travel_m
-
     def __str__(self) -> str:
         """One sentence that states these lengths."""
         parts = []
@@ -129,25 +124,53 @@ def unobserved(experiences: ExperienceMap, poses: Array) -> Unobserved | None:
     Returns:
         None if the map has no registrations at all.
     """
-    steps, registered = _by_target(experiences, EdgeKind.ODOMETRY), _by_target(experiences, EdgeKind.REGISTRATION)
-    accepted = {node: [e for e in edges if e.status is Status.ACCEPTED] for node, edges in registered.items()}
-    if not any(accepted.values()):
+    steps = list(_free_steps(experiences))
+    if all(step.blind for step in steps):
         return None
-    sliding, blind, total, axis = 0.0, 0.0, 0.0, 0.0 + 0.0j
-    for node in range(1, len(experiences)):
-        length = experiences.node(node).travel_m - experiences.node(node - 1).travel_m
-        total += length
-        edges = accepted.get(node, [])
-        if not edges:
-            blind += length
-            continue
-        direction = _free_direction(edges, steps.get(node, []))
-        if direction is not None:
-            sliding += length
-            axis += length * np.exp(2j * (direction + poses[node, 2]))
-    alike = float(abs(axis)) / sliding if sliding > 0 else 0.0
+    sliding = sum(step.length_m for step in steps if step.direction_rad is not None)
+    blind = sum(step.length_m for step in steps if step.blind)
+    turned = [
+        step.length_m * np.exp(2j * (step.direction_rad + poses[step.node, 2]))
+        for step in steps
+        if step.direction_rad is not None
+    ]
+    axis = complex(sum(turned))
+    alike = abs(axis) / sliding if sliding > 0 else 0.0
     mean = 0.5 * float(np.angle(axis)) if sliding > 0 else 0.0
-    return Unobserved(sliding, blind, total, mean, alike)
+    return Unobserved(sliding, blind, sum(step.length_m for step in steps), mean, alike)
+
+
+def free_lengths(experiences: ExperienceMap) -> Array:
+    """Path length (N,) to each node from the one before it where odometry alone knows the motion, m; elsewhere 0."""
+    free = np.zeros(len(experiences))
+    for step in _free_steps(experiences):
+        free[step.node] = step.length_m if step.blind or step.direction_rad is not None else 0.0
+    return free
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """The motion to a node from the one before it.
+
+    Attributes:
+        node: the node.
+        length_m: path length.
+        blind: whether nothing was registered.
+        direction_rad: direction in the node's frame that the registration leaves free; None if it leaves none.
+    """
+
+    node: int
+    length_m: float
+    blind: bool
+    direction_rad: float | None
+
+
+def _free_steps(experiences: ExperienceMap) -> Iterator[_Step]:
+    steps, registered = _by_target(experiences, EdgeKind.ODOMETRY), _by_target(experiences, EdgeKind.REGISTRATION)
+    for node in range(1, len(experiences)):
+        edges = [edge for edge in registered.get(node, []) if edge.status is Status.ACCEPTED]
+        free = _free_direction(edges, steps.get(node, [])) if edges else None
+        yield _Step(node, experiences.node(node).travel_m - experiences.node(node - 1).travel_m, not edges, free)
 
 
 def _by_target(experiences: ExperienceMap, kind: EdgeKind) -> dict[int, list[Edge]]:

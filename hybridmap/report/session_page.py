@@ -63,6 +63,8 @@ def _content(scene: SessionScene, store: MapStore) -> dict[str, Any]:
         "known_truth": scene.truth is not None,
         "saw_something": building is not None,
         "tiles": tiles(scene),
+        "verdict": scene.head.get("verdict"),
+        "reasons": [reason["words"] for reason in scene.head.get("reasons", ())],
         "remarks": _remarks(scene),
         "trajectories": trajectories_figure(scene, building),
         "graph": graph_figure(scene, building),

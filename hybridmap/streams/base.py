@@ -203,10 +203,12 @@ class StreamReport:
     Attributes:
         counts: name (`odometry`, `frames`, `unmatched color`, ...) -> number.
         remarks: choices and assumptions, for the user.
+        lost: topic or file -> (messages that cannot be read, messages in all), where some cannot.
     """
 
     counts: dict[str, int] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
+    lost: dict[str, tuple[int, int]] = field(default_factory=dict)
 
     def count(self, name: str, increment: int = 1) -> None:
         """Add `increment` to the count of this name."""

@@ -126,6 +126,8 @@ def _try_to_open(found: Inspection, source: str | Path, config: Config) -> None:
     found.remarks += getattr(stream, "remarks", [])
     losses: dict[str, int] = getattr(stream, "losses", {})
     found.problems += [f"{count} {name}" for name, count in losses.items() if count]
+    lost: dict[str, tuple[int, int]] = getattr(stream, "lost", {})
+    found.problems += [f"{name}: {gone} messages of {stated} cannot be read" for name, (gone, stated) in lost.items()]
     if truth is not None:
         found.remarks.append(f"ground truth: {len(truth)} poses")
 

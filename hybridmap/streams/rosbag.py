@@ -50,7 +50,8 @@ class BagStream:
         self._motion_ns, self._motion_poses = track.sorted(what, carry)
         self._plan_made = self._plan()
         self._planned, self.rig, self.losses = self._plan_made.planned, self._plan_made.rig, self._plan_made.losses
-        self.remarks += self._plan_made.remarks + self._lost_messages()
+        self.remarks += self._plan_made.remarks
+        self.lost = self._lost_messages()
         observation_ns = np.array([planned.stamp_ns for planned in self._planned], dtype=np.int64)
         check_overlap(self._motion_ns, observation_ns, str(path))
         self._apply(window or Window())
@@ -78,7 +79,7 @@ class BagStream:
         Raises:
             StreamError: a message is damaged; the message names topic and place.
         """
-        self.report = StreamReport(dict(self.losses), list(self.remarks))
+        self.report = StreamReport(dict(self.losses), list(self.remarks), self.lost)
         for sample in merge(self._motions(), self._observations()):
             self.report.count(kind_of(sample).counted if isinstance(sample, Observation) else "odometry")
             yield sample
@@ -132,11 +133,11 @@ class BagStream:
         self.remarks.append(f"no Odometry topic: self-motion from the transform {tracks[0].parent} -> {tracks[0].child}")
         return tracks[0], f"{self._bag.path}: transform {tracks[0].parent} -> {tracks[0].child}"
 
-    def _lost_messages(self) -> list[str]:
-        """A line for every used topic with fewer messages than the bag states: a sign of damage."""
+    def _lost_messages(self) -> dict[str, tuple[int, int]]:
+        """Topic -> (messages that cannot be read, messages that the bag states), for the used topics that lack some."""
         read, used = self._index.counts, frozenset(self.uses.values())
-        lost = [topic for topic in self._bag.topics if topic.name in used and read.get(topic.name, 0) < topic.count]
-        return [f"{topic.name}: {read.get(topic.name, 0)} messages of {topic.count} can be read" for topic in lost]
+        lacking = {topic.name: (topic.count - read.get(topic.name, 0), topic.count) for topic in self._bag.topics}
+        return {name: (gone, stated) for name, (gone, stated) in lacking.items() if gone > 0 and name in used}
 
     def _choose_base(self, track: PoseTrack) -> str:
         """The frame to map: the configured one, else the child frame of the odometry, else a usual name."""

@@ -24,6 +24,7 @@ from hybridmap.study.false_loops import Kind, with_drift, with_false_loops
 from hybridmap.study.frozen import Frozen
 from hybridmap.study.measures import KEPT, NEAR_M
 from hybridmap.study.model import BackendVariant, DriftConfig, backend_settings
+from hybridmap.verdict import Facts, reasons_of, verdict_of
 
 UNMAPPED, MAPPED = "unmapped", "mapped"
 """Status of a cell whose source gave no graph, and of one that is judged as its drive was mapped."""
@@ -159,6 +160,7 @@ def judge(own: PoseGraph, graph: PoseGraph, solution: Solution, reference: Array
         "chi2_own": _finite(chi2(own, solution.poses)),
         "chi2_odometry": _finite(solution.report.chi2_odometry),
         "unit_variance": _finite(solution.report.unit_variance),
+        "verdict": float(verdict_of(reasons_of(Facts.of_graph(graph, solution))).grade),
         "false_kept": float(np.count_nonzero(false & kept)),
         "own_lost": float(lost),
         "own_lost_percent": 100.0 * lost / own_loops if own_loops else None,

@@ -23,6 +23,7 @@ from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.gaps import grounded
 from hybridmap.mapper import Mapper
 from hybridmap.metrics import StageClock
+from hybridmap.session import facts_of
 from hybridmap.simulation import SimulatedStream
 from hybridmap.store.track import Track, trajectory_of
 from hybridmap.streams import open_stream
@@ -31,6 +32,7 @@ from hybridmap.study.disturb import KIDNAPPED, disturbed
 from hybridmap.study.frozen import Figures, Frozen, Mapped
 from hybridmap.study.measures import KEPT, WRONG_DEG, WRONG_M
 from hybridmap.trajectory import NS_PER_S, Trajectory, known_at, read_tum
+from hybridmap.verdict import reasons_of, verdict_of
 
 LIMITS = ClosureLimits(right_m=WRONG_M, right_deg=WRONG_DEG)
 
@@ -89,9 +91,10 @@ class MappedDrive:
         track = _track(mapper, updates)
         relations = relations_of(_there(self.relations), track.odometry) if self.relations else None
         reference = truth_at(truth, _stamps(mapper)) if truth is not None else np.full((graph.n_nodes, 3), np.nan)
+        verdict = verdict_of(reasons_of(facts_of(mapper, stream.report)))
         mapped = Mapped(
             mapper.backends.primary,
-            _figures(mapper, track, truth, relations, watch),
+            _figures(mapper, track, truth, relations, {**watch.figures(), "verdict": float(verdict.grade)}),
             _timings(clock.cpu_s["mapping"], float(track.stamps_ns[-1] - track.stamps_ns[0]) / NS_PER_S, views),
         )
         return Frozen(graph, reference, of_truth=truth is not None, mapped=mapped)
@@ -153,9 +156,9 @@ def _been_before(nodes: Array, down: int) -> NDArray[np.bool_]:
 
 
 def _figures(
-    mapper: Mapper, track: Track, truth: Trajectory | None, relations: Relations | None, watch: _Watch
+    mapper: Mapper, track: Track, truth: Trajectory | None, relations: Relations | None, of_primary: Figures
 ) -> Mapping[str, Figures]:
-    """Figures of odometry and of every back-end; None if not finite."""
+    """Figures of odometry and of every back-end, with those that are `of_primary`; None if not finite."""
     found: dict[str, dict[str, float | None]] = {}
     estimates = {name: trajectory_of(track, one.poses) for name, one in mapper.backends.solutions.items() if name != ODOMETRY}
     for name, estimate in ({ODOMETRY: track.odometry} | estimates).items():
@@ -163,7 +166,7 @@ def _figures(
         if name != ODOMETRY:
             figures |= _of_loops(mapper, mapper.backends.solutions[name], truth)
         if name == mapper.backends.primary:
-            figures |= watch.figures()
+            figures |= of_primary
         found[name] = {key: value if value is not None and math.isfinite(value) else None for key, value in figures.items()}
     return found
 

@@ -11,6 +11,8 @@ KEPT = 0.5
 NEAR_M = 0.05
 """A map this close to its reference counts as whole, m."""
 
+VERDICT = ("1", "verdict on the map: 0 trusted, 1 doubtful, 2 failed")
+
 MEASURES = {
     "ate_m": ("m", "RMSE of position against the reference after SE(2) alignment, over the nodes"),
     "yaw_deg": ("deg", "RMSE of heading against the reference after that alignment"),
@@ -23,6 +25,7 @@ MEASURES = {
     "own_lost_percent": ("%", "the same in percent of the graph's own loops"),
     "chi2_odometry": ("1", "share of chi2 from edges other than loops; large if true loops were rejected"),
     "unit_variance": SOLUTION["unit_variance/"],
+    "verdict": VERDICT,
     "iterations": SOLUTION["iterations/"],
 }
 """Figures of a back-end on a graph, in the order of the tables."""
@@ -35,6 +38,7 @@ MAPPED = {
     "relation_m": ("m", "mean translational error of the verified relations"),
     "relation_deg": ("deg", "mean rotational error of the verified relations"),
     "relation_loop_m": ("m", "mean translational error of the relations over more than 60 s"),
+    "verdict": VERDICT,
     "nodes": ("1", "nodes of the map"),
     "loops": ("1", "loops in the graph"),
     "loops_rejected": ("1", "of those, the ones rejected as outliers by the back-end"),

@@ -27,3 +27,13 @@ def test_what_happened_on_the_way_stands_under_the_tables(capsys):
     head = {"remarks": ["carried between nodes 3 and 4: [here]"]}
     emit(head, [Metric("nodes", 12.0, "1", "made")], as_json=False)
     assert capsys.readouterr().out.splitlines()[-1] == "note: carried between nodes 3 and 4: [here]"
+
+
+def test_the_verdict_is_the_last_line(capsys):
+    head = {"verdict": "doubtful", "reasons": [{"words": "node 3 (1 s): bent [here]"}], "remarks": ["a note"]}
+    emit(head, [Metric("nodes", 12.0, "1", "made")], as_json=False)
+    assert capsys.readouterr().out.splitlines()[-3:] == [
+        "note: a note",
+        "reason: node 3 (1 s): bent [here]",
+        "verdict: doubtful",
+    ]

@@ -4,7 +4,7 @@ import pytest
 from hybridmap.geometry import RelativePose, loosest_direction
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node
-from hybridmap.graph.gaps import unobserved
+from hybridmap.graph.gaps import free_lengths, unobserved
 from tests.narrowing import known
 
 ODOMETRY = np.diag([0.02, 0.02, 0.01]) ** 2
@@ -38,7 +38,6 @@ def test_a_corridor_is_free_along_itself_in_the_map():
     assert (found.sliding_m, found.blind_m, found.travel_m) == pytest.approx((3.0, 0.0, 3.5))
     assert found.direction_rad == pytest.approx(1.0)
     assert found.alike > 0.99
-    assert found.matters
     assert str(found) == (
         "on 3.0 m of 3.5 m nothing seen held the motion along 57 deg of the map: there the map rests on odometry"
     )
@@ -54,7 +53,6 @@ def test_there_and_back_is_one_axis():
 def test_a_room_is_held_and_no_remark():
     found = known(unobserved(*drive([HELD] * 5)))
     assert (found.sliding_m, found.blind_m) == (0.0, 0.0)
-    assert not found.matters
     assert str(found) == "registration held all of the way"
 
 
@@ -62,6 +60,11 @@ def test_what_was_not_registered_is_blind():
     found = known(unobserved(*drive([HELD, None, None])))
     assert found.blind_m == pytest.approx(1.0)
     assert "nothing seen held it at all" in str(found)
+
+
+def test_lengths_of_the_free_steps():
+    experiences, _ = drive([HELD, None, slides_along(0.0)])
+    assert free_lengths(experiences).tolist() == pytest.approx([0.0, 0.0, 0.5, 0.5])
 
 
 def test_a_loose_registration_that_beats_odometry_holds():

@@ -83,6 +83,20 @@ def test_shows_every_part(page: Page) -> None:
     assert sum(source.startswith("data:image/jpeg") for source in page.sources) == 2 * 4
 
 
+@pytest.mark.parametrize(
+    ("reasons", "said"), [([], "Nothing that was checked"), ([{"words": "node 3: <bent>"}], "node 3: <bent>")]
+)
+def test_begins_with_the_verdict(tmp_path: Path, reasons: list[dict[str, str]], said: str) -> None:
+    folder = write_session(tmp_path / "session", ring_map(1.2), keyframes=False)
+    folder.write_metrics({"verdict": "doubtful" if reasons else "trusted", "reasons": reasons}, [])
+    text = Page(write_report(folder).read_text()).text
+    assert text.index("Doubtful." if reasons else "Trusted.") < text.index(said) < text.index("Map and trajectories")
+
+
+def test_a_session_of_an_earlier_version_has_no_verdict(page: Page) -> None:
+    assert "Trusted" not in page.text
+
+
 def test_same_session_same_page(session: SessionFolder, page: Page) -> None:
     first = session.report.read_bytes()
     assert page.text

@@ -12,6 +12,7 @@ from hybridmap.config import Config
 from hybridmap.config.inputs import SensorsConfig
 from hybridmap.streams import open_stream
 from hybridmap.streams.base import SelfMotion
+from hybridmap.streams.inspection import inspect_source
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
 from hybridmap.streams.rosbag import BagStream
@@ -435,14 +436,15 @@ def test_a_database_without_message_definitions(tmp_path):
     assert len(list(open_stream(path, Config()))) == 12
 
 
-def test_messages_that_are_lost_are_remarked_on(tmp_path):
+def test_messages_that_are_lost_are_counted(tmp_path):
     folder = laser_drive().write(tmp_path / "a.db3", folder=True)
     (file,) = folder.glob("*.db3")
     with sqlite3.connect(file) as database:
         database.execute("DELETE FROM messages WHERE id = (SELECT max(id) FROM messages)")
     stream = open_stream(folder, Config())
     assert len(list(stream)) == 11
-    assert "/scan: 5 messages of 6 can be read" in stream.report.remarks
+    assert stream.report.lost == {"/scan": (1, 6)}
+    assert "/scan: 1 messages of 6 cannot be read" in inspect_source(folder, Config()).problems
 
 
 def test_a_broken_transform_elsewhere_does_not_matter_and_is_remarked_on(tmp_path):

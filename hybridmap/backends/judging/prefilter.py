@@ -150,7 +150,7 @@ class ConsistentBackend:
             rejected_clusters=rejected_clusters(graph, poses, rejected, gate_of(self._config)) if rejected else (),
             inconsistent_edge_ids=inconsistent,
         )
-        return Solution(poses, whole)
+        return replace(tried.solution, report=whole)
 
 
 def _without(graph: PoseGraph, edges: NDArray[np.int64]) -> PoseGraph:

@@ -1,0 +1,65 @@
+"""Groups of refused loops that agree with each other, and what the map has against them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.backends.objective import residuals
+from hybridmap.geometry import Array
+from hybridmap.graph.pose_graph import PoseGraph
+
+
+@dataclass(frozen=True, slots=True)
+class Rival:
+    """A group of refused loops that agree with each other and contradict the map.
+
+    If the group is right, then the chain is wrong somewhere between the older and the newer ends of its loops. The step of
+    the chain that most loops of the group and fewest loops of the map span is the one where this contradicts least.
+
+    Attributes:
+        edge_ids: the loops of the group.
+        node: the step leads to this node from the one before it.
+        spanning: loops of the group that span the step.
+        against: loops of the map that span it too: they say that it is right.
+        shift_m, turn_rad: how far the loops of the group would move the map, median.
+    """
+
+    edge_ids: tuple[int, ...]
+    node: int
+    spanning: int
+    against: int
+    shift_m: float
+    turn_rad: float
+
+
+def rivals(graph: PoseGraph, poses: Array, groups: Sequence[Sequence[int]], kept: NDArray[np.bool_]) -> list[Rival]:
+    """What each group of refused loops claims, and how many loops of the map stand against it.
+
+    Args:
+        graph: the graph with the loops of the groups.
+        poses: (N, 3) poses of the map, m and rad.
+        groups: edge ids of the loops of each group, e.g. by `clusters.rejected_clusters`.
+        kept: (E,) which edges are loops that the map keeps.
+    """
+    against, found = spans(graph, kept), []
+    for group in groups:
+        members = np.isin(graph.edge_ids, np.array(group, dtype=np.int64))
+        spanning = spans(graph, members)
+        node = int(np.argmax(np.where(spanning > 0, spanning - against, -graph.n_edges)))
+        apart = np.abs(residuals(graph.with_edges(members), poses))
+        shift_m, turn_rad = float(np.median(np.hypot(apart[:, 0], apart[:, 1]))), float(np.median(apart[:, 2]))
+        found.append(Rival(tuple(group), node, int(spanning[node]), int(against[node]), shift_m, turn_rad))
+    return found
+
+
+def spans(graph: PoseGraph, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(N,) number of chosen edges that span the step of the chain to each node from the one before it."""
+    ends = np.sort(np.stack([graph.sources[chosen], graph.targets[chosen]]), axis=0)
+    change = np.zeros(graph.n_nodes + 1, dtype=np.int64)
+    np.add.at(change, ends[0] + 1, 1)
+    np.add.at(change, ends[1] + 1, -1)
+    return change.cumsum()[: graph.n_nodes]

@@ -1,0 +1,204 @@
+"""The verdict on a map: each kind of reason is found where it holds, at its place, and only there."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybridmap import backends
+from hybridmap.backends.base import Solution, SolveStatus
+from hybridmap.geometry import RelativePose, between, compose
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status, at_least
+from hybridmap.graph.experience_map import ExperienceMap, Node
+from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.study.false_loops import inject, with_drift
+from hybridmap.study.model import DriftConfig, SyntheticConfig
+from hybridmap.study.sources import laps
+from hybridmap.verdict import KINDS, Facts, Reason, Verdict, reasons_of, verdict_of
+
+SURE, LOOSE = np.diag([0.01**2, 0.01**2, 0.003**2]), np.diag([0.1**2, 0.1**2, 0.05**2])
+CARRIED = 30
+
+
+def drive(laps_driven: int = 2, per_lap: int = 40) -> np.ndarray:
+    """(N, 3) poses of a robot that drives in circles, half a metre from node to node."""
+    poses = np.zeros((laps_driven * per_lap, 3))
+    for node in range(1, len(poses)):
+        poses[node] = compose(poses[node - 1], np.array([0.5, 0.0, 2.0 * np.pi / per_lap]))
+    return poses
+
+
+def mapped(truth: np.ndarray, *, registered: bool = True, per_lap: int = 40, slip: np.ndarray | None = None) -> ExperienceMap:
+    """A map of exact measurements with a loop to the lap before; `slip` is added to the registrations at node CARRIED."""
+    experiences = ExperienceMap()
+    for node, pose in enumerate(truth):
+        experiences.add_node(Node(node * 1_000_000_000, pose, np.zeros(0, np.float32), -1, 0.5 * node), pose)
+        if node == 0:
+            continue
+        step = between(truth[node - 1], pose)
+        if slip is not None and node == CARRIED:
+            step = compose(step, slip)
+        experiences.add_edge(Edge(node - 1, node, EdgeKind.ODOMETRY, Status.ACCEPTED, RelativePose(step, LOOSE)))
+        if registered:
+            experiences.add_edge(Edge(node - 1, node, EdgeKind.REGISTRATION, Status.ACCEPTED, RelativePose(step, SURE)))
+        if node >= per_lap:
+            experiences.add_edge(loop(truth, node - per_lap, node))
+    return experiences
+
+
+def loop(truth: np.ndarray, older: int, newer: int, **more: object) -> Edge:
+    return Edge(older, newer, EdgeKind.LOOP, Status.ACCEPTED, RelativePose(between(truth[older], truth[newer]), SURE), **more)  # type: ignore[arg-type]
+
+
+def judged(experiences: ExperienceMap, backend: str = "gtsam-gnc", **more: object) -> dict[str, Reason]:
+    solution = backends.create(backend).solve(experiences)
+    found = reasons_of(Facts.of_drive(experiences, solution, backend, **more))
+    return {reason.kind: reason for reason in found}
+
+
+def test_nothing_speaks_against_a_good_map():
+    assert judged(mapped(drive())) == {}
+    assert verdict_of([]) is Verdict.TRUSTED
+
+
+def test_loops_that_lose_against_a_chain_that_was_broken_are_named_with_their_place():
+    found = judged(mapped(drive(), slip=np.array([1.0, 0.0, 0.0])))["loops refused"]
+    assert found.node == CARRIED
+    assert found.count >= 25
+    assert found.value == pytest.approx(1.0, abs=0.1)
+    assert found.time_s == CARRIED
+    assert found.verdict is Verdict.DOUBTFUL
+
+
+def test_loops_that_left_the_graph_still_speak():
+    truth = drive()
+    experiences = mapped(truth, slip=np.array([1.0, 0.0, 0.0]))
+    for number, edge in enumerate(experiences.edges):
+        if edge.kind is EdgeKind.LOOP and edge.source < CARRIED <= edge.target:
+            experiences.update_edge(number, replace(edge, status=Status.REJECTED, relative=None, lack=Lack.CONTRADICTED))
+    assert judged(experiences)["loops refused"].node == CARRIED
+
+
+@pytest.mark.parametrize(("share", "speaks"), [(0.45, True), (0.1, False)])
+def test_refused_loops_speak_if_they_missed_by_a_hair(share, speaks):
+    truth = drive(1)
+    experiences = mapped(truth, slip=np.array([0.0, 2.0, 0.0]))
+    for older in range(8):
+        edge = loop(truth, older, older + CARRIED)
+        experiences.add_edge(Edge.decided(older, older + CARRIED, EdgeKind.LOOP, edge.relative, [at_least("near", share, 0.5)]))
+    assert ("loops refused" in judged(experiences)) is speaks
+
+
+def test_false_loops_against_many_true_ones_are_no_reason():
+    graph = laps(SyntheticConfig(nodes=240, per_lap=60), 2).graph
+    assert graph is not None
+    false = inject(graph, 0.4, "aliased", np.random.default_rng(2))
+    solution = backends.create("gtsam-gnc").solve(false)
+    assert solution.report.rejected_edge_ids
+    assert reasons_of(Facts.of_graph(false, solution)) == ()
+
+
+def test_a_map_that_false_loops_bend_is_doubted():
+    graph = laps(SyntheticConfig(nodes=240, per_lap=60), 0).graph
+    assert graph is not None
+    false = inject(graph, 0.1, "random", np.random.default_rng(0))
+    kinds = {reason.kind for reason in reasons_of(Facts.of_graph(false, backends.create("gtsam-lm").solve(false)))}
+    assert "bent" in kinds
+
+
+def test_a_calibrated_bend_is_none():
+    graph = laps(SyntheticConfig(nodes=240, per_lap=60), 0).graph
+    assert graph is not None
+    pulled = with_drift(graph, DriftConfig(heading_bias_deg_per_m=3.0), 0)
+    plain, calibrated = (
+        reasons_of(Facts.of_graph(pulled, backends.create(name).solve(pulled))) for name in ("gtsam-lm", "gtsam-calibrated")
+    )
+    assert {reason.kind for reason in plain} == {"bent"}
+    assert calibrated == ()
+
+
+def test_a_back_end_that_gave_nothing_has_failed():
+    experiences = mapped(drive())
+    graph = experiences.pose_graph()
+    solution = backends.create("gtsam-lm").solve(graph)
+    diverged = Solution(graph.initial, replace(solution.report, status=SolveStatus.DIVERGED))
+    for given, failure, kind in (
+        (None, "", "back-end failed"),
+        (solution, "singular", "back-end failed"),
+        (diverged, "", "no map"),
+    ):
+        (reason,) = reasons_of(Facts.of_drive(experiences, given, "gtsam-lm", failure=failure))
+        assert (reason.kind, verdict_of([reason])) == (kind, Verdict.FAILED)
+
+
+def test_poses_that_were_returned_as_they_were_given_are_no_map():
+    graph = mapped(drive(), slip=np.array([1.0, 0.0, 0.0])).pose_graph()
+    moved = replace(graph, initial=graph.initial + np.array([0.0, 0.0, 0.0]))
+    start = Solution(moved.initial, replace(backends.create("gtsam-lm").solve(moved).report, chi2=1e6))
+    assert [reason.kind for reason in reasons_of(Facts.of_graph(moved, start)) if reason.verdict is Verdict.FAILED] == [
+        "no map"
+    ]
+
+
+def test_dead_reckoning_is_doubted():
+    assert judged(mapped(drive()), "odometry")["dead reckoning"].value == 40
+
+
+def test_a_map_far_from_its_own_optimum_is_doubted():
+    graph = mapped(drive()).pose_graph()
+    solution = backends.create("gtsam-lm").solve(graph)
+    off = Solution(solution.poses * np.array([1.3, 1.0, 1.0]), solution.report)
+    kinds = [reason.kind for reason in reasons_of(Facts.of_graph(graph, off))]
+    assert "unsettled" in kinds
+
+
+def test_contradicted_odometry_is_counted():
+    experiences = mapped(drive())
+    odometry = [number for number, edge in enumerate(experiences.edges) if edge.kind is EdgeKind.ODOMETRY]
+    for number in odometry[::2]:
+        experiences.update_edge(number, experiences.edge(number).settled(lack=Lack.OVERRULED))
+    found = judged(experiences)["odometry dropped"]
+    assert found.count == 40
+    assert found.value == pytest.approx(100.0 * 40 / 79)
+
+
+def test_a_way_on_odometry_alone_is_named_where_no_loop_spans_it():
+    held, found = judged(mapped(drive(2), registered=False)), judged(mapped(drive(1), registered=False))
+    assert "nothing held" not in held
+    assert (found["nothing held"].node, found["nothing held"].until) == (0, 39)
+    assert found["nothing held"].value == pytest.approx(19.5)
+
+
+def test_a_map_against_the_odometry_is_doubted_where_no_loop_decides():
+    turned = [np.array([0.5, 0.0, 2.0 * np.pi / 40 + 0.06])] * 39
+    experiences = mapped(drive(1))
+    for number, edge in enumerate(experiences.edges):
+        if edge.kind is EdgeKind.ODOMETRY:
+            experiences.update_edge(number, replace(edge, relative=RelativePose(turned[edge.source], LOOSE)))
+    found = judged(experiences)["against odometry"]
+    assert (found.node, found.until) == (0, 39)
+
+
+def test_a_robot_that_is_lost_and_messages_that_are_missing():
+    found = judged(mapped(drive()), lost_since=70, lost={"/scan": (5, 200)})
+    assert (found["not localised"].node, found["not localised"].until) == (70, 79)
+    assert (found["messages lost"].name, found["messages lost"].count, found["messages lost"].value) == ("/scan", 5, 2.5)
+
+
+def test_every_kind_can_be_said_and_written():
+    for kind in KINDS:
+        reason = Reason(kind, 1.0, 2.0, node=3, until=5, stamp_ns=4_000_000_000, start_ns=1_000_000_000, name="x")
+        row = json.loads(json.dumps(reason.to_json()))
+        assert (row["kind"], row["node"], row["until_node"], row["time_s"], row["stamp_s"]) == (kind, 3, 5, 3.0, 4.0)
+        assert row["words"].startswith("nodes 3 to 5 (3 s): ")
+    assert Reason("bent").to_json()["value"] is None
+
+
+def test_a_graph_has_no_stamps():
+    ends = np.array([0]), np.array([1])
+    graph = PoseGraph(np.zeros((2, 3)), *ends, np.zeros((1, 3)), np.eye(3)[None], np.zeros(1, np.int8), np.zeros(1, np.int64))
+    facts = Facts.of_graph(graph, backends.create("gtsam-lm").solve(graph))
+    assert facts.reason("bent", node=1).time_s is None
+    assert str(facts.reason("bent", node=1)).startswith("node 1: ")
+    assert reasons_of(facts) == ()
