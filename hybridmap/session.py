@@ -28,7 +28,7 @@ from hybridmap.store.session_folder import SessionFolder
 from hybridmap.store.track import trajectory_of
 from hybridmap.streams.base import Observation, Stream, StreamReport
 from hybridmap.trajectory import NS_PER_S
-from hybridmap.verdict import Facts, reasons_of, verdict_of
+from hybridmap.verdict import Facts, reasons_of, said_of
 
 log = logging.getLogger(__name__)
 
@@ -185,10 +185,8 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
                 folder.write_trajectory(name, trajectory_of(track, solution.poses))
             folder.write_trajectory(f"{name}_online", store.online(name))
     free = unobserved(mapper.map, mapper.poses())
-    reasons = reasons_of(facts_of(mapper, stream.report))
     head = {
-        "verdict": str(verdict_of(reasons)),
-        "reasons": [reason.to_json() for reason in reasons],
+        **said_of(reasons_of(facts_of(mapper, stream.report))),
         "graph_hash": graph_hash(mapper.map),
         "primary_backend": mapper.backends.primary,
         "backends": list(mapper.backends.names),

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from hybridmap.backends.base import ODOMETRY, Solution
 from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.judging.rivals import Rival, rivals, spans
-from hybridmap.backends.judging.strain import bend_of, largest_bend, unsettled_m
-from hybridmap.backends.objective import squared_norms
+from hybridmap.backends.judging.strain import bend_of, largest_bend, optimum
+from hybridmap.backends.objective import SLACK, squared_norms, unit_variance
 from hybridmap.geometry import Array
 from hybridmap.graph.agreement import BOUND
 from hybridmap.graph.edges import Edge, EdgeKind, Status
@@ -43,6 +43,10 @@ kidnapping or a bent odometry give more than 14."""
 UNSETTLED_MAX_M = 0.5
 """Distance of a node from the optimum of the map's own edges, m. A relaxation that ends early is off by some 0.4 m at its
 worst node, outliers that a kernel does not silence pull by more."""
+STRAIN_MAX = SLACK
+"""Most unit variance of the map's own edges at their optimum: above, they contradict each other or are far too sure."""
+KEPT_MIN = 0.1
+"""Fewest loops of a map, as a share of those that its back-end rejected: it keeps more where seven of ten are false."""
 DROPPED_MAX = 0.2
 """Largest share of contradicted odometry edges. Wheels that slip now and then lose some per cent; a clock that is off, or a
 registration that is, contradicts the wheels all the way."""
@@ -298,12 +302,27 @@ def bent(facts: Facts) -> Iterable[Reason]:
     return [facts.reason("bent", bend.sigmas, BENT_MAX, node=bend.first, until=bend.last, apart_m=bend.apart_m)]
 
 
-def unsettled(facts: Facts) -> Iterable[Reason]:
-    """The map is not where its own edges are met best."""
+def at_odds(facts: Facts) -> Iterable[Reason]:
+    """The map is not where its own edges are met best, or they contradict each other even there."""
     if facts.solution is None or facts.poses is None or facts.solution.report.weak_edges:
+        return
+    graph = facts.graph.with_edges(facts.in_map)
+    best = optimum(graph, facts.poses)
+    apart_m = float(np.hypot(*(best - facts.poses)[:, :2].T).max())
+    if apart_m > UNSETTLED_MAX_M:
+        yield facts.reason("unsettled", apart_m, UNSETTLED_MAX_M)
+    variance = unit_variance(graph, squared_norms(graph, best))
+    if variance > STRAIN_MAX:
+        yield facts.reason("edges contradict", variance, STRAIN_MAX)
+
+
+def none_kept(facts: Facts) -> Iterable[Reason]:
+    """The back-end rejected nearly all loops that the front-end had accepted."""
+    if facts.solution is None or facts.poses is None:
         return []
-    apart_m = unsettled_m(facts.graph.with_edges(facts.in_map), facts.poses)
-    return [facts.reason("unsettled", apart_m, UNSETTLED_MAX_M)] if apart_m > UNSETTLED_MAX_M else []
+    rejected, kept = len(facts.solution.report.rejected_edge_ids), int(np.count_nonzero(facts.kept))
+    few = rejected >= TOGETHER and kept < KEPT_MIN * rejected
+    return [facts.reason("loops rejected", rejected, kept / KEPT_MIN, count=kept)] if few else []
 
 
 def against_wheels(facts: Facts) -> Iterable[Reason]:
@@ -397,6 +416,12 @@ KINDS = {
     "unsettled": Kind(
         Verdict.DOUBTFUL, "m", "a node lies {value:.2f} m from where the map's own edges want it (at most {limit:.1f} m)"
     ),
+    "edges contradict": Kind(
+        Verdict.DOUBTFUL, "1", "the edges of the map contradict each other: unit variance {value:.1f} (at most {limit:.0f})"
+    ),
+    "loops rejected": Kind(
+        Verdict.DOUBTFUL, "1", "the back-end rejected {value:.0f} loops and kept {count}: hardly any loop holds the map"
+    ),
     "against odometry": Kind(
         Verdict.DOUBTFUL,
         "sigma",
@@ -427,8 +452,9 @@ KINDS = {
 RULES: tuple[Callable[[Facts], Iterable[Reason]], ...] = (
     no_map,
     refused_together,
+    none_kept,
     bent,
-    unsettled,
+    at_odds,
     against_wheels,
     contradicted_odometry,
     not_held,
@@ -447,3 +473,8 @@ def reasons_of(facts: Facts) -> tuple[Reason, ...]:
 def verdict_of(reasons: Iterable[Reason]) -> Verdict:
     """The verdict on a map with these reasons against it."""
     return max((reason.verdict for reason in reasons), key=lambda verdict: verdict.grade, default=Verdict.TRUSTED)
+
+
+def said_of(reasons: Sequence[Reason]) -> dict[str, Any]:
+    """The keys `verdict` and `reasons` of a JSON object about a map."""
+    return {"verdict": str(verdict_of(reasons)), "reasons": [reason.to_json() for reason in reasons]}

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import result_studies as studies
 import results
+import verdict_table
 
 from hybridmap.metrics import Metric, to_json
 from tests.narrowing import known
@@ -133,3 +134,13 @@ def test_a_question_has_one_line_with_the_median_and_the_worst_of_its_figures() 
 def test_results_names_its_topics() -> None:
     said = subprocess.run([sys.executable, ROOT / "tools" / "results.py", "--list"], capture_output=True, text=True, check=True)
     assert "demo: hybridmap demo --out demo" in said.stdout
+
+
+def test_table_of_verdicts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    head = "source,setting,false_loop_kind,false_loop_rate,seed,backend,ate_m,verdict\n"
+    rows = ["lab,clean,,0,0,map,0.02,0", "lab,clean,,0,1,map,0.02,1", "lab,worse,,0,0,map,0.07,0", "lab,worse,,0,1,map,,2"]
+    (tmp_path / "cells.csv").write_text(head + "\n".join(rows) + "\n")
+    assert verdict_table.show(verdict_table.judged(tmp_path)) == 1
+    told = capsys.readouterr().out.splitlines()
+    assert told[2:4] == ["| right | 2 | 1 | 1 | 0 |", "| wrong | 2 | 1 | 0 | 1 |"]
+    assert [line.partition(":")[0] for line in told[4:]] == ["right and doubtful", "wrong and trusted"]

@@ -114,7 +114,7 @@ def test_a_calibrated_bend_is_none():
     plain, calibrated = (
         reasons_of(Facts.of_graph(pulled, backends.create(name).solve(pulled))) for name in ("gtsam-lm", "gtsam-calibrated")
     )
-    assert {reason.kind for reason in plain} == {"bent"}
+    assert {reason.kind for reason in plain} == {"bent", "edges contradict"}
     assert calibrated == ()
 
 
@@ -151,6 +151,22 @@ def test_a_map_far_from_its_own_optimum_is_doubted():
     off = Solution(solution.poses * np.array([1.3, 1.0, 1.0]), solution.report)
     kinds = [reason.kind for reason in reasons_of(Facts.of_graph(graph, off))]
     assert "unsettled" in kinds
+
+
+def test_edges_that_are_far_too_sure_contradict_each_other():
+    graph = laps(SyntheticConfig(nodes=120, per_lap=60), 0).graph
+    assert graph is not None
+    sure = replace(graph, information=10.0 * graph.information)
+    kinds = [reason.kind for reason in reasons_of(Facts.of_graph(sure, backends.create("gtsam-lm").solve(sure)))]
+    assert kinds == ["edges contradict"]
+
+
+def test_a_back_end_that_rejects_all_loops_is_doubted():
+    graph = laps(SyntheticConfig(nodes=240, per_lap=60), 0).graph
+    assert graph is not None
+    worse = with_drift(graph, DriftConfig(noise=9.0), 0)
+    found = {reason.kind: reason for reason in reasons_of(Facts.of_graph(worse, backends.create("gtsam-gnc").solve(worse)))}
+    assert found["loops rejected"].value >= 160
 
 
 def test_contradicted_odometry_is_counted():

@@ -27,7 +27,7 @@ def optimize(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Optimise a pose graph. Shows chi2 before and after, status, iterations, CPU seconds, and a proof of optimality if found.
+    """Optimise a pose graph. Shows chi2 before and after, status, iterations, CPU seconds, verdict and proof of optimality.
 
     If the back-end fails, diverges or finds the graph singular, no file is written and the exit code is 1.
     """
@@ -39,6 +39,7 @@ def optimize(
     from hybridmap.graph.io import held, write_g2o
     from hybridmap.output import staged
     from hybridmap.store import SessionFolder
+    from hybridmap.verdict import Facts, reasons_of, said_of
 
     source = open_graph(graph)
     chosen = create(backend, settings_of(source, config, setting))
@@ -58,6 +59,7 @@ def optimize(
         "certificate": proof.message,
         "rejected_edge_ids": list(report.rejected_edge_ids),
         "rejected_clusters": [list(cluster) for cluster in report.rejected_clusters],
+        **said_of(reasons_of(Facts.of_graph(source.graph, solution))),
     }
     emit(
         head,

@@ -122,6 +122,7 @@ def run(task: CellTask) -> CellResult:
     spent = {"cpu_s": time.process_time() - started}
     report = solution.report
     figures = counts | {"iterations": float(report.iterations), "chi2_initial": _finite(report.chi2_initial)}
+    figures["verdict"] = float(verdict_of(reasons_of(Facts.of_graph(graph, solution))).grade)
     if report.status not in (SolveStatus.FAILED, SolveStatus.DIVERGED):
         figures |= judge(drifted, graph, solution, frozen.reference)
     return CellResult(task.key, str(report.status), report.message, figures, spent)
@@ -160,7 +161,6 @@ def judge(own: PoseGraph, graph: PoseGraph, solution: Solution, reference: Array
         "chi2_own": _finite(chi2(own, solution.poses)),
         "chi2_odometry": _finite(solution.report.chi2_odometry),
         "unit_variance": _finite(solution.report.unit_variance),
-        "verdict": float(verdict_of(reasons_of(Facts.of_graph(graph, solution))).grade),
         "false_kept": float(np.count_nonzero(false & kept)),
         "own_lost": float(lost),
         "own_lost_percent": 100.0 * lost / own_loops if own_loops else None,

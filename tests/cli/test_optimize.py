@@ -49,6 +49,7 @@ def test_json_holds_the_figures_and_the_file_has_the_poses_they_are_of(monkeypat
     assert told["certificate"].startswith("F = ")
     assert figures["certificate_gap/gtsam-lm"] <= 1e-6
     assert (told["nodes"], told["edges"], told["loops"]) == (4, 4, 1)
+    assert (told["verdict"], told["reasons"]) == ("trusted", [])
     before, after = read_graph(square), read_graph(out)
     assert figures["chi2_initial/gtsam-lm"] == pytest.approx(chi2(before, before.initial))
     assert figures["chi2/gtsam-lm"] == pytest.approx(chi2(before, after.initial), rel=1e-9)
@@ -75,6 +76,7 @@ def test_a_back_end_that_diverged_is_exit_code_1_and_no_file(monkeypatch, capsys
     code, printed, _ = run(monkeypatch, capsys, "optimize", star, "--backend", "relaxation-paper", "--out", out, "--json")
     assert code == 1
     assert json.loads(printed)["status"] == "diverged"
+    assert json.loads(printed)["verdict"] == "failed"
     assert "theta_max" in json.loads(printed)["message"]
     assert not out.exists()
 

@@ -77,7 +77,6 @@ def _most_bent(chain: Chain, poses: Array, first: NDArray[np.int64], last: NDArr
     return Bend(int(first[worst]), int(last[worst]), math.sqrt(squared[worst]), math.hypot(x, y), abs(float(turn)))
 
 
-def unsettled_m(graph: PoseGraph, poses: Array) -> float:
-    """Largest distance of a node from where least squares on the same edges, begun at these poses, has it, m."""
-    optimum = run("lm", factor_graph(graph, NoiseModels()), poses, _ITERATIONS, tolerance=_TOLERANCE).poses
-    return float(np.hypot(*(optimum - poses)[:, :2].T).max())
+def optimum(graph: PoseGraph, poses: Array) -> Array:
+    """Poses (N, 3) where the edges of a graph are met best in least squares, searched from poses (N, 3); m and rad."""
+    return run("lm", factor_graph(graph, NoiseModels()), poses, _ITERATIONS, tolerance=_TOLERANCE).poses
