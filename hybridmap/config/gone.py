@@ -39,9 +39,10 @@ vision.templates vision/templates.py threshold stable_frames
 vision.relocalising vision/relocalising.py support mismatch_max mismatch_scale wait_m
 vision.relocalising vision/rgbd/closing.py span_m doubt_nodes:UNCERTAIN_NODES unrecognised_nodes known_m known_deg:KNOWN_RAD
 vision.relocalising vision/rgbd/global_search.py separation doubtful_m:UNCERTAIN_M
-vision.laser.scan vision/laser/cloud.py range_max_m cell_m
+vision.laser.scan vision/laser/scene.py range_max_m cell_m
 vision.laser.registration vision/laser/cloud.py reach_m:PARTNER_M field_sigma_m
-vision.laser.registration vision/laser/scan_matching.py cauchy_scale_m iterations inlier_m sigma_m spurious
+vision.laser.registration vision/laser/scan_matching.py cauchy_scale_m:CAUCHY_CELLS inlier_m:INLIER_CELLS
+vision.laser.registration vision/laser/scan_matching.py iterations sigma_m spurious
 vision.laser.tracking vision/laser/tracking.py submap_nodes narrow wide lost inliers_sure contradiction_m contradiction_deg
 vision.laser.tracking vision/laser/tracking.py floor_m floor_deg
 vision.laser.tracking vision/laser/checks.py inliers_min inliers_weak translation_max_m

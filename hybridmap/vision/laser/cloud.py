@@ -11,13 +11,10 @@ from numpy.typing import NDArray
 
 from hybridmap.geometry import Array
 from hybridmap.streams.laser import Laser
+from hybridmap.vision.laser.scene import CELL_M, INDOORS, Scale
 
-RANGE_MAX_M = 20.0
-"""Largest range used, m: beyond it the beams of most lasers are too far apart for normals."""
-CELL_M = 0.05
-"""Side of the cells whose points are merged, m: a few times the noise of a range."""
-REACH_M, REACH_BEAMS, REACH_MAX_M = 0.1, 8.0, 1.0
-"""Largest distance of neighbours, m: the first plus so many distances between beams, at most the last."""
+REACH_M, REACH_BEAMS = 0.1, 8.0
+"""Largest distance of neighbours, m: the first plus so many distances between beams, at most `Scale.reach_max_m`."""
 THIN = 0.1
 """Largest variance of neighbours across their line, as a share of that along it."""
 AGREEING = 0.3
@@ -37,10 +34,12 @@ class Cloud:
     Attributes:
         points: (P, 2) m.
         normals: (P, 2) unit vectors; (0, 0) where the neighbours of a point are no line.
+        cell_m: side of the cells whose points were merged.
     """
 
     points: Array
     normals: Array
+    cell_m: float = CELL_M
 
     def __len__(self) -> int:
         return len(self.points)
@@ -49,33 +48,34 @@ class Cloud:
         """The same cloud in frame a, where this one is given in frame b."""
         cos, sin = np.cos(pose_a_b[2]), np.sin(pose_a_b[2])
         turn = np.array([[cos, sin], [-sin, cos]])
-        return Cloud(self.points @ turn + pose_a_b[:2], self.normals @ turn)
+        return Cloud(self.points @ turn + pose_a_b[:2], self.normals @ turn, self.cell_m)
 
     def thinned(self, count: int) -> Cloud:
         """At most `count` points, evenly picked in their order."""
         if len(self) <= count:
             return self
         pick = (np.arange(count) * (len(self) / count)).astype(np.int64)
-        return Cloud(self.points[pick], self.normals[pick])
+        return Cloud(self.points[pick], self.normals[pick], self.cell_m)
 
 
 EMPTY = Cloud(np.zeros((0, 2)), np.zeros((0, 2)))
 
 
-def cloud_of_scan(ranges_m: NDArray[np.float32], laser: Laser) -> Cloud:
+def cloud_of_scan(ranges_m: NDArray[np.float32], laser: Laser, scale: Scale = INDOORS) -> Cloud:
     """Points of one scan in `base_link`; points that fall into one grid cell are averaged.
 
     Args:
         ranges_m: (B,) ranges, NaN where invalid.
         laser: bearings and mounting.
+        scale: of the scene; it gives the largest range and the cells.
     """
-    return clouds_of_scans([ranges_m], laser)[0]
+    return clouds_of_scans([ranges_m], laser, scale)[0]
 
 
-def clouds_of_scans(ranges_m: Sequence[NDArray[np.float32]], laser: Laser) -> list[Cloud]:
+def clouds_of_scans(ranges_m: Sequence[NDArray[np.float32]], laser: Laser, scale: Scale = INDOORS) -> list[Cloud]:
     """Clouds of many scans, as `cloud_of_scan` gives them one by one, but faster."""
     ranges = np.array(ranges_m, dtype=np.float64).reshape(len(ranges_m), -1)
-    valid = (ranges >= laser.range_min_m) & (ranges <= min(laser.range_max_m, RANGE_MAX_M))
+    valid = (ranges >= laser.range_min_m) & (ranges <= min(laser.range_max_m, scale.range_max_m))
     valid &= valid.sum(axis=1, keepdims=True) >= 2 * NEIGHBOURS + 1
     scan, beam = np.nonzero(valid)
     if len(scan) == 0:
@@ -83,26 +83,30 @@ def clouds_of_scans(ranges_m: Sequence[NDArray[np.float32]], laser: Laser) -> li
     distance, bearing = ranges[scan, beam], laser.bearings_rad[beam]
     points = np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], axis=1)
     step = abs(float(laser.bearings_rad[-1] - laser.bearings_rad[0])) / max(len(laser.bearings_rad) - 1, 1)
-    normals = _normals(points, np.minimum(REACH_MAX_M, REACH_M + REACH_BEAMS * step * distance), scan)
-    whole, group = _merged(Cloud(points, normals).moved(laser.pose_base_laser), scan, CELL_M)
+    normals = _normals(points, np.minimum(scale.reach_max_m, REACH_M + REACH_BEAMS * step * distance), scan)
+    whole, group = _merged(Cloud(points, normals).moved(laser.pose_base_laser), scan, scale.cell_m)
     ends = np.searchsorted(group, np.arange(len(ranges_m) + 1))
-    return [Cloud(whole.points[a:b], whole.normals[a:b]) for a, b in pairwise(ends.tolist())]
+    return [Cloud(whole.points[a:b], whole.normals[a:b], whole.cell_m) for a, b in pairwise(ends.tolist())]
 
 
-def merged(clouds: Iterable[Cloud], cell_m: float = CELL_M) -> Cloud:
+def merged(clouds: Iterable[Cloud], cell_m: float | None = None) -> Cloud:
     """Merge clouds of one frame; points that fall into one grid cell are averaged.
 
+    Without `cell_m`, the coarsest cloud gives the side of the cells.
     The order of the result follows the cells, so it does not depend on the order of the clouds.
     """
     parts = [c for c in clouds if len(c)]
     if not parts:
         return EMPTY
     whole = Cloud(np.concatenate([c.points for c in parts]), np.concatenate([c.normals for c in parts]))
-    return _merged(whole, np.zeros(len(whole), dtype=np.int64), cell_m)[0]
+    return _merged(whole, np.zeros(len(whole), dtype=np.int64), cell_m or max(c.cell_m for c in parts))[0]
 
 
-def merged_at(clouds: Sequence[Cloud], poses: Array, cell_m: float = CELL_M) -> Cloud:
-    """Merge clouds that were taken from poses (N, 3) into one, in the frame in which the poses are given."""
+def merged_at(clouds: Sequence[Cloud], poses: Array) -> Cloud:
+    """Merge clouds that were taken from poses (N, 3) into one, in the frame in which the poses are given.
+
+    The coarsest cloud gives the side of the cells.
+    """
     counts = [len(c) for c in clouds]
     if sum(counts) == 0:
         return EMPTY
@@ -112,7 +116,7 @@ def merged_at(clouds: Sequence[Cloud], poses: Array, cell_m: float = CELL_M) -> 
     nx, ny = np.concatenate([c.normals for c in clouds]).T
     points = np.stack([x + cos * px - sin * py, y + sin * px + cos * py], axis=1)
     normals = np.stack([cos * nx - sin * ny, sin * nx + cos * ny], axis=1)
-    return _merged(Cloud(points, normals), np.zeros(len(points), dtype=np.int64), cell_m)[0]
+    return _merged(Cloud(points, normals), np.zeros(len(points), dtype=np.int64), max(c.cell_m for c in clouds))[0]
 
 
 def _merged(cloud: Cloud, group: NDArray[np.int64], cell_m: float) -> tuple[Cloud, NDArray[np.int64]]:
@@ -130,7 +134,7 @@ def _merged(cloud: Cloud, group: NDArray[np.int64], cell_m: float) -> tuple[Clou
     normal: Array = np.stack([np.bincount(member, cloud.normals[:, i], n) for i in (0, 1)], axis=1)
     length = np.sqrt(normal[:, 0] ** 2 + normal[:, 1] ** 2)
     normal = np.where((length > AGREEING)[:, None], normal / np.maximum(length, 1e-9)[:, None], 0.0)
-    return Cloud(mean, normal), found // (rows * columns)
+    return Cloud(mean, normal, cell_m), found // (rows * columns)
 
 
 def _normals(points: Array, reach_m: Array, scan: NDArray[np.int64]) -> Array:
@@ -202,7 +206,7 @@ def _bounded(cells: Array, low: int, high: int) -> NDArray[np.int64]:
 
 def build_field(
     cloud: Cloud,
-    cell_m: float = CELL_M,
+    cell_m: float | None = None,
     reach_m: float = PARTNER_M,
     sigma_m: float = FIELD_SIGMA_M,
     search_m: float = 0.0,
@@ -211,11 +215,12 @@ def build_field(
 
     Args:
         cloud: P points with normals.
-        cell_m: side of a cell.
+        cell_m: side of a cell; None: that of the cloud.
         reach_m: largest distance from a point at which it has a likelihood.
         sigma_m: standard deviation of the likelihood.
         search_m: largest translation of the poses that will be scored on this field.
     """
+    cell_m = cell_m or cloud.cell_m
     usable = np.flatnonzero(cloud.normals[:, 0] ** 2 + cloud.normals[:, 1] ** 2 > 0.5)
     points, normals = cloud.points[usable].T, cloud.normals[usable].T
     reach, margin = int(np.ceil(reach_m / cell_m)), int(np.ceil(search_m / cell_m)) + 1

@@ -64,7 +64,7 @@ class DenseTrajectory:
         for first, stop in self._blocks():
             block = np.flatnonzero((nodes >= first) & (nodes < stop))
             if len(block):
-                clouds = clouds_of_scans([scans[i].scan.ranges_m for i in block.tolist()], self._laser)
+                clouds = clouds_of_scans([scans[i].scan.ranges_m for i in block.tolist()], self._laser, self._atlas.scene.scale)
                 found[block], good[block] = self._register(clouds, expected[block], poses[first:stop], poses)
         for piece in self._atlas.pieces[1:]:
             good[(nodes == piece.start - 1) & (_way(motions) > 0.0)] = False

@@ -75,6 +75,7 @@ class LaserFrontEnd:
             raise StreamError(f"laser: expected a LaserScan, found {type(frame).__name__}")
         if frame.ranges_m.shape != self._laser.bearings_rad.shape:
             raise StreamError(f"laser: expected {len(self._laser.bearings_rad)} ranges, found {frame.ranges_m.shape}")
+        self.atlas.scene.observe(frame.ranges_m)
         self._scans.append(ObservedScan(frame, len(self._profiles) - 1, np.array(delta_node_robot, dtype=np.float64)))
         profile = laser_profile(frame.ranges_m, self._laser.bearings_rad, self._profile_width)
         if not self._config.scan.templates:
@@ -168,7 +169,7 @@ class LaserFrontEnd:
         return self._keys - 1
 
     def _cloud(self, scan: LaserScan) -> Cloud:
-        return cloud_of_scan(scan.ranges_m, self._laser)
+        return cloud_of_scan(scan.ranges_m, self._laser, self.atlas.scene.scale)
 
     def _clouds_between(self) -> Iterator[tuple[Array, Cloud]]:
         return ((seen.motion, self._cloud(seen.scan)) for seen in self._between)

@@ -144,7 +144,7 @@ class Continuity:
     def _follow(self, node: int, odometry: Array, on_the_way: Sequence[tuple[Array, LaserScan]]) -> bool:
         """Whether each scan from the last node to the newest fits the one before it."""
         atlas = self._atlas
-        clouds = [cloud_of_scan(scan.ranges_m, self._laser) for _, scan in on_the_way]
+        clouds = [cloud_of_scan(scan.ranges_m, self._laser, atlas.scene.scale) for _, scan in on_the_way]
         clouds = [atlas.clouds[node - 1], *clouds, atlas.clouds[node]]
         ranges = [atlas.ranges[node - 1], *(scan.ranges_m for _, scan in on_the_way), atlas.ranges[node]]
         wheels = [IDENTITY, *(motion for motion, _ in on_the_way), odometry]

@@ -144,12 +144,12 @@ def _star() -> Array:
     return np.column_stack([np.tile(moves, (3, 1)), np.repeat(turns, len(moves))])
 
 
-CAUCHY_SCALE_M = 0.05
-"""Residual at which a partner's weight is halved, m: the size of a cell."""
+CAUCHY_CELLS = 1.0
+"""Residual at which a partner's weight is halved, cells of the field: 5 cm indoors."""
 ITERATIONS = 20
 """Most iterations; a good start needs less than half of them."""
-INLIER_M = 0.1
-"""Largest point-to-line residual of an inlier, m: two cells."""
+INLIER_CELLS = 2.0
+"""Largest point-to-line residual of an inlier, cells of the field: 10 cm indoors."""
 SIGMA_M = 0.01
 """Standard deviation of a point's residual at least, m: the noise of a laser."""
 SPURIOUS = 0.04
@@ -267,16 +267,17 @@ def align(field: LikelihoodField, cloud: Cloud, starts: Array, prior: Prior | No
     """
     poses = np.array(starts, dtype=np.float64)
     moving = _Moving(*(np.ascontiguousarray(a[..., i]) for a in (cloud.points, cloud.normals) for i in (0, 1)))
-    scale = WIDE * CAUCHY_SCALE_M
+    narrow = CAUCHY_CELLS * field.cell_m
+    scale = WIDE * narrow
     for iteration in range(ITERATIONS):
         hessian, gradient = _normal_equations(_partners(field, moving, poses), scale)
         steps = _newton_steps(hessian, gradient, poses, prior)
         poses = compose(poses, steps.clip(-LARGEST_STEP, LARGEST_STEP))
         if iteration >= WIDE_ITERATIONS:
-            scale = CAUCHY_SCALE_M
+            scale = narrow
             if np.abs(steps).max() < CONVERGED:
                 break
-    return _judge(_partners(field, moving, poses), poses)
+    return _judge(_partners(field, moving, poses), poses, INLIER_CELLS * field.cell_m)
 
 
 def _partners(field: LikelihoodField, moving: _Moving, poses: Array) -> _Partners:
@@ -330,8 +331,8 @@ def _solved(h: list[list[float]], g: list[float]) -> list[float]:
     return [-g[0] / h[0][0] - l1 * z1 - l2 * z2, z1, z2]
 
 
-def _judge(partners: _Partners, poses: Array) -> Alignment:
-    inlier = partners.has & (np.abs(partners.residual) < INLIER_M)
+def _judge(partners: _Partners, poses: Array, inlier_m: float) -> Alignment:
+    inlier = partners.has & (np.abs(partners.residual) < inlier_m)
     count, near = inlier.sum(axis=1), partners.has.sum(axis=1)
     n = max(partners.has.shape[1], 1)
     jacobian = partners.jacobian * inlier[:, None]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, compose_relative, inverse
 from hybridmap.streams.laser import Laser
 from hybridmap.vision.laser.cloud import Cloud, LikelihoodField, build_field, merged_at
+from hybridmap.vision.laser.scene import Scene
 
 SEARCH_M = 4.5
 """Largest distance of starts from the anchor of a submap, m."""
@@ -88,6 +89,7 @@ class Atlas:
         chain: pose (3,) of each node by scan matching from node to node.
         scatter: covariance (3, 3) of each node's pose relative to the nodes around it, in the node's own frame.
         travel_m: path length up to each node.
+        scene: how far the walls are; the scale of clouds that are made now.
     """
 
     def __init__(self) -> None:
@@ -99,6 +101,7 @@ class Atlas:
         self.chain: list[Array] = []
         self.scatter: list[Array] = []
         self.travel_m: list[float] = []
+        self.scene = Scene()
         self._pieces = [0]
 
     def __len__(self) -> int:

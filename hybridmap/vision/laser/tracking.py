@@ -10,7 +10,7 @@ import numpy as np
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, wrap_angle
 from hybridmap.graph.edges import Check, passed
 from hybridmap.vision.laser import checks
-from hybridmap.vision.laser.cloud import CELL_M, Cloud, LikelihoodField, build_field, merged
+from hybridmap.vision.laser.cloud import Cloud, LikelihoodField, build_field, merged
 from hybridmap.vision.laser.scan_matching import Alignment, Prior, align, score_starts, spaced, square
 from hybridmap.vision.laser.submap import Atlas
 
@@ -129,7 +129,7 @@ class Tracker:
         return self._field_of(cloud)
 
     def _field_of(self, cloud: Cloud) -> LikelihoodField:
-        return build_field(cloud, search_m=LOST.half_m + 2 * CELL_M)
+        return build_field(cloud, search_m=LOST.half_m + 2 * cloud.cell_m)
 
     def _search(self, field: LikelihoodField, cloud: Cloud, expected: Array) -> Alignment:
         """Search narrowly; if that is weak or contradicts the odometry, widely too, and take the one of more inliers."""
