@@ -61,12 +61,8 @@ def optimize(
         "rejected_clusters": [list(cluster) for cluster in report.rejected_clusters],
         **said_of(reasons_of(Facts.of_graph(source.graph, solution))),
     }
-    emit(
-        head,
-        metrics_of([Row(backend, solution, certificate=proof)]),
-        as_json=as_json,
-        title=f"{graph}: {backend}: {report.status}",
-    )
+    figures = metrics_of([Row(backend, solution, certificate=proof)])
+    emit(head, figures, as_json=as_json, title=f"{graph}: {backend}: {report.status}")
     if not as_json:
         typer.echo(f"{report.summary}\ncertificate: {proof.message}")
     if not solved:

@@ -1,0 +1,139 @@
+"""The facts about a finished map that the rules look at."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.backends.base import Solution
+from hybridmap.geometry import Array
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
+from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.graph.gaps import free_lengths
+from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.verdict.reasons import Reason
+
+HAIR = 0.2
+"""A loop that missed its limits by up to this share of them may be right; in one that missed by more the views differ."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Facts:
+    """What the kinds of reasons look at.
+
+    Attributes:
+        graph: the accepted edges, and the loops that were measured but are not accepted.
+        in_map: (E,) which edges the map was made of: the accepted ones that its back-end did not reject.
+        plausible: (E,) which of the other loops may be right all the same: not those that failed a check by far.
+        solution: the map of the primary back-end; None if it never gave one.
+        primary: name of that back-end.
+        failure: why the primary back-end failed; empty if it did not.
+        stamps_ns: (N,) stamps of the nodes; None if unknown.
+        wheels: all odometry edges but those across a kidnapping, also the contradicted ones; None if unknown.
+        free_m: (N,) way to each node on which odometry alone knows the motion, in one direction or in all.
+        lost_since: the first node since which the robot is lost; None if it is not.
+        lost: topic -> (messages that are missing or damaged, messages in all).
+    """
+
+    graph: PoseGraph
+    in_map: NDArray[np.bool_]
+    plausible: NDArray[np.bool_]
+    solution: Solution | None
+    primary: str
+    failure: str = ""
+    stamps_ns: NDArray[np.int64] | None = None
+    wheels: PoseGraph | None = None
+    free_m: Array | None = None
+    lost_since: int | None = None
+    lost: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+
+    @classmethod
+    def of_graph(cls, graph: PoseGraph, solution: Solution) -> Facts:
+        """The facts of a graph without a drive, such as a file, and of a back-end's solution of it."""
+        kept = ~np.isin(graph.edge_ids, np.array(solution.report.rejected_edge_ids, dtype=np.int64))
+        meant = _calibrated(graph, solution)
+        return cls(graph=meant, in_map=kept, plausible=~kept, solution=solution, primary=solution.report.backend)
+
+    @classmethod
+    def of_drive(cls, experiences: ExperienceMap, solution: Solution | None, primary: str, **more: Any) -> Facts:
+        """The facts of a drive; `more` are attributes that the map does not tell."""
+        edges = experiences.edges
+        chosen = [
+            number
+            for number, edge in enumerate(edges)
+            if edge.relative is not None and (edge.status is Status.ACCEPTED or edge.kind is EdgeKind.LOOP)
+        ]
+        accepted = np.array([edges[number].status is Status.ACCEPTED for number in chosen], dtype=bool)
+        near = np.array([_may_be_right(edges[number]) for number in chosen], dtype=bool)
+        rejected = () if solution is None else solution.report.rejected_edge_ids
+        in_map = accepted & ~np.isin(chosen, np.array(rejected, dtype=np.int64))
+        return cls(
+            graph=_calibrated(_graph_of(experiences, chosen), solution),
+            in_map=in_map,
+            plausible=~in_map & near,
+            solution=solution,
+            primary=primary,
+            stamps_ns=np.array([node.stamp_ns for node in experiences.nodes], dtype=np.int64),
+            wheels=_graph_of(experiences, [number for number, edge in enumerate(edges) if _driven(edge)]),
+            free_m=free_lengths(experiences),
+            **more,
+        )
+
+    @property
+    def poses(self) -> Array | None:
+        """(N, 3) the poses of the map; None if the primary back-end gave none but those that it began with."""
+        return self.solution.poses if self.solution is not None and self.solution.report.status.has_map else None
+
+    @property
+    def kept(self) -> NDArray[np.bool_]:
+        """(E,) which loops hold the map together."""
+        return np.asarray(self.in_map & self.graph.is_loop)
+
+    def reason(self, kind: str, value: float = math.nan, limit: float = math.nan, **more: Any) -> Reason:
+        """A reason with the stamps of its node."""
+        node, stamps = more.get("node"), self.stamps_ns
+        if node is not None and stamps is not None:
+            more |= {"stamp_ns": int(stamps[node]), "start_ns": int(stamps[0])}
+        return Reason(kind, float(value), float(limit), **more)
+
+
+def _driven(edge: Edge) -> bool:
+    """Whether an edge is of odometry, and not across a kidnapping."""
+    return edge.kind is EdgeKind.ODOMETRY and edge.lack is not Lack.KIDNAPPED
+
+
+def _may_be_right(edge: Edge) -> bool:
+    """Whether a loop that is not in the map may be right: it was in the map, or missed the limits of its checks by a hair."""
+    return edge.status in (Status.ACCEPTED, Status.RETRACTED) or all(check.slack >= -HAIR for check in edge.failed)
+
+
+def _graph_of(experiences: ExperienceMap, chosen: Sequence[int]) -> PoseGraph:
+    """The graph of measured edges of the numbers `chosen`, whatever their status."""
+    edges = [experiences.edge(number) for number in chosen]
+    measured = [edge.relative for edge in edges if edge.relative is not None]
+    information = np.linalg.inv(np.array([relative.covariance for relative in measured]).reshape(-1, 3, 3))
+    return PoseGraph(
+        initial=experiences.initial,
+        sources=np.array([edge.source for edge in edges], dtype=np.int64),
+        targets=np.array([edge.target for edge in edges], dtype=np.int64),
+        deltas=np.array([relative.delta for relative in measured]).reshape(-1, 3),
+        information=information,
+        kinds=np.array([edge.kind for edge in edges], dtype=np.int8),
+        edge_ids=np.array(chosen, dtype=np.int64),
+    )
+
+
+def _calibrated(graph: PoseGraph, solution: Solution | None) -> PoseGraph:
+    """The graph with the odometry as the back-end calibrated it, if it did."""
+    calibrated = None if solution is None else solution.calibrated
+    if calibrated is None:
+        return graph
+    _, here, there = np.intersect1d(graph.edge_ids, calibrated.edge_ids, return_indices=True)
+    deltas, information = graph.deltas.copy(), graph.information.copy()
+    deltas[here], information[here] = calibrated.deltas[there], calibrated.information[there]
+    return replace(graph, deltas=deltas, information=information)

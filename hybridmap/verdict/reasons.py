@@ -1,0 +1,176 @@
+"""What a verdict is and what a reason is: kinds of reasons with their words, and a reason with its place and figure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from hybridmap.trajectory import NS_PER_S
+
+
+class Verdict(StrEnum):
+    """How far a map can be relied on.
+
+    `trusted`: nothing speaks against it. `doubtful`: something does; it may be right all the same. `failed`: there is no
+    map beyond dead reckoning.
+    """
+
+    TRUSTED = "trusted"
+    DOUBTFUL = "doubtful"
+    FAILED = "failed"
+
+    @property
+    def grade(self) -> int:
+        """0 trusted, 1 doubtful, 2 failed."""
+        return list(Verdict).index(self)
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of reason.
+
+    Attributes:
+        verdict: the verdict on a map for which it holds.
+        unit: unit of its figure and limit.
+        words: template of its words, with the attributes of `Reason`.
+    """
+
+    verdict: Verdict
+    unit: str
+    words: str
+
+
+KINDS = {
+    "back-end failed": Kind(Verdict.FAILED, "1", "{name}; the map is dead reckoning"),
+    "no map": Kind(Verdict.FAILED, "1", "{name} gave no map: chi2 is {value:.4g} at the poses that it began with"),
+    "dead reckoning": Kind(Verdict.DOUBTFUL, "1", "the map is dead reckoning, which uses no loop; there are {value:.0f}"),
+    "loops refused": Kind(
+        Verdict.DOUBTFUL,
+        "m",
+        "{count} loops agree with each other and would move the map by {value:.2f} m, but are not in it; {against} loops are"
+        " against them: either they have one common error, or the motion here is wrong",
+    ),
+    "bent": Kind(
+        Verdict.DOUBTFUL,
+        "sigma",
+        "the map bends the chain of motion by {apart_m:.2f} m, {value:.0f} standard deviations (at most {limit:.0f}): loops or"
+        " motion are wrong here",
+    ),
+    "unsettled": Kind(
+        Verdict.DOUBTFUL, "m", "a node lies {value:.2f} m from where the map's own edges want it (at most {limit:.1f} m)"
+    ),
+    "edges contradict": Kind(
+        Verdict.DOUBTFUL, "1", "the edges of the map contradict each other: unit variance {value:.1f} (at most {limit:.0f})"
+    ),
+    "loops rejected": Kind(
+        Verdict.DOUBTFUL, "1", "the back-end rejected {value:.0f} loops and kept {count}: hardly any loop holds the map"
+    ),
+    "against odometry": Kind(
+        Verdict.DOUBTFUL,
+        "sigma",
+        "map and odometry differ by {apart_m:.2f} m, {value:.0f} standard deviations of the odometry, and no loop tells which"
+        " of them is right",
+    ),
+    "odometry dropped": Kind(
+        Verdict.DOUBTFUL,
+        "%",
+        "registrations contradict {count} odometry edges, {value:.0f} % of them (at most {limit:.0f} %): the wheels slip, or"
+        " the clock of the sensor is not theirs",
+    ),
+    "nodes hang": Kind(Verdict.DOUBTFUL, "1", "{value:.0f} nodes are joined to the rest by edges that have no weight"),
+    "nothing held": Kind(
+        Verdict.DOUBTFUL,
+        "m",
+        "on {value:.1f} m nothing seen held the motion and no loop spans it: the map rests on odometry",
+    ),
+    "not localised": Kind(
+        Verdict.DOUBTFUL,
+        "1",
+        "{value:.0f} nodes lie where the odometry has them: the robot may have been kidnapped, its views fit none before",
+    ),
+    "messages lost": Kind(Verdict.DOUBTFUL, "%", "{name}: {count} messages ({value:.2g} %) cannot be read"),
+}
+"""Every kind of reason by its name."""
+
+_WORDS = ("value", "limit", "count", "against", "apart_m", "name")  # attributes of a reason that its words may have
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """A reason against a map.
+
+    Attributes:
+        kind: name of the kind of reason, a key of `KINDS`.
+        value, limit: the figure that decided and its limit, in the unit of the kind; NaN: no figure.
+        node: the first node that it concerns; None: the whole map.
+        until: the last node that it concerns; None: `node` alone.
+        stamp_ns: stamp of `node`, ns; None if unknown.
+        start_ns: stamp of the first node, ns; None if unknown.
+        count: how many loops, edges or messages it concerns.
+        against: how many loops of the map speak against it.
+        apart_m: how far the map is from what it contradicts, m.
+        name: name of the back-end or topic that it concerns; otherwise empty.
+    """
+
+    kind: str
+    value: float = math.nan
+    limit: float = math.nan
+    node: int | None = None
+    until: int | None = None
+    stamp_ns: int | None = None
+    start_ns: int | None = None
+    count: int = 0
+    against: int = 0
+    apart_m: float = math.nan
+    name: str = ""
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict on a map for which this reason holds."""
+        return KINDS[self.kind].verdict
+
+    @property
+    def unit(self) -> str:
+        """Unit of `value` and `limit`."""
+        return KINDS[self.kind].unit
+
+    @property
+    def time_s(self) -> float | None:
+        """Time of `node` since the first node, s."""
+        return None if self.stamp_ns is None or self.start_ns is None else (self.stamp_ns - self.start_ns) / NS_PER_S
+
+    def __str__(self) -> str:
+        """The reason in words, with its place."""
+        words = KINDS[self.kind].words.format_map({name: getattr(self, name) for name in _WORDS})
+        if self.node is None:
+            return words
+        nodes = f"node {self.node}" if self.until in (None, self.node) else f"nodes {self.node} to {self.until}"
+        return f"{nodes}{'' if self.time_s is None else f' ({self.time_s:.0f} s)'}: {words}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The reason as a dictionary of JSON values; what is unknown is null."""
+        return {
+            "kind": self.kind,
+            "verdict": str(self.verdict),
+            "node": self.node,
+            "until_node": self.until,
+            "time_s": self.time_s,
+            "stamp_s": None if self.stamp_ns is None else self.stamp_ns / NS_PER_S,
+            "value": self.value if math.isfinite(self.value) else None,
+            "limit": self.limit if math.isfinite(self.limit) else None,
+            "unit": self.unit,
+            "words": str(self),
+        }
+
+
+def verdict_of(reasons: Iterable[Reason]) -> Verdict:
+    """The verdict on a map with these reasons against it."""
+    return max((reason.verdict for reason in reasons), key=lambda verdict: verdict.grade, default=Verdict.TRUSTED)
+
+
+def said_of(reasons: Sequence[Reason]) -> dict[str, Any]:
+    """The keys `verdict` and `reasons` of a JSON object about a map."""
+    return {"verdict": str(verdict_of(reasons)), "reasons": [reason.to_json() for reason in reasons]}

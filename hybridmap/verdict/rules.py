@@ -1,0 +1,190 @@
+"""The rules: each asks one question about a finished map, and gives its reasons to doubt it. None needs a ground truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.backends.base import ODOMETRY
+from hybridmap.backends.judging.clusters import rejected_clusters
+from hybridmap.backends.judging.rivals import Rival, rivals, spans
+from hybridmap.backends.judging.strain import bend_of, largest_bend, optimum
+from hybridmap.backends.objective import SLACK, squared_norms, unit_variance
+from hybridmap.graph.agreement import BOUND
+from hybridmap.graph.paths import chain_of
+from hybridmap.verdict.facts import Facts
+from hybridmap.verdict.reasons import Reason, Verdict
+
+TOGETHER = 6
+"""Fewest refused loops that speak against a map: two places that look alike give runs of four or five."""
+MOVES_M, MOVES_RAD = 0.1, math.radians(2.0)
+"""A group of refused loops that would move the map by less than both says nothing that matters: a place is found within it."""
+OUTNUMBER = 2
+"""So many times as many loops of a group must stand against the map as loops of the map against the group."""
+BENT_MAX = 10.0
+"""Standard deviations by which a map may bend a stretch of the chain of motion. Right maps stay below 6; wrong loops, a
+kidnapping or a bent odometry give more than 14."""
+UNSETTLED_MAX_M = 0.5
+"""Distance of a node from the optimum of the map's own edges, m. A relaxation that ends early is off by some 0.4 m at its
+worst node, outliers that a kernel does not silence pull by more."""
+STRAIN_MAX = SLACK
+"""Most unit variance of the map's own edges at their optimum: above, they contradict each other or are far too sure."""
+KEPT_MIN = 0.1
+"""Fewest loops of a map, as a share of those that its back-end rejected: it keeps more where seven of ten are false."""
+DROPPED_MAX = 0.2
+"""Largest share of contradicted odometry edges. Wheels that slip now and then lose some per cent; a clock that is off, or a
+registration that is, contradicts the wheels all the way."""
+WHEELS_MAX = 5.0
+"""Standard deviations of the odometry by which the map may contradict it where no loop decides between them."""
+FREE_MAX_M = 5.0
+"""Longest way on which odometry alone may know the motion where no loop spans it: wheels slip by some per cent of it."""
+
+
+def no_map(facts: Facts) -> Iterable[Reason]:
+    """The primary back-end failed, diverged, or returned the poses that it was given."""
+    solution = facts.solution
+    if solution is None or facts.failure:
+        return [facts.reason("back-end failed", name=f"{facts.primary}: {facts.failure or 'it gave no map'}")]
+    report = solution.report
+    if not report.status.has_map:
+        return [facts.reason("no map", report.chi2, report.chi2_initial, name=f"{facts.primary} ({report.status})")]
+    if facts.primary == ODOMETRY:
+        return [facts.reason("dead reckoning", len(facts.graph.edge_ids[facts.graph.is_loop]), 0, name=facts.primary)]
+    moved = not np.array_equal(solution.poses, facts.graph.initial)
+    if not moved and report.chi2 > facts.graph.n_edges:
+        return [facts.reason("no map", report.chi2, facts.graph.n_edges, name=f"{facts.primary} (returned its start)")]
+    return []
+
+
+def refused_together(facts: Facts) -> Iterable[Reason]:
+    """Loops that are not in the map although they agree with each other, and more of them than the map has against them."""
+    graph, poses = facts.graph, facts.poses
+    if poses is None:
+        return []
+    out = facts.plausible & graph.is_loop & (squared_norms(graph, poses) > BOUND)
+    groups = rejected_clusters(graph, poses, tuple(graph.edge_ids[out].tolist()), BOUND)
+    found = [one for one in rivals(graph, poses, groups, facts.kept) if _matters(one)]
+    return [
+        facts.reason("loops refused", one.shift_m, MOVES_M, node=one.node, count=one.spanning, against=one.against)
+        for one in found
+    ]
+
+
+def _matters(rival: Rival) -> bool:
+    moves = rival.shift_m > MOVES_M or rival.turn_rad > MOVES_RAD
+    return moves and rival.spanning >= TOGETHER and rival.spanning > rival.against
+
+
+def bent(facts: Facts) -> Iterable[Reason]:
+    """The map bends the chain of motion more than the noise of its edges allows."""
+    if facts.solution is None or facts.poses is None:
+        return []
+    variance = facts.solution.report.unit_variance
+    bend = largest_bend(facts.graph.with_edges(facts.in_map), facts.poses, min(variance or 1.0, 1.0))
+    if bend is None or bend.sigmas <= BENT_MAX:
+        return []
+    return [facts.reason("bent", bend.sigmas, BENT_MAX, node=bend.first, until=bend.last, apart_m=bend.apart_m)]
+
+
+def at_odds(facts: Facts) -> Iterable[Reason]:
+    """The map is not where its own edges are met best, or they contradict each other even there."""
+    if facts.solution is None or facts.poses is None or facts.solution.report.weak_edges:
+        return
+    graph = facts.graph.with_edges(facts.in_map)
+    best = optimum(graph, facts.poses)
+    apart_m = float(np.hypot(*(best - facts.poses)[:, :2].T).max())
+    if apart_m > UNSETTLED_MAX_M:
+        yield facts.reason("unsettled", apart_m, UNSETTLED_MAX_M)
+    variance = unit_variance(graph, squared_norms(graph, best))
+    if variance > STRAIN_MAX:
+        yield facts.reason("edges contradict", variance, STRAIN_MAX)
+
+
+def none_kept(facts: Facts) -> Iterable[Reason]:
+    """The back-end rejected nearly all loops that the front-end had accepted."""
+    if facts.solution is None or facts.poses is None:
+        return []
+    rejected, kept = len(facts.solution.report.rejected_edge_ids), int(np.count_nonzero(facts.kept))
+    few = rejected >= TOGETHER and kept < KEPT_MIN * rejected
+    return [facts.reason("loops rejected", rejected, kept / KEPT_MIN, count=kept)] if few else []
+
+
+def against_wheels(facts: Facts) -> Iterable[Reason]:
+    """Where no loop spans the way, the map contradicts dead reckoning, and nothing tells which of them is right."""
+    if facts.poses is None or facts.wheels is None:
+        return
+    chain = chain_of(facts.wheels)
+    for run in _runs(spans(facts.graph, facts.kept)[1:] == 0):
+        first, last = int(run[0]), int(run[-1]) + 1
+        bend = bend_of(chain, facts.poses, first, last)
+        if bend is not None and bend.sigmas > WHEELS_MAX:
+            yield facts.reason("against odometry", bend.sigmas, WHEELS_MAX, node=first, until=last, apart_m=bend.apart_m)
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+    """The runs of indices where a mask is true."""
+    parts = np.split(np.arange(len(mask)), np.flatnonzero(np.diff(mask)) + 1)
+    return [part for part in parts if len(part) and mask[part[0]]]
+
+
+def contradicted_odometry(facts: Facts) -> Iterable[Reason]:
+    """Registrations contradicted many odometry edges."""
+    if facts.wheels is None or not facts.wheels.n_edges:
+        return []
+    dropped = int(np.count_nonzero(~np.isin(facts.wheels.edge_ids, facts.graph.edge_ids)))
+    share = dropped / facts.wheels.n_edges
+    return [facts.reason("odometry dropped", 100.0 * share, 100.0 * DROPPED_MAX, count=dropped)] if share > DROPPED_MAX else []
+
+
+def not_held(facts: Facts) -> Iterable[Reason]:
+    """Long ways on which odometry alone knows the motion, and which no loop of the map spans; nodes that hang."""
+    report = None if facts.solution is None else facts.solution.report
+    if report is not None and report.hanging_nodes:
+        yield facts.reason("nodes hang", report.hanging_nodes, 0)
+    if facts.free_m is None:
+        return
+    for run in _runs((facts.free_m > 0.0) & (spans(facts.graph, facts.kept) == 0)):
+        length_m = float(facts.free_m[run].sum())
+        if length_m > FREE_MAX_M:
+            yield facts.reason("nothing held", length_m, FREE_MAX_M, node=int(run[0]) - 1, until=int(run[-1]))
+
+
+def lost(facts: Facts) -> Iterable[Reason]:
+    """The robot was not localised at the end."""
+    if facts.lost_since is None:
+        return []
+    nodes = facts.graph.n_nodes
+    return [facts.reason("not localised", nodes - facts.lost_since, 0, node=facts.lost_since, until=nodes - 1)]
+
+
+def messages_lost(facts: Facts) -> Iterable[Reason]:
+    """Messages of the recording are missing or damaged."""
+    return [
+        facts.reason("messages lost", 100.0 * gone / max(every, 1), 0, count=gone, name=name)
+        for name, (gone, every) in facts.lost.items()
+        if gone
+    ]
+
+
+RULES: tuple[Callable[[Facts], Iterable[Reason]], ...] = (
+    no_map,
+    refused_together,
+    none_kept,
+    bent,
+    at_odds,
+    against_wheels,
+    contradicted_odometry,
+    not_held,
+    lost,
+    messages_lost,
+)
+"""What is asked of every map."""
+
+
+def reasons_of(facts: Facts) -> tuple[Reason, ...]:
+    """Every reason against a map, the gravest first."""
+    found = [reason for rule in RULES for reason in rule(facts)]
+    return tuple(sorted(found, key=lambda reason: reason.verdict is not Verdict.FAILED))
