@@ -18,8 +18,9 @@ from hybridmap.graph.paths import chain_of
 from hybridmap.verdict.facts import Facts
 from hybridmap.verdict.reasons import Reason, Verdict
 
-TOGETHER = 6
-"""Fewest refused loops that speak against a map: two places that look alike give runs of four or five."""
+TOGETHER = 4
+"""Fewest refused loops that speak against a map, as many as find a lost robot; one more for each doubling of the number of
+groups, since of many false groups some fall where the map has nothing against them."""
 MOVES_M, MOVES_RAD = 0.1, math.radians(2.0)
 """A group of refused loops that would move the map by less than both says nothing that matters: a place is found within it."""
 OUTNUMBER = 2
@@ -66,16 +67,16 @@ def refused_together(facts: Facts) -> Iterable[Reason]:
         return []
     out = facts.plausible & graph.is_loop & (squared_norms(graph, poses) > BOUND)
     groups = rejected_clusters(graph, poses, tuple(graph.edge_ids[out].tolist()), BOUND)
-    found = [one for one in rivals(graph, poses, groups, facts.kept) if _matters(one)]
+    least = TOGETHER + math.log2(max(len(groups), 1))
     return [
         facts.reason("loops refused", one.shift_m, MOVES_M, node=one.node, count=one.spanning, against=one.against)
-        for one in found
+        for one in rivals(graph, poses, groups, facts.kept)
+        if _moves(one) and one.spanning >= max(least, OUTNUMBER * one.against)
     ]
 
 
-def _matters(rival: Rival) -> bool:
-    moves = rival.shift_m > MOVES_M or rival.turn_rad > MOVES_RAD
-    return moves and rival.spanning >= TOGETHER and rival.spanning > rival.against
+def _moves(rival: Rival) -> bool:
+    return rival.shift_m > MOVES_M or rival.turn_rad > MOVES_RAD
 
 
 def bent(facts: Facts) -> Iterable[Reason]:
