@@ -47,7 +47,15 @@ class NoiseLevel:
         if len(self._squared) >= ENOUGH:
             self._factor = max(1.0, SHARED * float(np.quantile(np.array(self._squared), QUANTILE)) / CHI2_QUANTILE)
 
-    def applied(self, relative: RelativePose, translation_floor_m: float, rotation_floor_deg: float) -> RelativePose:
-        """The same registration with its covariance times the factor, plus the squares of the floors (standard deviations)."""
+    def applied(
+        self, relative: RelativePose, translation_floor_m: float, rotation_floor_deg: float, shared: float = 1.0
+    ) -> RelativePose:
+        """The same registration with its covariance times the factor, plus the squares of the floors (standard deviations).
+
+        Args:
+            relative: a registration with the covariance that its residuals give.
+            translation_floor_m, rotation_floor_deg: the floors.
+            shared: a further factor on all, for errors that overlapping registrations have in common.
+        """
         floor = np.diag([translation_floor_m**2, translation_floor_m**2, np.deg2rad(rotation_floor_deg) ** 2])
-        return RelativePose(relative.delta, self.factor * relative.covariance + floor)
+        return RelativePose(relative.delta, shared * (self.factor * relative.covariance + floor))

@@ -53,3 +53,9 @@ def test_factor_and_floor_are_applied():
     applied = level.applied(relative, 0.01, 1.0)
     assert applied.delta is relative.delta
     assert applied.covariance == pytest.approx(4.0 * relative.covariance + np.diag([0.01, 0.01, np.deg2rad(1.0)]) ** 2)
+
+
+def test_errors_in_common_multiply_factor_and_floor():
+    level = NoiseLevel(4.0)
+    alone, common = (level.applied(RelativePose(STEP, COVARIANCE), 0.01, 1.0, shared) for shared in (1.0, 3.0))
+    assert common.covariance == pytest.approx(3.0 * alone.covariance)
