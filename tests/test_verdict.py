@@ -186,6 +186,18 @@ def test_a_way_on_odometry_alone_is_named_where_no_loop_spans_it():
     assert found["nothing held"].value == pytest.approx(19.5)
 
 
+@pytest.mark.parametrize(("breaks", "speaks"), [(2, False), (3, True)])
+def test_a_motion_that_is_broken_in_many_places_is_doubted(breaks, speaks):
+    experiences = mapped(drive())
+    steps = [number for number, edge in enumerate(experiences.edges) if edge.kind is EdgeKind.REGISTRATION][5 : 5 + breaks]
+    for number in steps:
+        seen = (at_least("seen", 0.0, 1.0),)
+        experiences.update_edge(number, replace(experiences.edge(number), broken_by=seen))
+    found = judged(experiences)
+    assert ("motion broken" in found) is speaks
+    assert not speaks or (found["motion broken"].node, found["motion broken"].until) == (6, 5 + breaks)
+
+
 def test_a_map_against_the_odometry_is_doubted_where_no_loop_decides():
     turned = [np.array([0.5, 0.0, 2.0 * np.pi / 40 + 0.06])] * 39
     experiences = mapped(drive(1))

@@ -14,7 +14,7 @@ from hybridmap.backends.base import Solution
 from hybridmap.geometry import Array
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
 from hybridmap.graph.experience_map import ExperienceMap
-from hybridmap.graph.gaps import free_lengths
+from hybridmap.graph.gaps import free_lengths, kidnappings
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.verdict.reasons import Reason
 
@@ -36,6 +36,7 @@ class Facts:
         stamps_ns: (N,) stamps of the nodes; None if unknown.
         wheels: all odometry edges but those across a kidnapping, also the contradicted ones; None if unknown.
         free_m: (N,) way to each node on which odometry alone knows the motion, in one direction or in all.
+        breaks: nodes to which the robot seems not to have driven, without a kidnapping that was found there.
         lost_since: the first node since which the robot is lost; None if it is not.
         lost: topic -> (messages that are missing or damaged, messages in all).
     """
@@ -49,6 +50,7 @@ class Facts:
     stamps_ns: NDArray[np.int64] | None = None
     wheels: PoseGraph | None = None
     free_m: Array | None = None
+    breaks: tuple[int, ...] = ()
     lost_since: int | None = None
     lost: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
@@ -71,6 +73,7 @@ class Facts:
         accepted = np.array([edges[number].status is Status.ACCEPTED for number in chosen], dtype=bool)
         near = np.array([_may_be_right(edges[number]) for number in chosen], dtype=bool)
         rejected = () if solution is None else solution.report.rejected_edge_ids
+        found = {one.after for one in kidnappings(experiences)}
         in_map = accepted & ~np.isin(chosen, np.array(rejected, dtype=np.int64))
         return cls(
             graph=_calibrated(_graph_of(experiences, chosen), solution),
@@ -81,6 +84,7 @@ class Facts:
             stamps_ns=np.array([node.stamp_ns for node in experiences.nodes], dtype=np.int64),
             wheels=_graph_of(experiences, [number for number, edge in enumerate(edges) if _driven(edge)]),
             free_m=free_lengths(experiences),
+            breaks=tuple(sorted({edge.target for edge in edges if edge.broken_by} - found)),
             **more,
         )
 

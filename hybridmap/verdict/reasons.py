@@ -86,6 +86,12 @@ KINDS = {
         "m",
         "on {value:.1f} m nothing seen held the motion and no loop spans it: the map rests on odometry",
     ),
+    "motion broken": Kind(
+        Verdict.DOUBTFUL,
+        "1",
+        "the robot seems not to have driven to {value:.0f} nodes (at most {limit:.0f}): what it sees there does not fit what it"
+        " saw just before",
+    ),
     "not localised": Kind(
         Verdict.DOUBTFUL,
         "1",

@@ -40,8 +40,11 @@ DROPPED_MAX = 0.2
 registration that is, contradicts the wheels all the way."""
 WHEELS_MAX = 5.0
 """Standard deviations of the odometry by which the map may contradict it where no loop decides between them."""
-FREE_MAX_M = 5.0
-"""Longest way on which odometry alone may know the motion where no loop spans it: wheels slip by some per cent of it."""
+BREAKS_MAX = 2
+"""Most breaks of the motion without a kidnapping. Indoors there are none; bushes and trees, which look different from every
+side, give dozens, and then a kidnapping that was found may be one of them."""
+FREE_MAX_M = 10.0
+"""Longest way on which odometry alone may know the motion where no loop spans it: good wheels err by some 0.1 m on it."""
 
 
 def no_map(facts: Facts) -> Iterable[Reason]:
@@ -153,6 +156,14 @@ def not_held(facts: Facts) -> Iterable[Reason]:
             yield facts.reason("nothing held", length_m, FREE_MAX_M, node=int(run[0]) - 1, until=int(run[-1]))
 
 
+def broken(facts: Facts) -> Iterable[Reason]:
+    """The motion seems broken in more places than kidnappings were found."""
+    if len(facts.breaks) <= BREAKS_MAX:
+        return []
+    first, last = facts.breaks[0], facts.breaks[-1]
+    return [facts.reason("motion broken", len(facts.breaks), BREAKS_MAX, node=first, until=last)]
+
+
 def lost(facts: Facts) -> Iterable[Reason]:
     """The robot was not localised at the end."""
     if facts.lost_since is None:
@@ -179,6 +190,7 @@ RULES: tuple[Callable[[Facts], Iterable[Reason]], ...] = (
     against_wheels,
     contradicted_odometry,
     not_held,
+    broken,
     lost,
     messages_lost,
 )
