@@ -96,6 +96,10 @@ class Whereabouts:
         self._breaks.clear()
         self._unrecognised = 0
 
+    def mended(self, node: int) -> None:
+        """Record that the robot drove to a node before which the chain was broken."""
+        self._breaks.pop(node, None)
+
     def unrecognised(self) -> None:
         """Record that the robot failed to recognise a known place; several times in a row make it count as lost."""
         self._unrecognised += 1

@@ -14,6 +14,8 @@ CONTRADICTION_SIGMAS = 4.0
 """A registration farther from the odometry, in standard deviations, is a sign of a break of the chain."""
 WAY_VIOLATION = 0.13
 """So is a larger share of the walls of two consecutive scans in each other's free space."""
+RESUMED_VIOLATION = 0.25
+"""Largest share of walls in free space at which scans after a break fit those before it: bad scans lie on either side of it."""
 NEAR_MIN = 0.5
 """Least share of the probe's points that lie near the target: half of the last metres must have been seen before."""
 LOOSEST_MAX_M = 0.1
@@ -47,6 +49,21 @@ def of_way(odometry_sigma: float | None, violation: float) -> tuple[Check, ...]:
     if odometry_sigma is None:
         return (seen,)
     return (at_most("odometry_sigma", odometry_sigma, CONTRADICTION_SIGMAS), seen)
+
+
+def of_resumption(inliers: float, loosest_m: float, violation: float) -> tuple[Check, ...]:
+    """Check whether a scan after a break of the chain fits the scans before it so well that it tells where the robot is.
+
+    Args:
+        inliers: share of the scan's points that fit the submap before the break.
+        loosest_m: largest standard deviation of the position in any direction.
+        violation: share of the walls of the two scans that lie in each other's free space.
+    """
+    return (
+        at_least("inliers", inliers, INLIERS_MIN),
+        at_most("loosest_m", loosest_m, LOOSEST_MAX_M),
+        at_most("violation", violation, RESUMED_VIOLATION),
+    )
 
 
 def of_fit(near: float, fit: float, fit_min: float) -> tuple[Check, ...]:

@@ -107,7 +107,7 @@ class LaserFrontEnd:
         step = self._tracker.step(cloud, odometry, self._clouds_between)
         self.atlas.add(cloud, scan.ranges_m, compose(self.atlas.chain[-1], step.relative.delta), step.scatter)
         broken = self._continuity.broken(node, step, odometry, [(seen.motion, seen.scan) for seen in self._between])
-        return [self.localisation.tracked(self._registration(node, step), broken)]
+        return self.localisation.tracked(self._registration(node, step), broken, odometry.delta)
 
     def close(self, node: int, belief: Belief) -> list[Edge]:
         """Look for loops of the new node, and decide pending ones.

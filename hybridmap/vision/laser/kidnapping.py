@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose
-from hybridmap.graph.edges import Check, Edge, Lack
+from hybridmap.graph.edges import Check, Edge, Lack, passed
 from hybridmap.streams.laser import Laser, LaserScan
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import nodes_within
 from hybridmap.vision.laser import checks
 from hybridmap.vision.laser.cloud import Cloud, build_field, cloud_of_scan, merged_at
-from hybridmap.vision.laser.hypotheses import GATE_DEG, GATE_INFLATION, GATE_M, LENGTH_M, TARGET_HALF_M, Hypothesis, Prober
+from hybridmap.vision.laser.hypotheses import (
+    GATE_DEG,
+    GATE_INFLATION,
+    GATE_M,
+    LENGTH_M,
+    REGISTERED_POINTS,
+    TARGET_HALF_M,
+    Hypothesis,
+    Prober,
+)
 from hybridmap.vision.laser.scan_matching import Prior, align
 from hybridmap.vision.laser.submap import Atlas, Submap, violation_both_ways
-from hybridmap.vision.laser.tracking import Step, Tracker
+from hybridmap.vision.laser.tracking import CONTRADICTION_DEG, CONTRADICTION_M, Step, Tracker
 from hybridmap.vision.profile import Profile
 from hybridmap.vision.relocalising import ChainState, GlobalMatch, Relocaliser, Settlement, Whereabouts, placed_by
 from hybridmap.vision.templates import Matcher
@@ -36,6 +45,23 @@ LOOSE_M, LOOSE_RAD = 0.3, float(np.deg2rad(5.0))
 """Standard deviations of the pose of a single scan that is compared with the map, m and rad."""
 DECIDED = 3.0
 """Going back from the node where the robot was localised, a sum of so many scans for the chain ends the search."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChainBreak:
+    """A break of the chain.
+
+    Attributes:
+        node: the first node after it.
+        registration: the registration across it.
+        odometry: (3,) the same motion by the wheels.
+        lost_since: first node after an earlier break from which the robot was not localised yet; None if there is none.
+    """
+
+    node: int
+    registration: Edge
+    odometry: Array
+    lost_since: int | None
 
 
 class Continuity:
@@ -73,6 +99,34 @@ class Continuity:
         if seen <= checks.WAY_VIOLATION or self._follow(node, odometry.delta, on_the_way):
             return ()
         return checks.of_way(sigmas if step.measured else None, seen)
+
+    def drove_on(self, breaks: Sequence[ChainBreak], node: int) -> bool | None:
+        """Whether a scan after a break of the chain shows that the robot drove on: a bad scan or a crowd broke the chain.
+
+        The scans since the break are registered to the submap before it, and expected where the wheels have them.
+
+        Args:
+            breaks: the breaks in a row, the first one first; nodes between them are joined by registrations.
+            node: the newest node, after the last of them.
+
+        Returns:
+            True if it drove on, False if it is elsewhere; None if the scan does not fit well enough to tell.
+        """
+        last = breaks[0].node - 1
+        by_wheels, expected = {b.node: b.odometry for b in breaks}, IDENTITY
+        for i in range(last + 1, node + 1):
+            chain = self._atlas.chain
+            expected = compose(expected, by_wheels[i] if i in by_wheels else between(chain[i - 1], chain[i]))
+        here = self._atlas.submap(node, range(breaks[-1].node, node + 1))
+        found = self._tracker.resume(last, here.cloud.thinned(REGISTERED_POINTS), expected)
+        loosest = np.linalg.eigvalsh(found.covariance(0, 0.0, 0.0)[:2, :2])[1] ** 0.5
+        there = self._atlas.submap(last, self._atlas.along(last, RECENT_M, 0.0))
+        seen = violation_both_ways(here, there, found.poses[0], self._atlas.ranges, self._laser)
+        if not passed(checks.of_resumption(float(found.inliers[0]), float(loosest), seen)):
+            return None
+        off, wider = between(expected, found.poses[0]), np.sqrt(node - last)
+        near = np.hypot(off[0], off[1]) <= CONTRADICTION_M * wider
+        return bool(near and abs(off[2]) <= np.deg2rad(CONTRADICTION_DEG) * wider)
 
     def contradicted(self, node: int, belief: Belief) -> bool:
         """Whether the last scans contradict the old scans around the robot's pose on the map, where that pose is certain."""
@@ -168,6 +222,10 @@ SPAN_M = 1.5
 """Travel that agreeing matches must cover, m: their submaps then overlap only in part."""
 FROM_M, OFTEN_M = 0.9, 6.0
 """The whole map is searched at each node between these travels since the break, m; later, as often as loops are looked for."""
+RESUMED_M = 10.0
+"""Travel after a break within which a scan may show that the robot drove on, m: the scans before it are still in sight."""
+BAD_SIGHT = 3
+"""So many breaks in a row within that travel come from bad scans (a slope, a crowd): nobody is kidnapped so often."""
 SUBMAPS = 100
 """Most old submaps that are searched: those with the most similar profiles."""
 MISFIT = 0.015
@@ -205,6 +263,7 @@ class GlobalLocalisation:
         self._views = Matcher("plain", *ALIKE, max_shift=config.profile.max_shift)
         self._misfits, self._steps = MISFIT_STEPS * MISFIT, MISFIT_STEPS
         self._broken_at: int | None = None
+        self._breaks: list[ChainBreak] = []
         self._lost_m, self._searched_m = 0.0, -np.inf
 
     @property
@@ -217,26 +276,46 @@ class GlobalLocalisation:
         """First node that is joined to the newest one by registrations: 0, or the first after the last kidnapping."""
         return self._broken_at or 0
 
-    def tracked(self, registration: Edge, broken_by: tuple[Check, ...]) -> Edge:
+    def tracked(self, registration: Edge, broken_by: tuple[Check, ...], odometry: Array) -> list[Edge]:
         """Note how the newest node was registered; after a kidnapping it begins a new piece of the atlas.
 
         Args:
             registration: edge from the node before to the newest node.
             broken_by: failed checks of `Continuity.broken`; empty if the robot was not kidnapped.
+            odometry: (3,) the same motion by the wheels.
 
         Returns:
-            The registration with these checks.
+            The registration with these checks, and those of earlier breaks that this node has mended.
         """
         node = registration.target
         if broken_by:
             self._atlas.part(node)
-            self._broken_at = node
+            lost_since, self._broken_at = self._broken_at, node
             self._lost_m, self._searched_m = self._atlas.travel_m[node], -np.inf
             registration = replace(registration, broken_by=broken_by)
+            self._breaks.append(ChainBreak(node, registration, odometry, lost_since))
         else:
             self._misfits, self._steps = self._misfits + 1.0 - registration.figures["fit"], self._steps + 1
         self._relocaliser.tracked(node, ChainState.BROKEN if broken_by else ChainState.HOLDS, [registration])
-        return registration
+        return [registration, *([] if broken_by else self._mended(node))]
+
+    def _mended(self, node: int) -> list[Edge]:
+        """If the newest scan shows that the robot drove on over the last breaks, join the chain; returns the changed edges."""
+        if not self._breaks:
+            return []
+        breaks, drove_on = self._breaks, self._continuity.drove_on(self._breaks, node)
+        if drove_on is None and len(breaks) >= BAD_SIGHT:
+            drove_on = True
+        if drove_on is not None or self._atlas.travel_m[node] - self._atlas.travel_m[breaks[0].node] > RESUMED_M:
+            self._breaks = []
+        if not drove_on:
+            return []
+        for b in breaks:
+            self._atlas.join(b.node)
+            self._whereabouts.mended(b.node)
+        self._broken_at = breaks[0].lost_since
+        dismissed = [] if self._whereabouts.lost else self._relocaliser.dismiss(Lack.NOT_LOST)
+        return [*(replace(b.registration, broken_by=()) for b in breaks), *dismissed]
 
     def probed(self, node: int, hypotheses: Sequence[Hypothesis], belief: Belief) -> None:
         """Note from the loop hypotheses of a node whether it recognised its place; an ambiguous fit counts neither way."""
@@ -307,7 +386,7 @@ class GlobalLocalisation:
 
     def _found(self, settlement: Settlement, belief: Belief) -> Settlement:
         """The robot is localised. Without a break of the chain, find the node of the kidnapping."""
-        broken_at, self._broken_at = self._broken_at, None
+        broken_at, self._broken_at, self._breaks = self._broken_at, None, []
         if broken_at is not None:
             if settlement.kidnapped_to is None:
                 self._atlas.join(broken_at)

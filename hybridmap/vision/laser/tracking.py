@@ -39,6 +39,8 @@ WIDE = SearchWindow(half_m=0.45, half_deg=40.0, prior_m=0.1, prior_deg=40.0)
 """Second search, when the first is weak or contradicts the odometry: drop-outs of wheels are mostly of heading."""
 LOST = SearchWindow(half_m=1.0, half_deg=60.0, prior_m=0.7, prior_deg=60.0)
 """Last search, when the scans between the nodes did not help either."""
+RESUMED = SearchWindow(half_m=0.45, half_deg=8.0, prior_m=0.1, prior_deg=5.0)
+"""Search after a break of the chain: wheels over some metres that did not slip."""
 INLIERS_SURE = 0.75
 """Least share of inliers at which a registration may contradict the odometry without further search."""
 CONTRADICTION_M, CONTRADICTION_DEG = 0.15, 3.0
@@ -112,6 +114,11 @@ class Tracker:
         if self._is_weak(best, odometry):
             best = _better(best, self._grid(field, following, odometry, LOST), LOST_GAIN)
         return best
+
+    def resume(self, last: int, cloud: Cloud, expected: Array) -> Alignment:
+        """Register a scan to the submap that ends at an earlier node (`last`), near an expected pose (3,) in its frame."""
+        nodes = range(max(last + 1 - SUBMAP_NODES, self._atlas.piece(last).start), last + 1)
+        return self._grid(self._field_of(self._atlas.submap(last, nodes).cloud), cloud, expected, RESUMED)
 
     def _is_weak(self, alignment: Alignment, expected: Array) -> bool:
         """Whether a registration is weak, or contradicts the odometry without being very good."""
