@@ -70,7 +70,7 @@ class Row:
         return self.failure if self.solution is None else self.solution.report.summary
 
     @property
-    def verdict(self) -> str:
+    def remark(self) -> str:
         """Message of the solver, and why the solution is not certified, if that was asked for."""
         doubt = "" if self.certificate is None or self.certificate.certified else self.certificate.message
         return "; ".join(filter(None, (self.message, doubt)))

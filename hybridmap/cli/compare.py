@@ -87,12 +87,13 @@ def compare(
                 opened.graph, names, settings, ways=ways, certified=True, traced=out is not None, progress=advance
             )
         judged = _judged(opened, rows, reference, relations)
-        cells = _table(rows, judged.metrics)
+        verdicts = _verdicts(opened, rows)
+        cells = _table(rows, verdicts, judged.metrics)
         if place is not None:
             facts = (f"Back-ends on {source.name}", opened.start, opened.head, opened.graph)
             write_comparison(place, Compared(*facts, rows, cells, settings, judged.truth, opened.kidnapped))
     if as_json:
-        _emit(opened, ways, rows, judged.metrics)
+        _emit(opened, ways, rows, verdicts, judged.metrics)
     else:
         _show(cells, rows, f"{source}: {opened.graph.n_nodes} nodes, {opened.graph.n_edges} edges; {_done(opened, ways)}")
 
@@ -116,7 +117,17 @@ def _judged(opened: GraphSource, rows: Sequence[Row], reference: Path | None, re
     return judge_solutions(opened.path, maps, reference, relations)
 
 
-def _emit(opened: GraphSource, ways: Sequence[Way], rows: Sequence[Row], judged: Sequence[Metric]) -> None:
+def _verdicts(opened: GraphSource, rows: Sequence[Row]) -> dict[str, str]:
+    """Title of each row with a solution -> verdict on its map."""
+    from hybridmap.verdict import Facts, reasons_of, verdict_of
+
+    solved = {row.title: row.solution for row in rows if row.solution is not None}
+    return {title: str(verdict_of(reasons_of(Facts.of_graph(opened.graph, one)))) for title, one in solved.items()}
+
+
+def _emit(
+    opened: GraphSource, ways: Sequence[Way], rows: Sequence[Row], verdicts: dict[str, str], judged: Sequence[Metric]
+) -> None:
     from hybridmap.backends.comparison import metrics_of
     from hybridmap.cli.show import emit
 
@@ -125,6 +136,7 @@ def _emit(opened: GraphSource, ways: Sequence[Way], rows: Sequence[Row], judged:
         "ways": [str(way) for way in ways],
         "backends": [row.title for row in rows],
         "status": {row.title: row.status for row in rows},
+        "verdicts": verdicts,
         "message": {row.title: row.message for row in rows},
         "certificate": {row.title: row.certificate.message for row in rows if row.certificate is not None},
     }
@@ -146,22 +158,30 @@ def _done(opened: GraphSource, ways: Sequence[Way]) -> str:
     return ", ".join(words[way] for way in ways)
 
 
-def _table(rows: Sequence[Row], judged: Sequence[Metric]) -> list[list[str]]:
+def _table(rows: Sequence[Row], verdicts: dict[str, str], judged: Sequence[Metric]) -> list[list[str]]:
     """Column titles, then one list of cells per row."""
     from hybridmap.report.page_tables import number
 
     by_name = {metric.name: f"{metric.value:.4f}" if isfinite(metric.value) else "–" for metric in judged}
     errors = {name: title for name, title in _ERRORS.items() if any(key.startswith(f"{name}/") for key in by_name)}
-    columns = ["back-end", "way", "chi2", "unit variance", *errors.values(), "status", "iterations", "CPU (s)"]
+    columns = ["back-end", "way", "chi2", "unit variance", *errors.values(), "status", "verdict", "iterations", "CPU (s)"]
     table = [[*columns, "rejected loops", "certificate"]]
     for row in rows:
         if row.solution is None:
-            table.append([row.backend, str(row.way), "", "", *("" for _ in errors), row.status, "", "", "", ""])
+            table.append([row.backend, str(row.way), "", "", *("" for _ in errors), row.status, "", "", "", "", ""])
             continue
         report = row.solution.report
         against = [by_name.get(f"{name}/{row.title}", "") for name in errors]
         variance = "" if report.unit_variance is None else number(report.unit_variance)
-        figures = [f"{report.chi2:.7g}", variance, *against, row.status, str(report.iterations), f"{report.cpu_s:.2f}"]
+        figures = [
+            f"{report.chi2:.7g}",
+            variance,
+            *against,
+            row.status,
+            verdicts[row.title],
+            str(report.iterations),
+            f"{report.cpu_s:.2f}",
+        ]
         proof = row.certificate.word if row.certificate is not None else ""
         table.append([row.backend, str(row.way), *figures, str(len(report.rejected_edge_ids)), proof])
     return table
@@ -185,4 +205,4 @@ def _show(cells: Sequence[Sequence[str]], rows: Sequence[Row], title: str) -> No
         table.add_row(*line)
     console.print(table)
     for row in rows:
-        typer.echo(f"{row.title}: {row.verdict}")
+        typer.echo(f"{row.title}: {row.remark}")

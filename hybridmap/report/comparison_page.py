@@ -83,7 +83,7 @@ def write_comparison(place: Held, compared: Compared) -> Path:
         tiles=[(compared.head[key], key) for key in ("nodes", "edges", "loops")],
         columns=compared.cells[0],
         rows=[{"cells": line, "bad": not row.has_map} for row, line in zip(rows, compared.cells[1:], strict=True)],
-        messages=[(row.title, row.verdict) for row in rows],
+        messages=[(row.title, row.remark) for row in rows],
         ways={str(row.way) for row in rows},
         kidnapped=compared.kidnapped,
         of_truth=bool(compared.truth),

@@ -60,6 +60,7 @@ def test_json_has_a_figure_and_a_status_of_each_back_end(monkeypatch, capsys, sq
     assert told["ways"] == (["incremental"] if "--incremental" in way else ["batch"])
     assert told["start"] == "the poses of the file"
     assert set(told["status"]) == set(told["certificate"]) == set(names)
+    assert told["verdicts"] == {name: "doubtful" if name.startswith("odometry") else "trusted" for name in names}
     assert figures["certificate_gap/gtsam-lm"] <= 1e-6
     for name in names:
         assert figures[f"chi2/{name}"] <= figures["chi2/odometry"] * (1 + 1e-9)
