@@ -20,6 +20,7 @@ from hybridmap.backends.registry import create
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, between, compose
+from hybridmap.graph.order import in_driving_order
 from hybridmap.graph.paths import extend, require_connected
 from hybridmap.graph.pose_graph import Change, PoseGraph, difference, prefix
 from hybridmap.metrics import StageClock
@@ -142,10 +143,18 @@ class Driver:
         return self._solution(graph, outcome, squared, before, started)
 
     def _whole(self, graph: PoseGraph, solver: Solver, start: Array) -> Solution:
-        """Check a whole graph, run a solver on it and check the result."""
-        started = time.process_time()
+        """Check a whole graph, and solve it with its nodes in the order of the drive, whatever theirs is."""
         graph.validate()
         require_connected(graph)
+        arranged = in_driving_order(graph)
+        if arranged.nodes is None:
+            return self._in_order(arranged.graph, solver, start)
+        solution = self._in_order(arranged.graph, solver, start[arranged.nodes])
+        return replace(solution, poses=_anchored(arranged.given(solution.poses), graph.initial[0]))
+
+    def _in_order(self, graph: PoseGraph, solver: Solver, start: Array) -> Solution:
+        """Run a solver on a whole graph and check the result."""
+        started = time.process_time()
         outcome = self._checked(graph, graph.initial, self._asked(solver, graph, start))
         squared = squared_norms(graph, outcome.poses)
         before = total(squared) if outcome.poses is graph.initial else chi2(graph, graph.initial)
@@ -194,11 +203,8 @@ class Driver:
         if not np.isfinite(outcome.poses).all():
             message = "the poses were not finite; the previous ones are kept"
             return Outcome(start, SolveStatus.DIVERGED, message, outcome.iterations)
-        if np.array_equal(outcome.poses[0], graph.initial[0]):
-            return outcome
-        poses = compose(graph.initial[0], between(outcome.poses[0], outcome.poses))
-        poses[0] = graph.initial[0]
-        return replace(outcome, poses=poses)
+        poses = _anchored(outcome.poses, graph.initial[0])
+        return outcome if poses is outcome.poses else replace(outcome, poses=poses)
 
     def _carried(self, new: PoseGraph, change: Change, start: Array) -> Array:
         """Squared residuals (E,) at the start of an update: those of the edges of `new`; the others are known."""
@@ -250,6 +256,15 @@ def replay(backend: Backend, graph: PoseGraph) -> Iterator[Solution]:
     """
     for nodes in range(1, graph.n_nodes + 1):
         yield backend.update(prefix(graph, nodes))
+
+
+def _anchored(poses: Array, first: Array) -> Array:
+    """Poses (N, 3) moved rigidly, so that the first one is `first` (3,); the same array if it is already."""
+    if np.array_equal(poses[0], first):
+        return poses
+    moved = compose(first, between(poses[0], poses))
+    moved[0] = first
+    return moved
 
 
 def _first_line(error: BaseException) -> str:

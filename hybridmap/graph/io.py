@@ -13,6 +13,7 @@ from hybridmap.errors import GraphError, quoted
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.graph.order import in_driving_order
 from hybridmap.graph.paths import chain
 from hybridmap.graph.pose_graph import GraphFile, PoseGraph
 from hybridmap.output import write_text
@@ -41,9 +42,10 @@ class _Lines:
 def read_graph(path: Path) -> PoseGraph:
     """Read a planar g2o (`VERTEX_SE2`, `EDGE_SE2`) or TORO (`VERTEX2`, `EDGE2`) file.
 
-    Vertices are numbered again from 0 in the order of their numbers in the file; edges keep the file's order. An edge between
-    consecutive vertices counts as odometry, every other one as a loop. If the file has no vertices, initial poses are composed
-    along its edges. The first vertex that a `FIX` line names is the one that is held; nothing else is fixed.
+    Vertices are numbered again from 0 in the order of the drive; edges keep the file's order. That order, and which edges are
+    odometry, `graph.order.in_driving_order` finds: where consecutive numbers are all joined by edges, these edges are the
+    odometry, and every other one is a loop. If the file has no vertices, initial poses are composed along its edges. The
+    first vertex that a `FIX` line names is the one that is held; nothing else is fixed.
 
     Raises:
         GraphError: no such file, a damaged line (named), a 3-D file, a vertex given twice or missing, no edge.
@@ -114,7 +116,6 @@ def _assemble(lines: _Lines, path: Path) -> PoseGraph:
                 raise GraphError(f"{path}:{number}: edge {source} -> {target} names vertex {end}, which the file does not give")
     sources = np.array([index[s] for s, _ in lines.ends], dtype=np.int64)
     targets = np.array([index[t] for _, t in lines.ends], dtype=np.int64)
-    kinds = np.where(np.abs(sources - targets) == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP).astype(np.int8)
     initial = np.array([lines.vertices[name] for name in names]) if lines.vertices else np.zeros((len(names), 3))
     graph = PoseGraph(
         initial=initial,
@@ -122,12 +123,13 @@ def _assemble(lines: _Lines, path: Path) -> PoseGraph:
         targets=targets,
         deltas=np.array(lines.deltas),
         information=np.array(lines.upper)[:, _UPPER],
-        kinds=kinds,
+        kinds=np.full(len(sources), EdgeKind.LOOP, dtype=np.int8),
         edge_ids=np.arange(len(sources), dtype=np.int64),
         file=GraphFile(
             path, np.array(names, dtype=np.int64), np.array(lines.numbers, dtype=np.int64), _held(lines, index, path)
         ),
     )
+    graph = in_driving_order(graph).graph
     return graph if lines.vertices else chain(graph)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from heapq import heapify, heappop, heappush
 
 import numpy as np
 from numpy.typing import NDArray
@@ -236,13 +237,13 @@ def require_connected(graph: PoseGraph) -> None:
 
 
 def extend(graph: PoseGraph, placed: Array) -> Array:
-    """Add poses for the nodes beyond `placed` (M, 3), each by its best edge to an earlier node; returns (N, 3).
+    """Add poses for the nodes beyond `placed` (M, 3), each by its best edge to a node that has a pose; returns (N, 3).
 
     Registrations are better than odometry, and odometry is better than loops; among edges of one kind, the earlier node nearest
-    in number is best, then the newest edge.
+    in number is best, then the newest edge. A node without an edge to an earlier one waits for the later ones.
 
     Raises:
-        GraphError: a node has no edge to an earlier one.
+        GraphError: a node has no path to those that have a pose.
     """
     done, n = len(placed), graph.n_nodes
     poses = np.concatenate([placed, np.zeros((n - done, 3))])
@@ -253,15 +254,42 @@ def extend(graph: PoseGraph, placed: Array) -> Array:
     rank = _TRUST[graph.kinds[candidates]]
     order = np.lexsort((candidates, earlier[candidates], rank))
     best = dict(zip(later[candidates][order].tolist(), candidates[order].tolist(), strict=True))  # the last one wins
+    if len(best) < n - done:
+        return _spread(graph, poses, done)
     for node in range(done, n):
-        if node not in best:
-            raise GraphError(f"{graph.where}: {graph.node_name(node)} is not connected to an earlier node")
-        edge = best[node]
-        if graph.targets[edge] == node:
-            poses[node] = compose(poses[graph.sources[edge]], graph.deltas[edge])
-        else:
-            poses[node] = compose(poses[graph.targets[edge]], inverse(graph.deltas[edge]))
+        poses[node] = _by_edge(graph, poses, best[node], node)
     return poses
+
+
+def _by_edge(graph: PoseGraph, poses: Array, edge: int, node: int) -> Array:
+    """Pose (3,) of one end of an edge, from that of the other end."""
+    if graph.targets[edge] == node:
+        return compose(poses[graph.sources[edge]], graph.deltas[edge])
+    return compose(poses[graph.targets[edge]], inverse(graph.deltas[edge]))
+
+
+def _spread(graph: PoseGraph, poses: Array, done: int) -> Array:
+    """Place the nodes from `done` on outwards from those before, whatever their order; best edges first, as for `extend`."""
+    ends = np.stack([graph.sources, graph.targets])
+    around: list[list[int]] = [[] for _ in range(graph.n_nodes)]
+    for edge, both in enumerate(ends.T.tolist()):
+        for node in both:
+            around[node].append(edge)
+    trust, total = _TRUST[graph.kinds].tolist(), ends.sum(axis=0).tolist()
+    out, placed = poses.copy(), [node < done for node in range(graph.n_nodes)]
+    rim = [(-trust[edge], total[edge] - node, -edge, node) for node in range(done) for edge in around[node]]
+    heapify(rim)
+    while rim:
+        _, node, edge, _ = heappop(rim)
+        if placed[node]:
+            continue
+        out[node], placed[node] = _by_edge(graph, out, -edge, node), True
+        for onward in around[node]:
+            heappush(rim, (-trust[onward], total[onward] - node, -onward, node))
+    if not all(placed):
+        node = placed.index(False)
+        raise GraphError(f"{graph.where}: {graph.node_name(node)} is not connected to {graph.node_name(0)}")
+    return out
 
 
 def own_odometry(graph: PoseGraph) -> Indices:
