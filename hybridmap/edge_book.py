@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hybridmap.backends.base import SolveReport
 from hybridmap.config.mapping import EdgesConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search
@@ -163,15 +162,16 @@ class EdgeBook:
             covariance_from=covariances_from(graph),
         )
 
-    def without_weight(self, report: SolveReport) -> list[Edge]:
-        """The loops proposed by the front-end that a back-end down-weighted as outliers."""
+    def proposed(self, numbers: Sequence[int]) -> list[Edge]:
+        """Of the edges with these numbers, those that the front-end proposed."""
         proposed = set(self._edge_of_proposal.values())
-        return [self._map.edge(number) for number in report.rejected_edge_ids if number in proposed]
+        return [self._map.edge(number) for number in numbers if number in proposed]
 
     def enter_again(self, proposals: Sequence[Edge]) -> list[int]:
-        """Write loops that were measured again into the map, as `enter`, and keep their numbers in `tried_again`."""
-        self.tried_again = tuple(self.enter(proposals))
-        return list(self.tried_again)
+        """Write loops that were measured again into the map, as `enter`, and add their numbers to `tried_again`."""
+        changed = self.enter(proposals)
+        self.tried_again = tuple(sorted({*self.tried_again, *changed}))
+        return changed
 
     def _drop_odometry(self, proposal: Edge) -> list[int]:
         ends = {proposal.source, proposal.target}

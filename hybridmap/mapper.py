@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from hybridmap.graph.experience_map import ExperienceMap, Node, Novelty
 from hybridmap.metrics import StageClock
 from hybridmap.neural.path_integrator import PathIntegrator, Reanchoring
 from hybridmap.odometry_model import Gains
+from hybridmap.second_look import SecondLook
 from hybridmap.streams.base import Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
@@ -26,7 +27,7 @@ from hybridmap.streams.sensors import rig_of
 from hybridmap.streams.synchronise import Ready, Synchroniser
 from hybridmap.trajectory import NO_ANCHORS, stamp_ns_from_s
 from hybridmap.vision import create_front_end
-from hybridmap.vision.base import Belief, DenseFrontEnd, VerifyingFrontEnd, View
+from hybridmap.vision.base import Belief, DenseFrontEnd, View
 
 
 class Mapper:
@@ -59,6 +60,7 @@ class Mapper:
         self.cells = Reanchoring(self.integrator, config.neural.reanchor_weight)
         self.vision = create_front_end(config.vision, rig or rig_of(config.sensors), config.seed, self.clock)
         self.backends = Ensemble(config.backends, self.clock, backends)
+        self.second_look = SecondLook(self.map, self.book, self.backends, self.vision, config)
         self.calibration = OnlineCalibration(Gains.of(config.neural)) if config.calibration.online else None
         self.anchors = NO_ANCHORS
         self._synchroniser = Synchroniser(latency_s=config.sensors.latency_s, odometry_delay_s=config.sensors.odometry_delay_s)
@@ -120,7 +122,7 @@ class Mapper:
         if len(self.map):
             updates += self._propose_again()
             self._correct(final=True)
-            updates += self._verify_again()
+            updates += self._look_again()
             self._measure_between_nodes()
             updates.append(self._position.update("end of the drive"))
         return updates
@@ -167,18 +169,11 @@ class Mapper:
             accepted = any(proposal.status is Status.ACCEPTED for proposal in proposals)
         return updates
 
-    def _verify_again(self) -> list[Update]:
-        """Let vision measure again, on the map of the primary back-end, the loops to which it gave no weight."""
-        solution = self.backends.solutions.get(self.backends.primary)
-        if solution is None or not isinstance(self.vision, VerifyingFrontEnd) or self.config.edges.gate == "odometry":
-            return []
-        outliers = self.book.without_weight(solution.report)
-        with self.clock.stage("matching"):
-            proposals = self.vision.verify(outliers, self.belief(solution.report.rejected_edge_ids)) if outliers else []
-        if not (edges := self.book.enter_again(proposals)):
-            return []
-        self._correct(final=True)
-        return [self._position.update("loops without weight measured again", None, edges)]
+    def _look_again(self) -> Iterator[Update]:
+        """Part the map where the robot was carried unnoticed, and let vision measure again the loops without weight."""
+        for done, edges in self.second_look.take(self.belief, self.clock):
+            self._correct(final=True)
+            yield self._position.update(done, None, edges)
 
     def _measure_between_nodes(self) -> None:
         """Register the frames between nodes to the final map: the dense trajectory."""

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybridmap.backends.base import SolveReport, SolveStatus
 from hybridmap.config import Config
 from hybridmap.config.mapping import EdgesConfig
 from hybridmap.edge_book import EdgeBook
@@ -43,10 +42,6 @@ def book(experiences) -> EdgeBook:
     return EdgeBook(experiences, EdgesConfig())
 
 
-def report(*rejected: int) -> SolveReport:
-    return SolveReport("gtsam-gnc", SolveStatus.CONVERGED, "", 1, 2.0, 1.0, 0.0, rejected)
-
-
 def test_a_later_proposal_of_the_same_key_replaces_the_edge(book, experiences):
     assert book.enter([proposal(7, Status.PENDING)]) == [3]
     assert book.enter([proposal(7), proposal(8, Status.REJECTED)]) == [3, 4]
@@ -58,11 +53,11 @@ def test_a_contradicted_odometry_edge_is_dropped(book, experiences):
     assert (experiences.edge(2).status, experiences.edge(2).lack) == (Status.RETRACTED, Lack.OVERRULED)
 
 
-def test_loops_without_weight_are_named_with_their_keys(book, experiences):
+def test_proposed_edges_are_named_with_their_keys(book, experiences):
     book.enter([proposal(5), proposal(6)])
-    assert [(edge.key, edge.source, edge.target) for edge in book.without_weight(report(4))] == [(6, 3, 0)]
-    assert book.without_weight(report()) == []
-    assert book.without_weight(report(1)) == []  # an edge of the chain was not proposed
+    assert [(edge.key, edge.source, edge.target) for edge in book.proposed([4])] == [(6, 3, 0)]
+    assert book.proposed([]) == []
+    assert book.proposed([1]) == []  # an edge of the chain was not proposed
 
 
 def test_a_loop_that_is_not_found_again_is_retracted(book, experiences):

@@ -324,6 +324,14 @@ class Ensemble:
         for name, backend in self._backends.items():
             self._run(name, backend, graph, final=True)
 
+    def trial(self, graph: PoseGraph) -> Solution | None:
+        """Solve another graph by the primary back-end, whose own state stays as it is; None if it fails."""
+        try:
+            with self._clock.stage(f"backend/{self.primary}"):
+                return self._backends[self.primary].solve(graph)
+        except BackendError:
+            return None
+
     def _run(self, name: str, backend: Backend, graph: PoseGraph, *, final: bool) -> None:
         try:
             with self._clock.stage(f"backend/{name}"):

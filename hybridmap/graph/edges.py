@@ -305,7 +305,7 @@ class Edge:
         if self.contradicts_odometry:
             words.append("contradicts the odometry")
         if self.broken_by:
-            words.append(f"may have been kidnapped: {', '.join(check.miss for check in self.broken_by)}")
+            words.append(f"the chain may be broken: {', '.join(check.miss for check in self.broken_by)}")
         return "; ".join(words) or str(self.status)
 
     @property

@@ -95,7 +95,8 @@ KINDS = {
     "not localised": Kind(
         Verdict.DOUBTFUL,
         "1",
-        "{value:.0f} nodes lie where the odometry has them: the robot may have been kidnapped, its views fit none before",
+        "{value:.0f} nodes lie where the odometry has them: what was seen there does not follow what was seen before, and no"
+        " loop says where the robot was",
     ),
     "messages lost": Kind(Verdict.DOUBTFUL, "%", "{name}: {count} messages ({value:.2g} %) cannot be read"),
 }

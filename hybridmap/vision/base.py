@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hybridmap.geometry import Array, RelativePose, between
 from hybridmap.graph.agreement import Indices
-from hybridmap.graph.edges import Edge
+from hybridmap.graph.edges import Check, Edge
 from hybridmap.streams.base import Observation
 from hybridmap.trajectory import Anchors
 
@@ -110,6 +110,21 @@ class VerifyingFrontEnd(FrontEnd, Protocol):
 
         Returns the loops that changed, each with its key of before; a loop that is not returned stays as it is.
         """
+
+
+@runtime_checkable
+class PartingFrontEnd(FrontEnd, Protocol):
+    """A front-end whose loops are measured by the views of several nodes, and which can be told of a kidnapping afterwards."""
+
+    @property
+    def reach_m(self) -> float:
+        """Travel from a node within which the views of others take part in its loops, m."""
+
+    def way(self, node: int) -> tuple[Check, ...]:
+        """Checks of whether what was seen allows that the robot drove to a node from the one before."""
+
+    def part(self, node: int) -> None:
+        """Note that the robot was kidnapped before a node: from now on nothing joins the views on either side."""
 
 
 @runtime_checkable

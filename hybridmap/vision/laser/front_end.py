@@ -9,20 +9,21 @@ from numpy.typing import NDArray
 
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
-from hybridmap.geometry import IDENTITY, Array, RelativePose, compose
-from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status
+from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose
+from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, Status
 from hybridmap.metrics import StageClock
 from hybridmap.streams.base import Observation, Rig
 from hybridmap.streams.laser import LASER, Laser, LaserScan
 from hybridmap.trajectory import Anchors
 from hybridmap.vision.base import Belief, View
+from hybridmap.vision.laser import checks
 from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan
 from hybridmap.vision.laser.commitment import Commitment
 from hybridmap.vision.laser.dense_trajectory import DenseTrajectory, ObservedScan
-from hybridmap.vision.laser.hypotheses import Prober
+from hybridmap.vision.laser.hypotheses import LENGTH_M, Prober
 from hybridmap.vision.laser.kidnapping import Continuity, GlobalLocalisation
 from hybridmap.vision.laser.revisits import Reviser
-from hybridmap.vision.laser.submap import Atlas
+from hybridmap.vision.laser.submap import Atlas, violation_of_step
 from hybridmap.vision.laser.tracking import Step, Tracker
 from hybridmap.vision.profile import laser_profile
 from hybridmap.vision.templates import ViewTemplates
@@ -35,7 +36,8 @@ MOST_BETWEEN = 30
 
 
 class LaserFrontEnd:
-    """Loop closure by registration of laser submaps; implements `vision.base.DenseFrontEnd`.
+    """Loop closure by registration of laser submaps; implements `vision.base.DenseFrontEnd`, `VerifyingFrontEnd` and
+    `PartingFrontEnd`.
 
     Attributes:
         atlas: the scans of the nodes, from which submaps are made.
@@ -149,6 +151,20 @@ class LaserFrontEnd:
         """Measure again, from the poses of the map, loops that a back-end down-weighted as outliers."""
         poses = belief.poses_map_node
         return [self._reviser.register(edge.source, edge.target, poses, Search.AGAIN).proposed(edge.key) for edge in outliers]
+
+    @property
+    def reach_m(self) -> float:
+        """Travel from a node within which the scans of others take part in its loops, m."""
+        return LENGTH_M
+
+    def way(self, node: int) -> tuple[Check, ...]:
+        """Check whether the scan of a node and the one before look through each other's walls."""
+        motion = between(self.atlas.chain[node - 1], self.atlas.chain[node])
+        return checks.of_way(None, violation_of_step(node, motion, self.atlas, self._laser))
+
+    def part(self, node: int) -> None:
+        """Begin a new piece of the atlas at a node: the robot was kidnapped before it."""
+        self.atlas.part(node)
 
     def dense_trajectory(self, belief: Belief) -> Anchors:
         """Register every scan to the final map; returns the poses between nodes."""

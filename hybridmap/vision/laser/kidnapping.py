@@ -15,7 +15,7 @@ from hybridmap.streams.laser import Laser, LaserScan
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import nodes_within
 from hybridmap.vision.laser import checks
-from hybridmap.vision.laser.cloud import Cloud, build_field, cloud_of_scan, merged_at
+from hybridmap.vision.laser.cloud import build_field, cloud_of_scan, merged_at
 from hybridmap.vision.laser.hypotheses import (
     GATE_DEG,
     GATE_INFLATION,
@@ -27,7 +27,7 @@ from hybridmap.vision.laser.hypotheses import (
     Prober,
 )
 from hybridmap.vision.laser.scan_matching import Prior, align
-from hybridmap.vision.laser.submap import Atlas, Submap, violation_both_ways
+from hybridmap.vision.laser.submap import Atlas, Submap, alone, violation_both_ways, violation_of_step
 from hybridmap.vision.laser.tracking import CONTRADICTION_DEG, CONTRADICTION_M, Step, Tracker
 from hybridmap.vision.profile import Profile
 from hybridmap.vision.relocalising import ChainState, GlobalMatch, Relocaliser, Settlement, Whereabouts, placed_by
@@ -94,8 +94,7 @@ class Continuity:
         sigmas = float(np.sqrt(error @ np.linalg.solve(odometry.covariance, error)))
         if step.measured and sigmas <= checks.CONTRADICTION_SIGMAS:
             return ()
-        last, here = (_alone(self._atlas.clouds[i], i) for i in (node - 1, node))
-        seen = violation_both_ways(here, last, step.relative.delta, self._atlas.ranges, self._laser)
+        seen = violation_of_step(node, step.relative.delta, self._atlas, self._laser)
         if seen <= checks.WAY_VIOLATION or self._follow(node, odometry.delta, on_the_way):
             return ()
         return checks.of_way(sigmas if step.measured else None, seen)
@@ -204,16 +203,11 @@ class Continuity:
         wheels = [IDENTITY, *(motion for motion, _ in on_the_way), odometry]
         for i in range(len(clouds) - 1):
             found = self._tracker.pair(clouds[i], clouds[i + 1], between(wheels[i], wheels[i + 1]))
-            here, there = _alone(clouds[i + 1], i + 1), _alone(clouds[i], i)
+            here, there = alone(clouds[i + 1], i + 1), alone(clouds[i], i)
             seen = violation_both_ways(here, there, found.poses[0], ranges, self._laser)
             if found.inliers[0] < checks.INLIERS_WEAK or seen > checks.WAY_VIOLATION:
                 return False
         return True
-
-
-def _alone(cloud: Cloud, number: int) -> Submap:
-    """A submap of one scan."""
-    return Submap(number, np.array([number]), IDENTITY[None], cloud)
 
 
 UNRECOGNISED_PROBES = 2

@@ -227,6 +227,17 @@ def violation_both_ways(
     return max(forth, violation(there, here, inverse(pose_there_here), ranges, laser))
 
 
+def violation_of_step(node: int, motion: Array, atlas: Atlas, laser: Laser) -> float:
+    """Share of the walls of a node's scan and of the one before in each other's free space, given the motion (3,) between."""
+    last, here = (alone(atlas.clouds[i], i) for i in (node - 1, node))
+    return violation_both_ways(here, last, motion, atlas.ranges, laser)
+
+
+def alone(cloud: Cloud, number: int) -> Submap:
+    """A submap of one scan, that of the node `number`."""
+    return Submap(number, np.array([number]), IDENTITY[None], cloud)
+
+
 def _look(cloud: Cloud, poses_laser_cloud: Array, ranges_m: NDArray[np.float32], laser: Laser) -> tuple[Marks, Marks]:
     """Which points of a cloud are in the free space of each scan, and which are at its ranges; (V, P) each.
 

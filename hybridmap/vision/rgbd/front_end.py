@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, RelativePose
-from hybridmap.graph.edges import Edge
+from hybridmap.graph.edges import Check, Edge
 from hybridmap.metrics import StageClock
 from hybridmap.streams.base import Observation, Rig
 from hybridmap.streams.rgbd import RGBD, Camera, RgbdFrame
@@ -38,7 +38,7 @@ from hybridmap.vision.templates import ViewTemplates
 class RgbdFrontEnd:
     """The RGB-D front-end: profiles, depth registration of consecutive nodes, loops verified by features and depth.
 
-    Implements `vision.base.VerifyingFrontEnd`.
+    Implements `vision.base.VerifyingFrontEnd` and `PartingFrontEnd`.
 
     Args:
         config: settings of the visual side.
@@ -127,6 +127,18 @@ class RgbdFrontEnd:
     def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
         """Measure again, from the poses of the map, loops that a back-end down-weighted as outliers."""
         return self.closer.verify(outliers, belief)
+
+    @property
+    def reach_m(self) -> float:
+        """Zero: a loop is measured by the frames of its two nodes alone."""
+        return 0.0
+
+    def way(self, node: int) -> tuple[Check, ...]:
+        """Check that the depth of a node fits that of the one before no worse than nearly always on this drive."""
+        return self._tracker.way(node)
+
+    def part(self, node: int) -> None:
+        """Nothing to do: no measurement joins frames of more than two nodes."""
 
     @property
     def lost_since(self) -> int | None:

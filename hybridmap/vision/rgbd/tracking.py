@@ -10,7 +10,7 @@ import numpy as np
 
 from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import Array, RelativePose, between, compose, compose_relative, log, loosest_direction
-from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status, passed
+from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, Status, at_most, passed
 from hybridmap.streams.rgbd import Camera
 from hybridmap.vision.rgbd import checks
 from hybridmap.vision.rgbd.depth_grid import place
@@ -32,6 +32,8 @@ HELD_SHARED = 2.0
 """Factor on the covariance of the consecutive edges of a hand-held camera. Three of them span each step. They share keyframes
 whose tilt is measured, and their errors are correlated by about 0.55 (0.2 with a mounted camera in the simulated worlds). A
 chain that takes them for independent claims less than half of its variance, although each edge alone claims the right one."""
+ODD, ODD_FACTOR = 98.0, 1.5
+"""A registration fits oddly badly where its outliers exceed this percentile of the drive's own times this factor."""
 STRAIGHTENED_RAD = float(np.deg2rad(0.4))
 STRAIGHTENED_M = 0.01
 """Standard deviations that a registration adds to a stance that it propagates."""
@@ -56,6 +58,7 @@ class Tracker:
         self._measured: dict[tuple[int, int], RelativePose] = {}
         self._steps: list[RelativePose] = []
         self._refined: list[Array] = []
+        self._outliers: dict[int, float] = {}
 
     def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
         """Register a new node to the ones before it; returns proposed edges from these to the new node.
@@ -74,6 +77,13 @@ class Tracker:
             self._refined[-1] = first.relative.delta
         self._learn(node)
         return proposals
+
+    def way(self, node: int) -> tuple[Check, ...]:
+        """Check that the registration of a node to the one before does not fit much worse than nearly all of the drive's."""
+        if node not in self._outliers:
+            return ()
+        limit = ODD_FACTOR * float(np.percentile(list(self._outliers.values()), ODD))
+        return (at_most("depth_outliers", self._outliers[node], limit),)
 
     def _learn(self, node: int) -> None:
         """Give the noise level the ring of the newest three registrations."""
@@ -94,6 +104,8 @@ class Tracker:
         pairs = self._pairs(fixed, moving, guess)
         fit = register(fixed.surface, moving.surface, guess, prior, pairs)
         proposal = self._judge(node - back, node, fit, prior)
+        if back == 1:
+            self._outliers[node] = 1.0 if fit is None else 1.0 - fit.inliers
         if fit is not None and proposal.status is Status.ACCEPTED:
             if back <= 2:
                 self._measured[node - back, node] = fit.relative

@@ -1,0 +1,131 @@
+"""Rejected loops against the chain of motion: whether a break of the chain before some node frees them.
+
+Robust back-ends take the chain of motion for known. Where the robot was carried, the few edges across then outweigh any
+number of true loops. Those loops agree with each other all the same: they want the rest of the map moved alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.backends.judging.clusters import loops_of
+from hybridmap.backends.objective import squared_norms
+from hybridmap.geometry import Array, between, compose, inverse, wrap_angle
+from hybridmap.graph.agreement import Indices
+from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.pose_graph import PoseGraph
+
+Mask = NDArray[np.bool_]
+
+LEAST_LOOPS, LEAST_NODES = 6, 4
+"""Fewest loops of a group, and fewest newer nodes that they come from: similar places seldom agree so often."""
+OUTWEIGHS = 4.0
+"""The freed loops must be so many times those that are lost."""
+GAIN = 0.5
+"""Least fall of the truncated cost, as a share of what the freed loops cost while they were rejected."""
+SAME_M, SAME_DEG = 0.1, 2.0
+"""Loops that move the map by less contradict the noise of the solution and not the solution, m and degrees."""
+LOOSE_M, LOOSE_RAD = 0.5, float(np.deg2rad(10.0))
+"""Standard deviations of the edge in place of a chain that is taken apart, m and rad: loose, as the loops place the node."""
+
+
+def is_group(graph: PoseGraph, edges: Indices) -> bool:
+    """Whether loops, given by index, are enough, from enough newer nodes, to be believed together."""
+    newer = np.maximum(graph.sources[edges], graph.targets[edges])
+    return len(edges) >= LEAST_LOOPS and len(np.unique(newer)) >= LEAST_NODES
+
+
+def moves(motion: Array, poses: Array, place: int) -> bool:
+    """Whether a transform (3,) of the map moves a node by more than the noise of a solution."""
+    shift_m, shift_deg = shift(motion, poses, place)
+    return shift_m > SAME_M or shift_deg > SAME_DEG
+
+
+def shift(motion: Array, poses: Array, place: int) -> tuple[float, float]:
+    """How far a transform (3,) of the map moves a node: distance, m, and turn, degrees."""
+    off = between(poses[place], compose(motion, poses[place]))
+    return float(np.hypot(off[0], off[1])), float(np.rad2deg(abs(off[2])))
+
+
+def leads_across(graph: PoseGraph, place: int) -> Mask:
+    """(E,) which edges lead from a node before `place` to that node or a later one."""
+    low, high = np.minimum(graph.sources, graph.targets), np.maximum(graph.sources, graph.targets)
+    return np.asarray((low < place) & (high >= place))
+
+
+def wanted_motion(graph: PoseGraph, poses: Array, edges: Indices, place: int) -> Array:
+    """The transform (3,) of the map that loops, given by index, want: the median of where they put the node `place`."""
+    loops = loops_of(graph, edges)
+    seen = compose(poses[loops.older], loops.relative.delta)
+    placed = compose(seen, between(poses[loops.newer], np.broadcast_to(poses[place], (len(seen), 3))))
+    turn = np.median(wrap_angle(placed[:, 2] - poses[place, 2]))
+    return compose(np.array([*np.median(placed[:, :2], axis=0), poses[place, 2] + turn]), inverse(poses[place]))
+
+
+def loosened(graph: PoseGraph, poses: Array, place: int, motion: Array) -> PoseGraph:
+    """The graph with the chain loosened before a node, and the nodes from there on moved by a transform (3,) of the map.
+
+    One loose edge takes the place of the edges of motion that lead across; its number follows the highest.
+    """
+    moved = np.concatenate([poses[:place], compose(motion, poses[place:])])
+    kept = graph.with_edges(~(graph.is_motion & leads_across(graph, place)))
+    information = np.diag(1.0 / np.array([LOOSE_M, LOOSE_M, LOOSE_RAD]) ** 2)
+    return replace(
+        kept,
+        initial=moved,
+        sources=np.append(kept.sources, place - 1),
+        targets=np.append(kept.targets, place),
+        deltas=np.concatenate([kept.deltas, between(moved[place - 1], moved[place])[None]]),
+        information=np.concatenate([kept.information, information[None]]),
+        kinds=np.append(kept.kinds, np.int8(EdgeKind.REGISTRATION)),
+        edge_ids=np.append(kept.edge_ids, graph.edge_ids.max() + 1),
+        entered=None if kept.entered is None else np.append(kept.entered, graph.n_nodes - 1),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Freed:
+    """What a solution with the chain loosened before a node changes.
+
+    Attributes:
+        loops: (F,) edge ids of the loops that were rejected and now fit.
+        lost: number of loops that fitted and are now rejected.
+        gain: fall of the truncated cost.
+        motion: (3,) how the node has moved on the map against the one before it, as a transform of the map, m and rad.
+        pays: whether so many loops are freed at so little cost that the chain was wrong.
+    """
+
+    loops: Indices
+    lost: int
+    gain: float
+    motion: Array
+    pays: bool
+
+
+def freed(graph: PoseGraph, poses: Array, solved: Array, place: int, gate: float, clear: Mask) -> Freed:
+    """Compare the solution with that of the graph whose chain is loosened before a node.
+
+    Args:
+        graph: the graph with its chain.
+        poses: (N, 3) its solution, m and rad.
+        solved: (N, 3) solution of the loosened graph.
+        place: the node.
+        gate: squared residual beyond which a loop is an outlier, at which its cost is truncated.
+        clear: (E,) edges that may be lost. A loop that is measured by views from both sides of the place fits neither map.
+    """
+    before, after = squared_norms(graph, poses), squared_norms(graph, solved)
+    loops, motion_edges = graph.is_loop, graph.is_motion & ~leads_across(graph, place)
+    edges = np.flatnonzero(loops & (before > gate) & (after <= gate))
+    lost = int(np.count_nonzero(loops & clear & (before <= gate) & (after > gate)))
+    fall = np.minimum(before, gate) - np.minimum(after, gate)
+    crossing = before[graph.is_motion & leads_across(graph, place)].sum()
+    counted = loops & (clear | (fall > 0.0))
+    gain = float(fall[counted].sum() + (before - after)[motion_edges].sum() + crossing)
+    expected = compose(solved[place - 1], between(poses[place - 1], poses[place]))
+    motion = compose(solved[place], inverse(expected))
+    worth = gain > GAIN * gate * len(edges) and len(edges) >= OUTWEIGHS * lost
+    pays = bool(worth and is_group(graph, edges) and moves(motion, poses, place))
+    return Freed(graph.edge_ids[edges], lost, gain, motion, pays)

@@ -1,0 +1,227 @@
+"""After the drive: was the robot carried where nobody noticed, and do the loops that the solver rejected fit after all?
+
+A short carry passes for a bad registration, and a robust back-end then rejects every true loop that contradicts it. Here the
+chain is loosened at the places that betray themselves. Where that frees many loops and costs few, the robot was kidnapped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.backends.base import Solution
+from hybridmap.backends.driver import Ensemble
+from hybridmap.backends.judging.breaks import (
+    LEAST_LOOPS,
+    Freed,
+    freed,
+    leads_across,
+    loosened,
+    shift,
+    wanted_motion,
+)
+from hybridmap.backends.judging.clusters import rejected_clusters
+from hybridmap.backends.judging.rivals import rivals, spans
+from hybridmap.backends.objective import gate_of
+from hybridmap.config import Config
+from hybridmap.edge_book import EdgeBook
+from hybridmap.geometry import Array, RelativePose, between, log
+from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, at_most
+from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.metrics import StageClock
+from hybridmap.vision.base import Belief, FrontEnd, PartingFrontEnd, VerifyingFrontEnd
+from hybridmap.vision.relocalising import REATTACHED_M, REATTACHED_RAD
+
+Indices = NDArray[np.int64]
+
+ODD, ODD_FACTOR = 98.0, 1.5
+"""A registration differs oddly from the odometry beyond this percentile of the drive's own steps times this factor."""
+TRIED = 3
+"""Places that are tried for each sign of a break: those where it is strongest."""
+EQUAL = 0.5
+"""A place is as good as the best one if it gains this share: which one it was, the signs say."""
+MOST_CARRIES = 4
+"""Kidnappings that are looked for one after the other."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Trial:
+    """The chain loosened before a node.
+
+    Attributes:
+        place: the node.
+        signs: failed checks of whether the robot drove there from the node before.
+        solved: (N, 3) poses with the loose chain, m and rad.
+        found: what that changes.
+        blurred: numbers of the loops that are measured by views from both sides.
+    """
+
+    place: int
+    signs: tuple[Check, ...]
+    solved: Array
+    found: Freed
+    blurred: tuple[int, ...]
+
+
+class SecondLook:
+    """Takes the final map apart where the robot was carried unnoticed; measures again the loops that the solver rejects."""
+
+    def __init__(
+        self, experiences: ExperienceMap, book: EdgeBook, backends: Ensemble, vision: FrontEnd | None, config: Config
+    ) -> None:
+        """Look at a map by the solutions of the primary back-end, with a front-end that may test and measure."""
+        self._map = experiences
+        self._book = book
+        self._backends = backends
+        self._vision = vision
+        self._gate = gate_of(config.backends)
+        self._enabled, self._may_part = config.edges.gate != "odometry", config.vision.relocalising.enabled
+
+    def take(self, belief: Callable[[Sequence[int]], Belief], clock: StageClock) -> Iterator[tuple[str, list[int]]]:
+        """Change edges of the map in steps; the graph must be solved for good before the first step and after each.
+
+        Args:
+            belief: the map without the edges of the numbers given.
+            clock: measures the time (stage `matching`).
+
+        Yields:
+            What was done, and the numbers of the edges that changed.
+        """
+        if not self._enabled:
+            return
+        for _ in range(MOST_CARRIES):
+            if (solution := self._solution()) is None:
+                return
+            trial = self._break(self._map.pose_graph(), solution)
+            if trial is None:
+                break
+            edges = self._parted(solution.poses, trial)
+            there = replace(belief(trial.blurred), poses_map_node=trial.solved)
+            edges += self._measured(trial.blurred, there, clock)
+            yield "a kidnapping was found on the final map", edges
+        if (solution := self._solution()) is None:
+            return
+        outliers = solution.report.rejected_edge_ids
+        if edges := self._measured(outliers, belief(outliers), clock):
+            yield "loops without weight measured again", edges
+
+    def _solution(self) -> Solution | None:
+        return self._backends.solutions.get(self._backends.primary)
+
+    def _break(self, graph: PoseGraph, solution: Solution) -> _Trial | None:
+        """Find the place whose loosening frees the most loops; None if there is none that shows signs of a break."""
+        ids, poses = solution.report.rejected_edge_ids, solution.poses
+        outliers = np.isin(graph.edge_ids, ids) & graph.is_loop
+        if not self._may_part or np.count_nonzero(outliers) < LEAST_LOOPS:
+            return None
+        spanned = np.flatnonzero(spans(graph, outliers) >= LEAST_LOOPS)
+        asked = self._asked(spanned)
+        groups = rejected_clusters(graph, poses, ids, self._gate)
+        places = {one.node for one in rivals(graph, poses, groups, graph.is_loop & ~outliers) if one.spanning >= LEAST_LOOPS}
+        paying = []
+        for place in sorted(places | _oddest(asked)):
+            signs = tuple(check for check in asked.get(place, ()) if not check.passed)
+            trial = self._trial(graph, poses, np.flatnonzero(outliers), place, signs)
+            if trial is not None and trial.found.pays:
+                paying.append(trial)
+        most = max((trial.found.gain for trial in paying), default=0.0)
+        good = [trial for trial in paying if trial.signs and trial.found.gain >= EQUAL * most]
+        return max(good, key=lambda trial: (len(trial.signs), trial.found.gain), default=None)
+
+    def _asked(self, places: Indices) -> dict[int, tuple[Check, ...]]:
+        """Checks of whether the robot drove to each of some nodes: registration against wheels, and what it saw."""
+        sigmas = _odometry_sigmas(self._map)
+        odd = ODD_FACTOR * float(np.percentile(list(sigmas.values()), ODD)) if sigmas else 0.0
+        out: dict[int, tuple[Check, ...]] = {}
+        for place in places.tolist():
+            way = self._vision.way(place) if isinstance(self._vision, PartingFrontEnd) else ()
+            out[place] = (at_most("odometry_sigma", sigmas.get(place, 0.0), odd), *way)
+        return out
+
+    def _trial(self, graph: PoseGraph, poses: Array, rejected: Indices, place: int, signs: tuple[Check, ...]) -> _Trial | None:
+        """Solve the graph with its chain loosened before a node; None if the back-end cannot."""
+        clear = self._clear(graph, place)
+        voting = rejected[leads_across(graph, place)[rejected]]
+        motion = wanted_motion(graph, poses, voting, place)
+        solved = self._backends.trial(loosened(graph.with_edges(clear), poses, place, motion))
+        if solved is None:
+            return None
+        found = freed(graph, poses, solved.poses, place, self._gate, clear)
+        return _Trial(place, signs, solved.poses, found, tuple(graph.edge_ids[~clear].tolist()))
+
+    def _clear(self, graph: PoseGraph, place: int) -> NDArray[np.bool_]:
+        """(E,) edges but the loops across a node that are measured by views from both sides of it."""
+        travel_m = np.array([node.travel_m for node in self._map.nodes])
+        reach_m = self._vision.reach_m if isinstance(self._vision, PartingFrontEnd) else 0.0
+        low, high = np.minimum(graph.sources, graph.targets), np.maximum(graph.sources, graph.targets)
+        near = (travel_m[high] - travel_m[place] < reach_m) | (travel_m[place] - travel_m[low] <= reach_m)
+        return np.asarray(~(graph.is_loop & leads_across(graph, place) & near & (reach_m > 0.0)))
+
+    def _parted(self, poses: Array, trial: _Trial) -> list[int]:
+        """Write a break into the map with poses (N, 3): no motion leads across it, but a loose edge by way of the loops."""
+        place, graph, changed = trial.place, self._map.pose_graph(), []
+        for number in graph.edge_ids[graph.is_motion & leads_across(graph, place)].tolist():
+            edge = self._map.edge(number)
+            broken_by = trial.signs if (edge.source, edge.target) == (place - 1, place) else ()
+            edge = replace(edge.settled(lack=Lack.KIDNAPPED), broken_by=broken_by, contradicts_odometry=False, since_node=-1)
+            self._map.update_edge(number, edge)
+            changed.append(number)
+        covariance = np.diag([REATTACHED_M, REATTACHED_M, REATTACHED_RAD]) ** 2
+        reattached = Edge.decided(
+            place - 1,
+            place,
+            EdgeKind.REGISTRATION,
+            RelativePose(between(trial.solved[place - 1], trial.solved[place]), covariance),
+            method=Method.LOOPS,
+            figures={"agreeing": float(len(trial.found.loops))},
+            kidnapped_m=shift(trial.found.motion, poses, place)[0],
+            contradicts_odometry=True,
+        )
+        if isinstance(self._vision, PartingFrontEnd):
+            self._vision.part(place)
+        return [*changed, self._map.add_edge(reattached)]
+
+    def _measured(self, numbers: Sequence[int], belief: Belief, clock: StageClock) -> list[int]:
+        """Let vision measure loops again, from the map without them; returns the numbers of the edges that changed."""
+        loops = self._book.proposed(numbers)
+        if not loops or not isinstance(self._vision, VerifyingFrontEnd):
+            return []
+        with clock.stage("matching"):
+            proposals = self._vision.verify(loops, belief)
+        return self._book.enter_again(proposals)
+
+
+def _odometry_sigmas(experiences: ExperienceMap) -> dict[int, float]:
+    """Node -> how its registration to the node before differs from the odometry, in standard deviations of the latter."""
+    odometry: dict[int, RelativePose] = {}
+    out: dict[int, float] = {}
+    for edge in experiences.edges:
+        if edge.relative is None or edge.source != edge.target - 1 or _is_break(edge):
+            continue
+        if edge.kind is EdgeKind.ODOMETRY:
+            odometry[edge.target] = edge.relative
+        elif edge.kind is EdgeKind.REGISTRATION and edge.target in odometry:
+            wheels = odometry[edge.target]
+            error = log(between(wheels.delta, edge.relative.delta))
+            out[edge.target] = float(np.sqrt(error @ np.linalg.solve(wheels.covariance, error)))
+    return out
+
+
+def _is_break(edge: Edge) -> bool:
+    """Whether an edge belongs to a kidnapping that is known."""
+    return edge.kidnapped_m is not None or edge.lack is Lack.KIDNAPPED
+
+
+def _oddest(asked: Mapping[int, Sequence[Check]]) -> set[int]:
+    """For each check, the nodes that fail it by most."""
+    out: set[int] = set()
+    for index in range(max(map(len, asked.values()), default=0)):
+        worst = [
+            (checks[index].slack, node) for node, checks in asked.items() if len(checks) > index and not checks[index].passed
+        ]
+        out |= {node for _, node in sorted(worst)[:TRIED]}
+    return out

@@ -1,0 +1,94 @@
+"""A carry that nobody noticed while driving is found on the final map, by evidence alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybridmap.config import Config
+from hybridmap.geometry import RelativePose, align, between, compose, inverse
+from hybridmap.graph.edges import EdgeKind, Lack, Status
+from hybridmap.graph.gaps import kidnappings
+from hybridmap.mapper import Mapper
+from hybridmap.simulation import SimulatedStream
+from tests.narrowing import known
+from tests.streams_for_tests import RoomDrive
+
+
+def drive(named, world, carried_m, seed=1):
+    settings = {"simulation.world": world, "simulation.carried_m": carried_m, "backends.names": ["gtsam-gnc"]}
+    if named == "laser":
+        settings["simulation.sensors"] = "laser"
+    config = Config.load(named, settings)
+    stream = SimulatedStream(config.simulation, seed)
+    mapper = Mapper(config, stream.rig)
+    for sample in stream:
+        mapper.add(sample)
+    mapper.finish()
+    return stream, mapper
+
+
+def error_m(stream, mapper):
+    truth = stream.groundtruth.at(np.array([node.stamp_ns for node in mapper.map.nodes]))
+    poses = mapper.poses()
+    return float(np.sqrt(np.mean(np.sum((compose(align(truth, poses), poses) - truth)[:, :2] ** 2, axis=1))))
+
+
+@pytest.mark.parametrize(
+    ("named", "carried_m"),
+    [("laser", 0.75), ("laser", 1.0), ("laser", 2.0), *(pytest.param("rgbd", m, marks=pytest.mark.slow) for m in (0.3, 1.0))],
+)
+def test_a_short_carry_is_found_and_the_map_is_right(named, carried_m):
+    stream, mapper = drive(named, "lab", carried_m)
+    stamps = np.array([node.stamp_ns for node in mapper.map.nodes])
+    down = int(np.searchsorted(stamps, stream.groundtruth.stamps_ns[known(stream.carry).last]))
+    assert [(one.before, one.after) for one in kidnappings(mapper.map)] == [(down - 1, down)]
+    assert error_m(stream, mapper) < 0.02
+    crossing = [e for e in mapper.map.edges if e.source < down <= e.target and e.kind is EdgeKind.REGISTRATION]
+    broken = [edge for edge in crossing if edge.lack is Lack.KIDNAPPED]
+    assert broken
+    assert all(edge.status is Status.RETRACTED for edge in broken)
+    assert any(not check.passed for edge in broken for check in edge.broken_by)
+
+
+def test_a_drive_without_a_carry_is_left_alone():
+    stream, mapper = drive("laser", "lab", None)
+    assert kidnappings(mapper.map) == ()
+    assert error_m(stream, mapper) < 0.02
+
+
+def mapped(stream):
+    mapper = Mapper(Config.load("laser", {"backends.names": ["gtsam-gnc"]}), stream.rig)
+    for sample in stream:
+        mapper.add(sample)
+    mapper.finish()
+    return mapper
+
+
+def test_false_loops_that_agree_move_nothing_where_the_chain_shows_no_break(monkeypatch):
+    mapper = mapped(RoomDrive(laps=0.9))
+    poses, last = mapper.poses(), len(mapper.map) - 1
+    model = next(e for e in mapper.map.edges if e.kind is EdgeKind.REGISTRATION)
+    motion = np.array([0.8, -0.5, 0.2])
+    false = []
+    for count, newer in enumerate(range(last - 7, last + 1)):
+        relative = between(poses[count], compose(motion, poses[newer]))
+        loop = replace(
+            model,
+            source=newer,
+            target=count,
+            kind=EdgeKind.LOOP,
+            relative=RelativePose(inverse(relative), np.diag([1e-4, 1e-4, 1e-5])),
+            checks=(),
+            key=900 + count,
+            since_node=-1,
+        )
+        false.append(loop)
+    entered = mapper.book.enter(false)
+    monkeypatch.setattr(mapper.vision, "verify", lambda outliers, belief: [])  # else it would measure them rightly
+    mapper.finish()
+    assert kidnappings(mapper.map) == ()
+    assert len(set(entered) & set(mapper.backends.solutions["gtsam-gnc"].report.rejected_edge_ids)) >= 6
+    np.testing.assert_allclose(mapper.poses(), poses, atol=0.01)
