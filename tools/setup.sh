@@ -55,13 +55,14 @@ create_venv() {
   "$python" -m venv "$venv" || die "$python could not create $venv (see above)"
 }
 
-# Everything that the installed packages depend on: the declared dependencies, the Python version, and the path of the
+# Everything that the installed packages depend on: the declared dependencies, the tested versions, the Python version, and the path of the
 # checkout, because an editable install and the shebangs hold absolute paths.
 fingerprint() {
   "$venv/bin/python" - "$root" <<'PY'
 import hashlib, pathlib, sys
 root = pathlib.Path(sys.argv[1])
-print(hashlib.sha256((root / "pyproject.toml").read_bytes()).hexdigest(), sys.version.split()[0], root)
+declared = (root / "pyproject.toml").read_bytes() + (root / "constraints.txt").read_bytes()
+print(hashlib.sha256(declared).hexdigest(), sys.version.split()[0], root)
 PY
 }
 
@@ -72,8 +73,10 @@ installed() {
 install_packages() {
   say "installing hybridmap and its dependencies into .venv (a minute or two, 2 GB on disk)"
   rm -f "$stamp"
-  "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --retries 5 --editable "$root[dev]" ||
-    die "pip could not install the dependencies (see above); run it again once the cause is gone"
+  "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --retries 5 \
+    --constraint "$root/constraints.txt" --editable "$root[dev]" ||
+    die "pip could not install the dependencies (see above); run it again once the cause is gone. Where a version of" \
+      "constraints.txt does not exist for this Python, take that line out"
 }
 
 package_of() {
