@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+_ROUNDED = 1e-3  # a unit quaternion with four decimals has a squared length this far from 1 at most
 
 IDENTITY: Array = np.zeros(3)
 IDENTITY.setflags(write=False)
@@ -160,9 +161,17 @@ def interpolate(pose_a_i: ArrayLike, pose_a_j: ArrayLike, fraction: ArrayLike) -
 
 
 def yaw_from_quaternion(x: ArrayLike, y: ArrayLike, z: ArrayLike, w: ArrayLike) -> Array:
-    """Heading of a unit quaternion about the z axis, rad. The one conversion that every reader uses."""
+    """Heading of a quaternion about the z axis, rad; NaN if it is no rotation. The one conversion that every reader uses.
+
+    A quaternion that is not of length 1, by more than rounding, is normalised first. One of length 0 or infinity is no
+    rotation.
+    """
     qx, qy, qz, qw = (np.asarray(q, dtype=np.float64) for q in (x, y, z, w))
-    return np.asarray(np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz)))
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        squared = qx * qx + qy * qy + qz * qz + qw * qw
+        usable = (squared > 0.0) & np.isfinite(squared)
+        scale = np.where(np.abs(squared - 1.0) <= _ROUNDED, 1.0, np.where(usable, 1.0 / squared, np.nan))
+        return np.asarray(np.arctan2(scale * (2.0 * (qw * qz + qx * qy)), 1.0 - scale * (2.0 * (qy * qy + qz * qz))))
 
 
 def quaternion_from_yaw(yaw_rad: ArrayLike) -> Array:

@@ -183,10 +183,12 @@ def holds_only(folder: Path, names: tuple[str, ...]) -> bool:
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically: a reader or a crash never sees a partial file. Makes the file's folder if needed.
 
+    Names of files that are not UTF-8 are written with their bytes as numbers.
+
     Raises:
         OutputError: the file cannot be written.
     """
-    write_bytes(path, text.encode("utf-8"))
+    write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def write_bytes(path: Path, content: bytes) -> None:

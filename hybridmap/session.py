@@ -89,6 +89,8 @@ def _drive(stream: Stream, mapper: Mapper, recorder: _Recorder, progress: Progre
             observations += 1
             if progress is not None:
                 progress(observations, stream.expected_observations)
+    for name, (gone, stated) in stream.report.lost.items():
+        log.warning("%s: %s: %d messages of %d are damaged or missing; they were left out", stream.name, name, gone, stated)
     for update in mapper.finish():
         recorder.record(update)
     if not len(mapper.map):
@@ -193,6 +195,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
         "source": stream.name,
         "failed_backends": dict(mapper.backends.failures),
         "stream": dict(stream.report.counts),
+        "lost": {name: list(counts) for name, counts in stream.report.lost.items()},
         "remarks": [
             *stream.report.remarks,
             *map(str, _gain_changes(mapper)),

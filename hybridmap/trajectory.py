@@ -14,8 +14,40 @@ from hybridmap.geometry import Array, between, compose, interpolate, quaternion_
 from hybridmap.output import write_text
 
 NS_PER_S = 1_000_000_000
+FARTHEST_M = 1e9
+"""Coordinates of a pose, m, beyond which they have no millionths left; no map of the earth has them."""
 MAX_GAP_S = 1.0
 """A reference is interpolated between two of its poses only if they are no further apart than this."""
+
+
+_LATEST_S = 9_000_000_000
+"""The year 2255. Later stamps do not fit into 64 bits of nanoseconds; those of other units than seconds are far beyond."""
+_UNITS = {"milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}
+_MOST_DIGITS = 40
+"""Characters of a stamp: 10 digits of seconds, a point and 9 decimals are 20. A number of 10^999990 takes half a minute."""
+
+
+def read_stamp_ns(text: str) -> int:
+    """Nearest whole nanosecond of a stamp in seconds, as files have it.
+
+    Raises:
+        ValueError: no number, or one that is no time in seconds; the message says what was found and what was expected.
+    """
+    try:
+        stamp_s = Decimal(text) if len(text) <= _MOST_DIGITS else None
+    except InvalidOperation:
+        stamp_s = None
+    if stamp_s is None or not stamp_s.is_finite():
+        raise ValueError(f"expected a stamp in seconds, found {quoted(text)}")
+    if abs(stamp_s) > _LATEST_S:
+        unit = next((name for name, per_s in _UNITS.items() if abs(stamp_s) <= _LATEST_S * per_s), None)
+        guess = f", which would be the year {_year(stamp_s / _UNITS[unit])} in {unit}" if unit else ""
+        raise ValueError(f"expected a stamp in seconds, found {quoted(text)}{guess}; convert it to seconds")
+    return int((stamp_s * NS_PER_S).to_integral_value())
+
+
+def _year(stamp_s: Decimal) -> int:
+    return 1970 + int(stamp_s / 31_556_952)  # seconds of a year, on average
 
 
 def stamp_ns_from_s(stamp_s: float) -> int:
@@ -134,16 +166,23 @@ def read_tum(path: Path) -> Trajectory:
         if not text:
             continue
         try:
-            stamp_ns = int((Decimal(text[0]) * NS_PER_S).to_integral_value())
             row = [float(field) for field in text[1:]]
-        except (InvalidOperation, ValueError, OverflowError):
+        except ValueError:
             raise StreamError(f"{path}:{number}: expected numbers, found {quoted(line)}") from None
+        try:
+            stamp_ns = read_stamp_ns(text[0])
+        except ValueError as error:
+            raise StreamError(f"{path}:{number}: {error}") from None
         if len(row) != 7 or not np.isfinite(row).all():
             raise StreamError(
                 f"{path}:{number}: expected 8 finite numbers `stamp x y z qx qy qz qw`, found {len(text)}"
                 if len(row) != 7
                 else f"{path}:{number}: found NaN or Inf, expected finite numbers"
             )
+        if max(map(abs, row[:3])) > FARTHEST_M:
+            raise StreamError(f"{path}:{number}: found the position {quoted(' '.join(text[1:4]))}, expected metres below 1e9")
+        if np.isnan(yaw_from_quaternion(*row[3:])):
+            raise StreamError(f"{path}:{number}: found the quaternion {quoted(' '.join(text[4:]))}, expected a rotation")
         if stamps and stamp_ns < stamps[-1]:
             raise StreamError(f"{path}:{number}: stamp {text[0]} goes back behind the line before; expected sorted stamps")
         if stamps and stamp_ns == stamps[-1]:

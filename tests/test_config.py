@@ -11,6 +11,7 @@ from configuration_page import PAGE, count, page, tables
 from pydantic import ValidationError
 
 from hybridmap.config import Config, gone, named_configs
+from hybridmap.config.section import value_of
 from hybridmap.errors import ConfigError
 
 BEFORE = Path(__file__).with_name("config_before.yaml")
@@ -163,3 +164,44 @@ def test_every_named_configuration_loads_and_its_resolved_form_is_itself(name, t
     config = Config.load(name)
     (tmp_path / "resolved.yaml").write_text(config.to_yaml())
     assert Config.load(tmp_path / "resolved.yaml") == config
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 3000,
+        "{a: " * 3000 + "1" + "}" * 3000,
+        "- " * 3000,
+        "a: &a [*a]",
+        "a: &a [1,1,1,1,1,1,1,1,1,1]\n" + "".join(f"x{i}: &{chr(98 + i)} [{f'*{chr(97 + i)},' * 10}]\n" for i in range(9)),
+        "9" * 6000,
+        "2001-99-99",
+        "!!timestamp x",
+        "!!bool x",
+        "? [a]\n: 1",
+        "!!python/object:os.system x",
+        "a: 1\n" * 2_500_000,
+    ],
+    ids=lambda text: text[:20],
+)
+def test_a_document_that_no_reader_should_take_is_refused_at_once(text):
+    with pytest.raises(ConfigError) as caught:
+        value_of(text, "here")
+    assert len(str(caught.value)) < 300
+    assert str(caught.value).startswith("here: ")
+
+
+@pytest.mark.parametrize(
+    "key", ["backends.max_iterations", "nodes.distance_m", "sensors.sync_tolerance_s", "vision.rgbd.max_width_px"]
+)
+def test_a_setting_of_a_billion_is_refused_before_anything_is_made_of_it(key):
+    with pytest.raises(ConfigError, match=key.replace(".", r"\.")):
+        Config.load(None, {key: 10**9})
+
+
+def test_a_mounting_without_rotation_and_a_lens_of_three_numbers_are_refused():
+    with pytest.raises(ConfigError, match="quaternion"):
+        Config.load(None, {"sensors.camera_mounting": {"translation_m": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 0]}})
+    intrinsics = {"width_px": 8, "height_px": 6, "fx_px": 5, "fy_px": 5, "cx_px": 4, "cy_px": 3, "distortion": [0.1, 0.2, 0.3]}
+    with pytest.raises(ConfigError, match="distortion"):
+        Config.load(None, {"sensors.camera_intrinsics": intrinsics})

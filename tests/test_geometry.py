@@ -94,3 +94,10 @@ def test_inverted_relative_pose_agrees_with_samples():
 def test_small_angles_are_smooth(yaw):
     a = np.array([1.0, 2.0, yaw])
     assert close(g.exp(g.log(a)), a, 1e-12)
+
+
+def test_a_quaternion_of_another_length_has_the_same_heading_and_none_has_none():
+    unit = g.quaternion_from_yaw(np.array([0.3, -2.0, 3.0]))
+    assert np.allclose(g.yaw_from_quaternion(*(2.5 * unit).T), [0.3, -2.0, 3.0])
+    for none in ((0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1e300, 1.0), (0.0, 0.0, np.nan, 1.0), (0.0, 0.0, np.inf, 1.0)):
+        assert np.isnan(g.yaw_from_quaternion(*none))

@@ -45,7 +45,13 @@ def test_negative_stamp_is_exact():
         ("1 2 3\n", "expected 8"),
         ("1 nan 0 0 0 0 0 1\n", "NaN"),
         ("2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "goes back"),
-        ("x 0 0 0 0 0 0 1\n", "expected numbers"),
+        ("x 0 0 0 0 0 0 1\n", "expected a stamp"),
+        ("1 0 0 0 0 0 y 1\n", "expected numbers"),
+        ("1700000000123 0 0 0 0 0 0 1\n", "milliseconds"),
+        ("1700000000123456789 0 0 0 0 0 0 1\n", "nanoseconds"),
+        ("1e999990 0 0 0 0 0 0 1\n", "expected a stamp"),
+        ("1 0 0 0 0 0 0 0\n", "expected a rotation"),
+        ("1 1e12 0 0 0 0 0 1\n", "expected metres"),
     ],
 )
 def test_damage_is_named_with_its_line(tmp_path, text, expected):

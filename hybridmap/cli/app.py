@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import sys
@@ -79,6 +80,8 @@ def main() -> None:
     """Run the command line. Every error is printed as one line on standard error, with exit code 2."""
     os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")  # pictures are small: a second thread costs more than it gives
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # a damaged picture is reported by our own line
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 26))  # as `streams.cameras.MOST_PIXELS`, for every format
+    _print_every_name()
     try:
         _refuse_empty(sys.argv[1:])
         code = app(prog_name="hybridmap", standalone_mode=False)
@@ -95,6 +98,13 @@ def main() -> None:
     if code == _INTERRUPTED:
         print("hybridmap: interrupted", file=sys.stderr)  # noqa: T201
     raise SystemExit(code if isinstance(code, int) else 0)
+
+
+def _print_every_name() -> None:
+    """Let names of files that are not in the terminal's encoding be printed, with their bytes as numbers."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _refuse_empty(arguments: Sequence[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from hybridmap.config import Config
@@ -46,6 +47,7 @@ def choose(
     *,
     start_s: float | None = None,
     end_s: float | None = None,
+    skip_damaged: bool = False,
 ) -> OpenedSource:
     """Open a source (recording or simulated world) and load its configuration.
 
@@ -57,21 +59,23 @@ def choose(
         config_name: name or path of a configuration.
         overrides: dotted key -> value, applied last.
         start_s, end_s: the part of the source to read, seconds after its first stamp.
+        skip_damaged: leave out damaged scans and pictures, and count them.
 
     Raises:
         StreamError: the source cannot be opened.
         ConfigError: the configuration does not exist or is not valid.
     """
+    opened = partial(open_stream, source, start_s=start_s, end_s=end_s, skip_damaged=skip_damaged)
     if config_name is None:
         config_name = world_of(source)
     if config_name is not None:
         config = Config.load(config_name, overrides)
-        return OpenedSource(open_stream(source, config, start_s=start_s, end_s=end_s), config)
+        return OpenedSource(opened(config), config)
     default = Config.load(None, overrides)
-    stream = open_stream(source, default, start_s=start_s, end_s=end_s)
+    stream = opened(default)
     config = _config_for(stream.rig, overrides)
     if config.sensors != default.sensors:
-        stream = open_stream(source, config, start_s=start_s, end_s=end_s)
+        stream = opened(config)
     return OpenedSource(stream, config)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hybridmap.cli.map import LOST
 from hybridmap.cli.options import OdometryFile, Source, Topic, sensor_settings
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ def inspect(
         list[str] | None,
         typer.Option("--set", help="KEY=VALUE, e.g. sensors.sync_tolerance_s=0.05. Keys: docs/configuration.md."),
     ] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit code 3 if messages of the recording were lost.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
     """Show what a recording holds (topics, rates in Hz, spans in s), what mapping would use, and what is missing or damaged."""
@@ -53,6 +55,8 @@ def inspect(
         sys.stdout.write(to_json(_head(found), _metrics(found)) + "\n")
     else:
         _show(found)
+    if strict and found.lost:
+        raise typer.Exit(LOST)
 
 
 def _head(found: Inspection) -> dict[str, Any]:
@@ -65,6 +69,7 @@ def _head(found: Inspection) -> dict[str, Any]:
         "sensor": _sensor(found),
         "remarks": found.remarks,
         "problems": found.problems,
+        "lost": found.lost,
         "mappable": found.mappable,
         "reason": found.reason,
     }

@@ -14,6 +14,9 @@ from hybridmap.errors import EvaluationError
 
 log = logging.getLogger(__name__)
 
+LOST = 3
+"""Exit code of a recording that lost messages, where that matters."""
+
 
 def map_source(
     source: Source,
@@ -43,10 +46,17 @@ def map_source(
     setting: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. nodes.distance_m=0.3. Keys: docs/configuration.md.")
     ] = None,
+    skip_damaged: Annotated[
+        bool, typer.Option("--skip-damaged", help="Skip damaged scans and pictures, and count them, instead of ending there.")
+    ] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit code 3 if messages of the recording were lost.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Map a recording or a simulated world. Writes the map, the trajectories and a page into one session folder."""
+    """Map a recording or a simulated world. Writes the map, the trajectories and a page into one session folder.
+
+    Messages that the recording states to hold but that cannot be read are warned of, and counted in `metrics.json` (`lost`).
+    """
     from hybridmap.cli.choose import choose, parse_settings
 
     topics = sensor_settings(
@@ -61,11 +71,13 @@ def map_source(
     named: dict[str, Any] = {"backends.names": backend or None, "seed": seed}
     chosen_here = {key: value for key, value in named.items() if value is not None}
     overrides = {**topics, **chosen_here, **parse_settings(setting)}
-    chosen = choose(source, config, overrides, start_s=start, end_s=end)
+    chosen = choose(source, config, overrides, start_s=start, end_s=end, skip_damaged=skip_damaged)
     head, metrics = map_and_report(chosen.stream, chosen.config, out, overwrite=overwrite)
     emit(head, metrics, as_json=as_json, title=f"{out}: {chosen.stream.name}")
     if not as_json:
         typer.echo(f"page: {out / 'report.html'}")
+    if strict and chosen.stream.report.lost:
+        raise typer.Exit(LOST)
 
 
 def map_and_report(stream: Any, config: Any, out: Path, *, overwrite: bool) -> tuple[dict[str, Any], list[Any]]:

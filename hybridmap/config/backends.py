@@ -21,12 +21,12 @@ class RelaxationConfig(Section):
 
     Watch: with 1 the last sweeps end in a limit cycle; far below 1 they stop before the map has converged.
     """
-    sweeps_per_node: int = Field(default=20, ge=1)
+    sweeps_per_node: int = Field(default=20, ge=1, le=10_000)
     """Sweeps after each growth of the graph.
 
     Watch: the time of a sweep grows with the edges of the whole graph.
     """
-    solve_sweeps: int = Field(default=5000, ge=1)
+    solve_sweeps: int = Field(default=5000, ge=1, le=10_000_000)
     """Most sweeps when a whole graph is solved at once.
 
     Watch: a long chain needs many.
@@ -58,7 +58,7 @@ class GncConfig(Section):
 class RobustConfig(Section):
     """Robust kernels on the loop edges, and on odometry and registration edges if wheels have drop-outs."""
 
-    cauchy_scale: float = Field(default=1.0, gt=0)
+    cauchy_scale: float = Field(default=1.0, ge=1e-6, le=1e6)
     """Whitened residual at which the Cauchy weight of a loop is one half.
 
     Watch: a smaller scale resists more false loops, and follows true loops less after drift.
@@ -99,7 +99,7 @@ class BackendsConfig(Section):
 
     Watch: each back-end takes its own time at every node.
     """
-    max_iterations: int = Field(default=100, ge=1)
+    max_iterations: int = Field(default=100, ge=1, le=1_000_000)
     """Most iterations of a batch optimiser.
 
     Watch: a back-end that stops at the limit says so in its report.

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from math import hypot
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from hybridmap.config.section import Section
+
+DISTORTIONS = (4, 5, 8, 12, 14)
+"""How many coefficients of a lens OpenCV takes."""
+_LEAST_NORM = 1e-3
+_FARTHEST_M = 1000.0
 
 
 class LaserMounting(Section):
     """Pose of the laser on the robot's base; replaces the pose in the recording's transforms."""
 
-    x_m: float = 0.0
+    x_m: float = Field(default=0.0, ge=-1000, le=1000)
     """Position forward of the base's origin, m."""
-    y_m: float = 0.0
+    y_m: float = Field(default=0.0, ge=-1000, le=1000)
     """Position to the left of the base's origin, m."""
-    yaw_rad: float = 0.0
+    yaw_rad: float = Field(default=0.0, ge=-10, le=10)
     """Direction of the laser's x axis in the base frame, rad."""
     upside_down: bool = False
     """Whether the laser hangs upside down: its beams then turn the other way."""
@@ -32,24 +38,45 @@ class CameraMounting(Section):
 
     Watch: an error of 1 degree in the tilt makes the floor look like a ramp."""
 
+    @field_validator("translation_m")
+    @classmethod
+    def _near(cls, translation: tuple[float, float, float]) -> tuple[float, float, float]:
+        if max(map(abs, translation)) > _FARTHEST_M:
+            raise ValueError(f"expected at most {_FARTHEST_M:g} m, found {max(map(abs, translation)):g} m")
+        return translation
+
+    @field_validator("quaternion_xyzw")
+    @classmethod
+    def _rotates(cls, quaternion: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+        if not _LEAST_NORM <= hypot(*quaternion) <= 1.0 / _LEAST_NORM:
+            raise ValueError(f"expected a quaternion, of length 1, found one of length {hypot(*quaternion):g}")
+        return quaternion
+
 
 class CameraIntrinsics(Section):
     """Intrinsic calibration of the colour camera; replaces the one in the recording."""
 
-    width_px: int = Field(gt=0)
+    width_px: int = Field(gt=0, le=16_384)
     """Image width, pixels."""
-    height_px: int = Field(gt=0)
+    height_px: int = Field(gt=0, le=16_384)
     """Image height, pixels."""
-    fx_px: float = Field(gt=0)
+    fx_px: float = Field(gt=0, le=1e6)
     """Focal length along x, pixels."""
-    fy_px: float = Field(gt=0)
+    fy_px: float = Field(gt=0, le=1e6)
     """Focal length along y, pixels."""
-    cx_px: float
+    cx_px: float = Field(ge=-1e6, le=1e6)
     """Principal point, x, pixels."""
-    cy_px: float
+    cy_px: float = Field(ge=-1e6, le=1e6)
     """Principal point, y, pixels."""
     distortion: tuple[float, ...] = ()
     """Lens distortion k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty: none."""
+
+    @field_validator("distortion")
+    @classmethod
+    def _of_a_lens(cls, distortion: tuple[float, ...]) -> tuple[float, ...]:
+        if any(distortion) and len(distortion) not in DISTORTIONS:
+            raise ValueError(f"expected {', '.join(map(str, DISTORTIONS))} coefficients or none, found {len(distortion)}")
+        return distortion
 
 
 class SensorsConfig(Section):
@@ -81,15 +108,15 @@ class SensorsConfig(Section):
     """Mounting of the camera; None: from the recording's transforms or camera.yaml."""
     camera_intrinsics: CameraIntrinsics | None = None
     """Calibration of the colour camera; None: from CameraInfo or camera.yaml."""
-    depth_scale: float | None = Field(default=None, gt=0)
+    depth_scale: float | None = Field(default=None, ge=0.001, le=1e6)
     """Units of a 16 bit depth value per metre; None: 1000 in bags, camera.yaml in a TUM folder.
 
     Watch: TUM recordings of a Kinect have 5000; a wrong factor scales every depth."""
-    sync_tolerance_s: float = Field(default=0.02, ge=0)
+    sync_tolerance_s: float = Field(default=0.02, ge=0, le=10)
     """Colour and depth belong together when their stamps differ by no more than this, s.
 
     Watch: while the robot turns, a pair this far apart shows two different views."""
-    latency_s: float = Field(default=0.0, ge=0)
+    latency_s: float = Field(default=0.0, ge=0, le=3600)
     """Live input: time for which samples are held back to be sorted by stamp, s. Recordings are sorted by their reader.
 
     Watch: the pose is delayed by this time.
@@ -100,21 +127,21 @@ class SensorsConfig(Section):
 
     Watch: updates of a live robot are delayed by this time.
     """
-    range_min_m: float | None = Field(default=None, ge=0)
+    range_min_m: float | None = Field(default=None, ge=0, le=1e6)
     """Laser returns nearer than this are dropped, m; None: only the recording's limit applies.
 
     Watch: set it if the laser sees the robot itself.
     """
-    range_max_m: float | None = Field(default=None, gt=0)
+    range_max_m: float | None = Field(default=None, gt=0, le=1e6)
     """Laser returns at or beyond this are dropped, m; None: only the recording's limit applies.
 
     Watch: in a long hall a low limit removes the far walls, which hold the heading and position along it.
     """
-    depth_min_m: float | None = Field(default=None, ge=0)
+    depth_min_m: float | None = Field(default=None, ge=0, le=1e6)
     """Depth nearer than this is dropped, m; None: all depth is kept.
 
     Watch: many cameras give wrong depth below 0.3 m."""
-    depth_max_m: float | None = Field(default=None, gt=0)
+    depth_max_m: float | None = Field(default=None, gt=0, le=1e6)
     """Depth beyond this is dropped, m; None: all depth is kept.
 
     Watch: the noise of depth grows with the square of the distance."""
@@ -123,11 +150,11 @@ class SensorsConfig(Section):
 class WheelErrorConfig(Section):
     """Errors of the simulated wheel odometry."""
 
-    scale_bias: float = Field(default=0.02, gt=-1)
+    scale_bias: float = Field(default=0.02, gt=-1, le=10)
     """Relative error of every distance; 0.02 reports 2 % too much."""
-    turn_bias: float = Field(default=0.01, gt=-1)
+    turn_bias: float = Field(default=0.01, gt=-1, le=10)
     """Relative error of every turn."""
-    heading_bias_deg_per_m: float = 0.16
+    heading_bias_deg_per_m: float = Field(default=0.16, ge=-360, le=360)
     """Pull to the left, degrees per metre driven.
 
     Watch: it bends a map more than any other error of wheels."""
@@ -162,7 +189,7 @@ class LaserScannerConfig(Section):
     """Angle between the first and the last beam, degrees. With 360 the last beam is left out, as it would repeat the first."""
     rate_hz: float = Field(default=5.0, gt=0, le=60)
     """Scans a second."""
-    range_max_m: float = Field(default=12.0, gt=0)
+    range_max_m: float = Field(default=12.0, gt=0, le=1000)
     """No return beyond this, m."""
 
 
@@ -175,7 +202,7 @@ class SimulationConfig(Section):
     """Sensors of the robot besides its wheels."""
     noise: float = Field(default=1.0, ge=0, le=10)
     """Factor on the noise of camera and laser: depth, colour, ranges, holes, lost beams and exposure changes; 0: none."""
-    duration_s: float | None = Field(default=None, gt=0)
+    duration_s: float | None = Field(default=None, gt=0, le=1e6)
     """Stop the drive after this many seconds; None: drive to the end."""
     carried_m: float | None = Field(default=None, gt=0)
     """Kidnap the robot in the middle of the drive: carry it about this far, m, to a place that it has visited. Meanwhile the

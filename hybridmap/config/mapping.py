@@ -122,7 +122,7 @@ class NodesConfig(Section):
 
     Watch: under `novelty` a known place makes no node, and hence no loop closure.
     """
-    distance_m: float = Field(default=0.25, gt=0)
+    distance_m: float = Field(default=0.25, gt=0, le=1000)
     """`travel`: distance between nodes, m.
 
     Watch: time grows with the number of nodes; with a large distance consecutive views overlap too little.
@@ -159,21 +159,21 @@ class EdgesConfig(Section):
 
     Watch: if wheel odometry has drop-outs, a kept edge bends the map.
     """
-    translation_floor_m: float = Field(default=0.005, gt=0)
+    translation_floor_m: float = Field(default=0.005, ge=1e-6, le=100)
     """Standard deviation of an odometry edge's translation without travel, m."""
-    rotation_floor_deg: float = Field(default=0.2, gt=0)
+    rotation_floor_deg: float = Field(default=0.2, ge=1e-6, le=180)
     """Standard deviation of an odometry edge's heading without travel, degrees."""
-    translation_per_sqrt_m: float = Field(default=0.02, ge=0)
+    translation_per_sqrt_m: float = Field(default=0.02, ge=0, le=100)
     """Growth of the translation's standard deviation, m per sqrt(m) of travel.
 
     Watch: too small, and the edge outweighs a better registration; too large, and a false loop bends the chain.
     """
-    rotation_deg_per_sqrt_m: float = Field(default=0.6, ge=0)
+    rotation_deg_per_sqrt_m: float = Field(default=0.6, ge=0, le=180)
     """Growth of the heading's standard deviation, degrees per sqrt(m) of travel.
 
     Watch: heading is the largest error of wheel odometry; the gate of loop closures grows with this value.
     """
-    rotation_per_turn: float = Field(default=0.02, ge=0)
+    rotation_per_turn: float = Field(default=0.02, ge=0, le=10)
     """Growth of the heading's standard deviation, radians per sqrt(radian) turned."""
 
 

@@ -16,16 +16,57 @@ from hybridmap.errors import ConfigError, HybridMapError
 _WORDS = {"tuple_type": "a list", "list_type": "a list", "dict_type": "keys with values", "model_type": "keys with values"}
 
 
+_DEEPEST = 50
+"""Levels of a YAML document. The configuration has five; a document of thousands exhausts Python's stack."""
+_MOST_BYTES = 10_000_000
+"""Size of a YAML document; a configuration has some kB, and PyYAML reads 0.1 MB a second."""
+_MOST_VALUES = 1_000_000
+"""Values of a document with its aliases written out; ten aliases of ten aliases and so on are a few lines of text."""
+
+
 class _Strict(yaml.SafeLoader):
-    """The safe loader of YAML; it takes no key twice, of which the last would win unseen."""
+    """The safe loader of YAML; it takes no key twice, of which the last would win unseen, and no deep nesting."""
+
+    depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        if self.depth >= _DEEPEST:
+            raise yaml.composer.ComposerError(None, None, _TOO_DEEP, self.get_mark())
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen: set[Any] = set()
+        seen: set[str] = set()
         for key, _ in node.value:
-            if key.value in seen and isinstance(key, yaml.ScalarNode):
+            if not isinstance(key, yaml.ScalarNode):
+                continue  # refused by the safe loader
+            if key.value in seen:
                 raise yaml.constructor.ConstructorError(None, None, f"the key {key.value!r} is there twice", key.start_mark)
-            seen |= {key.value} if isinstance(key, yaml.ScalarNode) else set()
+            seen.add(key.value)
         return super().construct_mapping(node, deep=deep)
+
+
+_TOO_DEEP = f"nested more than {_DEEPEST} levels deep"
+
+
+def _check_extent(tree: Any) -> None:
+    """Refuse a document that its aliases make too large, or endless.
+
+    Raises:
+        ValueError: it has too many levels or values.
+    """
+    level, count = [tree], 0
+    for _ in range(_DEEPEST + 1):
+        if not level:
+            return
+        count += len(level)
+        if count > _MOST_VALUES:
+            raise ValueError(f"more than {_MOST_VALUES} values, its aliases written out")
+        inner = (held.values() if isinstance(held, dict) else held for held in level if isinstance(held, dict | list | tuple))
+        level = [value for values in inner for value in values]
+    raise ValueError(_TOO_DEEP)
 
 
 class Section(BaseModel):
@@ -99,6 +140,9 @@ def read_mapping(path: Path, error: type[HybridMapError] = ConfigError) -> dict[
     Raises:
         HybridMapError: of the class `error`: the file is not YAML (the message names the line), or holds no mapping.
     """
+    size = path.stat().st_size
+    if size > _MOST_BYTES:
+        raise error(f"{path}: holds {size} bytes, expected at most {_MOST_BYTES}; is it a configuration?")
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as mistake:
@@ -128,11 +172,24 @@ def value_of(text: str, origin: str, error: type[HybridMapError] = ConfigError) 
     Args:
         text: the YAML text.
         origin: name of the text in error messages.
-        error: type of the error to raise if the text is not YAML, or a mapping in it has the same key twice.
+        error: type of the error to raise if the text is not YAML, a mapping in it has the same key twice, or a value in it is
+            nested too deep or cannot be used.
     """
+    if len(text) > _MOST_BYTES:
+        raise error(f"{origin}: holds {len(text)} characters, expected at most {_MOST_BYTES}; is it a configuration?")
     try:
-        return yaml.load(text, Loader=_Strict)
+        tree = yaml.load(text, Loader=_Strict)
+        _check_extent(tree)
     except yaml.YAMLError as mistake:
         mark = getattr(mistake, "problem_mark", None)
         line = f"line {mark.line + 1}: " if mark is not None else ""
         raise error(f"{origin}: not YAML: {line}{getattr(mistake, 'problem', None) or mistake}") from None
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        TypeError,
+        ValueError,
+    ) as mistake:  # as of 2001-99-99
+        raise error(f"{origin}: a value cannot be used: {mistake}") from None
+    return tree

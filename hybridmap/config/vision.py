@@ -42,7 +42,7 @@ class MatchingConfig(Section):
     Watch: a laser has depth only and ignores it."""
     g_bar: Literal["templates", "shifts"] = "templates"
     """Definition of g_bar: the mean of g_min over the stored templates, or the mean of g over the shifts of the pair."""
-    c_t: float | None = Field(default=None)
+    c_t: float | None = Field(default=None, ge=-1e6, le=1e6)
     """Threshold: two views match if their score G is below c_t. None: no threshold if matches are verified by features, else a
     moderate one that depends on `vision.rgbd.matching`.
 
@@ -73,13 +73,13 @@ class TrackingConfig(Section):
 class ClosingConfig(Section):
     """Search for loop closures by laser or camera."""
 
-    gate_sigmas: float = Field(default=2.5, gt=0)
+    gate_sigmas: float = Field(default=2.5, gt=0, le=100)
     """Older nodes are considered for a loop within this many standard deviations of the pose uncertainty on the map (the gate).
 
     Watch: a wide gate takes time and admits places that only look alike; a narrow one loses loops after long drift. A laser
     multiplies the deviations by four; a camera uses them only after its gate has grown by 10 m.
     """
-    revisit_rounds: int = Field(default=2, ge=0)
+    revisit_rounds: int = Field(default=2, ge=0, le=100)
     """How many times, at the end, nodes that lie close together on the optimised map are registered to each other; 0: never.
 
     Watch: the time of a round grows with the number of nodes at places that were visited twice.
@@ -109,7 +109,7 @@ class ScanConfig(Section):
 class ProbeConfig(Section):
     """Search for loops by laser: the submap of the last metres is matched with old submaps that the drift allows."""
 
-    every_m: float = Field(default=2.0, gt=0)
+    every_m: float = Field(default=2.0, gt=0, le=1000)
     """Travel between two searches for loops, m.
 
     Watch: half the distance takes about twice the time for matching.
@@ -139,7 +139,7 @@ class LaserConfig(Section):
 class RegistrationConfig(Section):
     """Registration of the depth of two RGB-D frames."""
 
-    depth_sigma: float = Field(default=0.003, gt=0)
+    depth_sigma: float = Field(default=0.003, ge=1e-6, le=10)
     """Noise of depth: standard deviation in m at 1 m; it grows with the square of the distance.
 
     Watch: too small a value gives edges too small a covariance.
@@ -149,7 +149,7 @@ class RegistrationConfig(Section):
 class PnpConfig(Section):
     """Verification of a loop candidate by visual features and depth (perspective-n-point)."""
 
-    min_inliers: int = Field(default=12, ge=4)
+    min_inliers: int = Field(default=12, ge=4, le=100_000)
     """Least number of matched features that agree with the estimated relative pose (inliers).
 
     Watch: from 4 to 400 the map of the office hardly changes (see results); with a high number fewer loops limit the drift.
@@ -159,15 +159,15 @@ class PnpConfig(Section):
 class RgbdClosingConfig(Section):
     """Loop closure by camera: which older nodes are candidates."""
 
-    min_age_s: float = Field(default=10.0, ge=0)
+    min_age_s: float = Field(default=10.0, ge=0, le=1e6)
     """Least age of a node to be a candidate, s."""
-    gate_m: float = Field(default=2.5, gt=0)
+    gate_m: float = Field(default=2.5, gt=0, le=10_000)
     """Radius around the robot within which older nodes are candidates, right after a loop closure, m. It grows by 10 % of the
     travel since then, by at most 10 m.
 
     Watch: candidates outside are not considered.
     """
-    candidates: int = Field(default=5, ge=1)
+    candidates: int = Field(default=5, ge=1, le=10_000)
     """Candidates verified per node, best profile first.
 
     Watch: each takes some milliseconds.
@@ -191,12 +191,12 @@ class RgbdConfig(Section):
     """`level`: the camera is as mounted; `floor`: tilt and height are measured in each keyframe (hand-held camera);
     `auto`: `level` until a visible floor contradicts the mounting.
     """
-    max_width_px: int = Field(default=320, ge=80)
+    max_width_px: int = Field(default=320, ge=80, le=16_384)
     """Images are reduced by an integer factor until they are at most this wide, pixels.
 
     Watch: the time for features grows with the pixels.
     """
-    held_images: int = Field(default=100, ge=1)
+    held_images: int = Field(default=100, ge=1, le=1_000_000)
     """Number of newest nodes whose images stay in memory; the map file holds all images.
 
     Watch: an image of 640 x 480 takes 2 MB.

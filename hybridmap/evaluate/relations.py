@@ -7,7 +7,6 @@ the mean over relations of the translational and of the rotational part of `delt
 from __future__ import annotations
 
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from hybridmap.errors import EvaluationError, quoted
 from hybridmap.geometry import Array, between
-from hybridmap.trajectory import NS_PER_S, Trajectory, known_at
+from hybridmap.trajectory import NS_PER_S, Trajectory, known_at, read_stamp_ns
 
 LOOP_GAP_S = 60.0
 """Relations over more than this time count as loops."""
@@ -79,13 +78,15 @@ def read_relations(path: Path) -> Relations:
         if not fields:
             continue
         try:
-            first, second = (int((Decimal(field) * NS_PER_S).to_integral_value()) for field in fields[:2])
             delta = [float(field) for field in fields[2:]]
-        except (InvalidOperation, ValueError, OverflowError):
+        except ValueError:
             raise EvaluationError(f"{path}:{number}: expected numbers, found {quoted(line)}") from None
         if len(delta) != 3 or not np.isfinite(delta).all():
             raise EvaluationError(f"{path}:{number}: expected 5 finite numbers `t1 t2 dx dy dyaw`, found {quoted(line)}")
-        stamps.append((first, second))
+        try:
+            stamps.append((read_stamp_ns(fields[0]), read_stamp_ns(fields[1])))
+        except ValueError as error:
+            raise EvaluationError(f"{path}:{number}: {error}") from None
         deltas.append(delta)
     if not stamps:
         raise EvaluationError(f"{path}: holds no relation; expected lines `t1 t2 dx dy dyaw`")

@@ -118,9 +118,11 @@ def drift_percent(pairs: PosePairs) -> float:
     shares = []
     for length in lengths:
         first, last = _pieces(along, length)
+        grown = along[last] - along[first]
         translation, _ = motion_errors(pairs, first, last)
-        shares.append(translation / (along[last] - along[first]))
-    return 100.0 * float(np.concatenate(shares).mean())
+        shares.append(translation[grown > 0.0] / grown[grown > 0.0])  # beside a jump of 1e9 m a step of millimetres is none
+    found = np.concatenate(shares)
+    return 100.0 * float(found.mean()) if len(found) else float("nan")
 
 
 def motion_errors(pairs: PosePairs, first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[Array, Array]:

@@ -26,6 +26,8 @@ _TORO_ORDER = (0, 1, 4, 2, 5, 3)
 _EDGES = {"EDGE_SE2": _G2O_ORDER, "EDGE2": _TORO_ORDER}
 _VERTICES = ("VERTEX_SE2", "VERTEX2")
 _FIX = "FIX"
+_HIGHEST = 2**63 - 1
+"""Number of a vertex, as g2o and arrays hold it."""
 _UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
@@ -87,12 +89,16 @@ def _parse(lines: _Lines, fields: list[str], where: str) -> None:
 
 
 def _integers(fields: list[str], count: int, where: str) -> list[int]:
+    given = fields[1 : 1 + count]
     try:
-        return [int(field) for field in fields[1 : 1 + count]]
+        numbers = [int(field) for field in given]
     except ValueError:
         raise GraphError(
-            f"{where}: expected {count} whole number(s) after {fields[0]}, found {quoted(' '.join(fields[1 : 1 + count]))}"
+            f"{where}: expected {count} whole number(s) after {fields[0]}, found {quoted(' '.join(given))}"
         ) from None
+    if max(map(abs, numbers), default=0) > _HIGHEST:
+        raise GraphError(f"{where}: found {quoted(' '.join(given))}, expected numbers of vertices up to {_HIGHEST}")
+    return numbers
 
 
 def _numbers(fields: list[str], start: int, count: int, where: str) -> list[float]:

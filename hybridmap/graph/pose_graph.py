@@ -142,7 +142,8 @@ class PoseGraph:
             return False
         if not (ends.min() >= 0 and ends.max() < self.n_nodes and (ends[0] != ends[1]).all()):
             return False
-        squared = upper**2 / (own[:, [0, 0, 1]] * own[:, [1, 2, 2]])
+        with np.errstate(over="ignore"):
+            squared = upper**2 / (own[:, [0, 0, 1]] * own[:, [1, 2, 2]])
         weak = squared.sum(axis=1).max() <= _WEAK
         return bool(weak and np.abs(self.deltas).max() <= _FARTHEST and np.abs(self.initial).max() <= _FARTHEST)
 

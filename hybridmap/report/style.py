@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -85,9 +86,22 @@ def figure(width_in: float, height_in: float, margins: Margins | None = None) ->
 
 def svg_uri(picture: Any) -> str:
     """The figure as SVG in a `data:` URI; the same figure gives the same text."""
+    _take_literally(picture)
     text = io.BytesIO()
     picture.savefig(text, format="svg", dpi=160, metadata={"Date": None, "Creator": None})
     return "data:image/svg+xml;base64," + base64.b64encode(text.getvalue()).decode("ascii")
+
+
+def _take_literally(picture: Any) -> None:
+    """Show the dollars of names and titles as they are; matplotlib would read what stands between two of them as a formula."""
+    from matplotlib.text import Text
+
+    for text in picture.findobj(Text):
+        if "$" in text.get_text() and not _POWER_OF_TEN.fullmatch(text.get_text()):
+            text.set_parse_math(False)
+
+
+_POWER_OF_TEN = re.compile(r"\$\\mathdefault\{[-−]?10\^\{[-−]?\d+\}\}\$")  # matplotlib's own labels of a logarithmic axis
 
 
 def photo_uri(rgb: NDArray[np.uint8]) -> str:

@@ -4,26 +4,47 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import update_wrapper
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.base import ODOMETRY, Solution, SolveReport
 from hybridmap.config.section import mapping_of
-from hybridmap.errors import StoreError
+from hybridmap.errors import GeometryError, GraphError, StoreError, quoted
 from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.store import schema
 from hybridmap.store.track import Track
 from hybridmap.streams.base import Rig
-from hybridmap.trajectory import NO_ANCHORS, Anchors, Trajectory
+from hybridmap.trajectory import FARTHEST_M, NO_ANCHORS, Anchors, Trajectory
 
 _KEYFRAME, _SNAPSHOT, _CODE = "keyframe", "snapshot", "code"
+_DAMAGE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError, GeometryError, GraphError)
+"""What making something of the values of a damaged file raises."""
+_Given = ParamSpec("_Given")
+_Found = TypeVar("_Found")
+
+
+def _reading(
+    method: Callable[Concatenate[MapStore, _Given], _Found],
+) -> Callable[Concatenate[MapStore, _Given], _Found]:
+    """A method that reads; values in the file that are not what `create` wrote become a StoreError."""
+
+    def guarded(self: MapStore, /, *args: _Given.args, **named: _Given.kwargs) -> _Found:
+        try:
+            return method(self, *args, **named)
+        except _DAMAGE as error:
+            raise StoreError(
+                f"{self.path}: damaged: {quoted(f'{error or type(error).__name__}')[1:-1]}; map the source again"
+            ) from None
+
+    return update_wrapper(guarded, method)
 
 
 class MapStore:
@@ -197,6 +218,7 @@ class MapStore:
         return mapping_of(self.config_yaml, f"{self._path}: configuration", StoreError)
 
     @property
+    @_reading
     def rig(self) -> Rig:
         """The sensors of the run."""
         return schema.rig_from_json(self.info("rig"))
@@ -207,6 +229,7 @@ class MapStore:
         return str(self.info("source"))
 
     @property
+    @_reading
     def primary(self) -> str:
         """Name of the primary back-end: as the run recorded it, else the first one of the configuration."""
         recorded = self.info("primary_backend")
@@ -220,38 +243,44 @@ class MapStore:
         """Whether the run that wrote the file came to its end."""
         return self.info("graph_hash") is not None
 
+    @_reading
     def info(self, key: str) -> Any:
         """The value that was written under a key; None if the key is not there."""
         text = self._one("SELECT value FROM info WHERE key = ?", (key,))
         return None if text is None else json.loads(text)
 
+    @_reading
     def map(self) -> ExperienceMap:
         """The experience map: its nodes and edges in the order in which they were made."""
         experiences, version = ExperienceMap(), int(self._one("PRAGMA user_version", ()))
         codes = {row[0]: schema.Packed(*row[1:]) for row in self._arrays(_CODE)}
-        for row in self._rows("SELECT * FROM nodes ORDER BY number"):
-            node = Node(row[1], np.array(row[2:5]), schema.unpack(codes[row[0]]), row[8], row[9])
-            experiences.add_node(node, np.array(row[5:8]))
-        for row in self._rows("SELECT * FROM edges ORDER BY number"):
-            relative = None
-            if row[9] is not None:
-                relative = RelativePose(np.array(row[6:9]), schema.unpack_floats(row[9], 3))
+        for number, row in enumerate(self._rows("SELECT * FROM nodes ORDER BY number")):
+            node = Node(int(row[1]), _pose(row[2:5]), schema.unpack(codes[number]), int(row[8]), float(row[9]))
+            if experiences.add_node(node, _pose(row[5:8])) != row[0]:
+                raise ValueError(f"node {number} is missing")
+        for number, row in enumerate(self._rows("SELECT * FROM edges ORDER BY number")):
+            relative = None if row[9] is None else RelativePose(_pose(row[6:9]), _covariance(row[9]))
             kind, status, record = EdgeKind[row[3].upper()], Status(row[4]), schema.record_from_json(row[10], row[5], version)
-            experiences.add_edge(Edge(row[1], row[2], kind, status, relative, since_node=row[11], **record))
+            edge = Edge(int(row[1]), int(row[2]), kind, status, relative, since_node=int(row[11]), **record)
+            if experiences.add_edge(edge) != row[0]:
+                raise ValueError(f"edge {number} is missing")
         return experiences
 
+    @_reading
     def keyframe(self, node: int) -> dict[str, NDArray[Any]]:
         """The arrays that the front-end kept of a node's frame, by name; empty for an unknown node."""
         return self._named(node, _KEYFRAME)
 
+    @_reading
     def snapshot(self, node: int) -> dict[str, NDArray[Any]]:
         """The arrays of the state of the path integrator at a node, by name; empty for an unknown node."""
         return self._named(node, _SNAPSHOT)
 
+    @_reading
     def track(self) -> Track:
         """Where the robot was at each stamp, seen from nodes, and the frames registered to the final map."""
         rows = self._rows("SELECT * FROM track ORDER BY stamp_ns")
-        values = np.array([row[2:] for row in rows], dtype=np.float64).reshape(-1, 6)
+        values = _near(np.array([row[2:] for row in rows], dtype=np.float64).reshape(-1, 6))
         ends = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2)
         return Track(ends[:, 0].copy(), ends[:, 1].copy(), values[:, :3].copy(), values[:, 3:].copy(), self._anchors())
 
@@ -259,25 +288,35 @@ class MapStore:
         if not self._rows("SELECT name FROM sqlite_master WHERE name = 'anchors'"):
             return NO_ANCHORS
         rows = self._rows("SELECT * FROM anchors ORDER BY stamp_ns")
-        values = np.array([row[3:] for row in rows], dtype=np.float64).reshape(-1, 6)
+        values = _near(np.array([row[3:] for row in rows], dtype=np.float64).reshape(-1, 6))
         ends = np.array([row[:3] for row in rows], dtype=np.int64).reshape(-1, 3)
         stamps, nodes, after = ends.T.copy()
         return Anchors(stamps, nodes, after, values[:, :3].copy(), values[:, 3:].copy())
 
+    @_reading
     def online(self, backend: str) -> Trajectory:
         """The poses that a back-end gave while driving; an empty trajectory if it gave none."""
         rows = self._rows("SELECT stamp_ns, x_m, y_m, yaw_rad FROM online WHERE backend = ? ORDER BY stamp_ns", (backend,))
         stamps = np.array([row[0] for row in rows], dtype=np.int64)
-        return Trajectory(stamps, np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 3))
+        return Trajectory(stamps, _near(np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 3)))
 
+    @_reading
     def online_backends(self) -> list[str]:
         """Names of the back-ends that gave poses while driving, sorted."""
-        return [row[0] for row in self._rows("SELECT DISTINCT backend FROM online ORDER BY backend")]
+        return [str(row[0]) for row in self._rows("SELECT DISTINCT backend FROM online ORDER BY backend")]
 
+    @_reading
     def solutions(self) -> dict[str, Solution]:
         """Poses and report of every back-end, by name, in the order in which they were written."""
         rows = self._rows("SELECT backend, poses, report FROM solutions ORDER BY position")
-        return {name: Solution(schema.unpack_floats(poses, 3), schema.report_from_json(report)) for name, poses, report in rows}
+        nodes = self._one("SELECT COUNT(*) FROM nodes", ())
+        found = {
+            str(name): Solution(schema.unpack_floats(poses, 3), schema.report_from_json(report)) for name, poses, report in rows
+        }
+        for name, solution in found.items():
+            if len(_near(solution.poses)) != nodes:
+                raise ValueError(f"{name} has {len(solution.poses)} poses, expected one for each of {nodes} nodes")
+        return found
 
     # ------------------------------------------------------------------ plumbing
 
@@ -315,6 +354,29 @@ def _file_of(folder_or_db: Path) -> Path:
 
 def _floats(values: Array) -> tuple[float, ...]:
     return tuple(float(value) for value in values)
+
+
+def _pose(values: tuple[Any, ...]) -> Array:
+    """A pose (3,) from its columns."""
+    return _near(np.array(values, dtype=np.float64))
+
+
+def _near(values: Array) -> Array:
+    """The numbers, if they are poses.
+
+    Raises:
+        ValueError: one is not finite, or too large for a pose in metres.
+    """
+    if not (np.abs(values) <= FARTHEST_M).all():
+        raise ValueError(f"a pose with NaN, Inf or a number beyond {FARTHEST_M:g}")
+    return values
+
+
+def _covariance(data: bytes) -> Array:
+    covariance = schema.unpack_floats(data, 3)
+    if covariance.shape != (3, 3) or not np.isfinite(covariance).all() or not (np.diagonal(covariance) > 0.0).all():
+        raise ValueError("a covariance that is none")
+    return covariance
 
 
 def _marks(count: int) -> str:

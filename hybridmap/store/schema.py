@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import sqlite3
 import zlib
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,11 +14,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from hybridmap.backends.base import SolveReport, SolveStatus
 from hybridmap.errors import StoreError
 from hybridmap.graph.edges import Check, Edge, Lack, Method, Need, Search
 from hybridmap.streams.base import Rig
+from hybridmap.streams.cameras import decode_picture
 from hybridmap.streams.sensors import kinds
 
 VERSION = 3
@@ -159,20 +163,25 @@ def unpack(packed: Packed) -> NDArray[Any]:
     """
     try:
         return _unpack(packed)
-    except (zlib.error, ValueError, TypeError) as error:
+    except (zlib.error, ArithmeticError, LookupError, TypeError, ValueError) as error:
         raise StoreError(f"map file: an array in it is damaged: {error}; map the source again") from None
 
 
+_MOST_BYTES = 1 << 28
+"""Size of an unpacked array; a few bytes of a damaged file may unpack to gigabytes."""
+
+
 def _unpack(packed: Packed) -> NDArray[Any]:
-    dtype, shape = np.dtype(packed.dtype), json.loads(packed.shape)
+    dtype, shape = np.dtype(packed.dtype), tuple(json.loads(packed.shape))
+    size = dtype.itemsize * math.prod(shape)
+    if dtype.kind not in "biuf" or not 0 <= size <= _MOST_BYTES or min(shape, default=0) < 0:
+        raise ValueError(f"found {packed.dtype} of shape {packed.shape}, expected numbers, at most {_MOST_BYTES} bytes")
     if packed.codec == "png":
         import cv2
 
-        pixels = cv2.imdecode(np.frombuffer(packed.data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if pixels is None:
-            raise ValueError("not an image")
-        return np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels).reshape(shape)
-    return np.frombuffer(zlib.decompress(packed.data), dtype).reshape(shape).copy()
+        pixels = decode_picture(packed.data, cv2.IMREAD_UNCHANGED)
+        return np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels).astype(dtype, copy=False).reshape(shape)
+    return np.frombuffer(zlib.decompressobj().decompress(packed.data, size + 1), dtype).reshape(shape).copy()
 
 
 def _is_image(array: NDArray[Any]) -> bool:
@@ -203,7 +212,8 @@ def rig_from_json(tree: dict[str, Any]) -> Rig:
 
 
 def _array(value: Any) -> Any:
-    return np.array(value) if isinstance(value, list) else value
+    numbers = _NUMBERS.validate_python(value)
+    return np.array(numbers) if isinstance(numbers, list) else value
 
 
 def _plain(fields: dict[str, Any]) -> dict[str, Any]:
@@ -232,16 +242,36 @@ def record_from_json(text: str, reason: str, version: int = VERSION) -> dict[str
     A file of a version before 3 has only measured values and the `reason` in words.
     """
     fields: dict[str, Any] = json.loads(text)
+    carried_m = fields.pop("carried_m", None)
+    fields["kidnapped_m"] = None if carried_m is None else float(carried_m)
     if version < 3:
-        kidnapped_m = fields.pop("carried_m", None)
-        return {"figures": fields, "kidnapped_m": kidnapped_m, "note": reason}
-    fields["kidnapped_m"] = fields.pop("carried_m", None)
+        kidnapped_m = fields.pop("kidnapped_m")
+        return {"figures": _figures(fields), "kidnapped_m": kidnapped_m, "note": str(reason)}
     for name in ("checks", "broken_by"):
-        fields[name] = tuple(Check(figure, value, Need(needs), *limit) for figure, value, needs, *limit in fields.get(name, ()))
-    for name, kind in (("lack", Lack), ("method", Method), ("search", Search)):
+        fields[name] = tuple(_check(*row) for row in fields.get(name, ()))
+    for name, kind in _OF_EDGES.items():
         if name in fields:
             fields[name] = kind(fields[name])
     return fields
+
+
+def _figures(fields: dict[str, Any]) -> dict[str, float]:
+    return {name: float(value) for name, value in fields.items()}
+
+
+def _check(figure: str, value: float, needs: str, limit: float, setting: str | None = None) -> Check:
+    return Check(str(figure), float(value), Need(needs), float(limit), None if setting is None else str(setting))
+
+
+_OF_EDGES: dict[str, Callable[[Any], Any]] = {
+    "lack": Lack,
+    "method": Method,
+    "search": Search,
+    "figures": _figures,
+    "shift": int,
+    "contradicts_odometry": bool,
+}
+"""Field of an edge's record -> its value from that in the file."""
 
 
 def _row(check: Check) -> list[Any]:
@@ -268,4 +298,8 @@ def report_from_json(text: str) -> SolveReport:
     for name in ("weights", "weak_edges"):
         fields[name] = {int(number): weight for number, weight in fields.get(name, {}).items()}
     fields["rejected_clusters"] = tuple(tuple(cluster) for cluster in fields.get("rejected_clusters", ()))
-    return SolveReport(**fields)
+    return _REPORT.validate_python(fields)
+
+
+_REPORT = TypeAdapter(SolveReport)
+_NUMBERS = TypeAdapter(float | list[float] | list[list[float]])

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hybridmap.errors import OutputError, StoreError
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from hybridmap.errors import OutputError, StoreError, quoted
 from hybridmap.metrics import Metric, to_json
 from hybridmap.output import PREVIOUS, Kind, held, holds_only, is_held, write_text
 from hybridmap.store.map_store import MapStore
@@ -37,6 +39,25 @@ def _is_session(folder: Path) -> bool:
 
 
 SESSION = Kind("session", _FILES, _is_session, useful_unfinished=True)
+
+
+class _Reason(BaseModel):
+    words: str
+
+
+_HEAD: dict[str, Any] = {
+    "graph_hash": str,
+    "primary_backend": str,
+    "backends": list[str],
+    "source": str,
+    "failed_backends": dict[str, str],
+    "stream": dict[str, int],
+    "lost": dict[str, tuple[int, int]],
+    "remarks": list[str],
+    "verdict": str,
+    "reasons": list[_Reason],
+}
+"""Keys of `metrics.json` beside the metrics that are read again, and what they hold."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,8 +182,12 @@ class SessionFolder:
         try:
             tree = json.loads(self.metrics_json.read_text(encoding="utf-8"))
             metrics = [_metric(row) for row in tree.pop("metrics")]
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise StoreError(f"{self.metrics_json}: damaged: {error}; map again or delete it") from None
+            for key, kind in _HEAD.items():
+                if key in tree:
+                    TypeAdapter(kind).validate_python(tree[key])
+        except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+            found = quoted(error.errors()[0]["msg"] if isinstance(error, ValidationError) else error)[1:-1]
+            raise StoreError(f"{self.metrics_json}: damaged: {found}; map again or delete it") from None
         return MetricsFile(tree, metrics)
 
     def merge_metrics(self, metrics: Iterable[Metric]) -> None:
@@ -204,5 +229,8 @@ def _ended(folder: Path) -> bool:
 
 
 def _metric(row: dict[str, Any]) -> Metric:
-    value = math.nan if row["value"] is None else float(row["value"])
-    return Metric(row["name"], value, row["unit"], row["description"], row.get("bar"), row.get("passed"))
+    value = math.nan if row["value"] is None else row["value"]
+    return _METRIC.validate_python({**row, "value": value})
+
+
+_METRIC = TypeAdapter(Metric)

@@ -160,7 +160,7 @@ class BagFile:
 
     def _store(self, msgtype: str) -> Any:
         if msgtype not in self._stores:
-            embedded = _embedded_store(self._definitions[msgtype], msgtype)
+            embedded = _embedded_store(self._definitions[msgtype], msgtype, self.is_ros1)
             self._stores[msgtype] = embedded if embedded is not None else _standard_store(self.is_ros1)
         return self._stores[msgtype]
 
@@ -207,8 +207,11 @@ def _standard_store(is_ros1: bool) -> Any:
 
 
 @cache  # parsing a definition takes tens of milliseconds, and every bag of a robot carries the same ones
-def _embedded_store(definition: Any, msgtype: str) -> Any | None:
-    """Type store of the definitions inside the bag; None if there are none that can be used."""
+def _embedded_store(definition: Any, msgtype: str, is_ros1: bool) -> Any | None:
+    """Type store of the definitions inside the bag; None if there are none that can be used.
+
+    A standard type that lacks a standard field is damaged: its messages are read as the standard has them.
+    """
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -219,6 +222,14 @@ def _embedded_store(definition: Any, msgtype: str) -> Any | None:
         store = get_typestore(Stores.EMPTY)
         store.register(types)
         store.generate_msgdef(msgtype)
+        standard = _standard_store(is_ros1).fielddefs
+        whole = all(_names(standard[name]) <= _names(types[name]) for name in types.keys() & standard.keys())
     except Exception:  # noqa: BLE001  an incomplete definition: the standard one will do
         return None
-    return store
+    return store if whole else None
+
+
+def _names(definition: Any) -> set[str]:
+    """Names of the fields of a message type."""
+    _, fields = definition
+    return {name for name, _ in fields}

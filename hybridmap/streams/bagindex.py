@@ -21,7 +21,7 @@ from hybridmap.streams.bagfile import TRANSFORM, BagFile, RawMessage, Topic
 from hybridmap.streams.base import Rig, SensorKind
 from hybridmap.streams.mounting import TransformTree, clean_frame, matrix
 from hybridmap.streams.order import sorted_order
-from hybridmap.trajectory import NS_PER_S, Trajectory, format_stamp
+from hybridmap.trajectory import FARTHEST_M, NS_PER_S, Trajectory, format_stamp
 
 ODOMETRY = ("nav_msgs/msg/Odometry",)
 
@@ -52,17 +52,20 @@ class PoseTrack:
         """Append the planar part of a pose, given by ROS position and orientation; `what` names it in the error.
 
         Raises:
-            StreamError: NaN or Inf, or a quaternion of length zero.
+            StreamError: NaN, Inf or a position that is none, or a quaternion that is no rotation.
         """
         q = (orientation.x, orientation.y, orientation.z, orientation.w)
         pose = (float(position.x), float(position.y), float(yaw_from_quaternion(*q)))
-        if not np.isfinite(pose).all() or not np.isfinite(q).all():
+        if not np.isfinite((*pose[:2], *q)).all():
             raise StreamError(
                 f"{what}: found NaN or Inf in the pose at stamp {format_stamp(stamp_ns)} s; expected finite numbers"
             )
-        if not any(q):
+        if max(abs(pose[0]), abs(pose[1])) > FARTHEST_M:
+            at = f"({pose[0]:g}, {pose[1]:g}) m at stamp {format_stamp(stamp_ns)} s"
+            raise StreamError(f"{what}: found the position {at}; expected at most {FARTHEST_M:g} m")
+        if np.isnan(pose[2]):
             raise StreamError(
-                f"{what}: found a quaternion of length 0 at stamp {format_stamp(stamp_ns)} s; expected a rotation"
+                f"{what}: found a quaternion of length 0 or infinity at stamp {format_stamp(stamp_ns)} s; expected a rotation"
             )
         self.stamps_ns.append(stamp_ns)
         self.poses.append(pose)
@@ -120,13 +123,14 @@ class BagIndex:
         return clean_frame(self.first[topic].header.frame_id) if topic in self.first else ""
 
 
-def build_index(bag: BagFile, names: Iterable[str], odom_frame: str) -> BagIndex:
+def build_index(bag: BagFile, names: Iterable[str], odom_frame: str, *, skip_damaged: bool = False) -> BagIndex:
     """Read the named topics once.
 
     Args:
         bag: the bag.
         names: topics whose messages have a header or are transforms.
         odom_frame: transforms from this frame are kept as tracks of poses, since they may be the odometry.
+        skip_damaged: take the first message of a sensor that can be decoded for its first one, instead of ending with an error.
 
     Raises:
         StreamError: the bag is damaged, or a pose has invalid numbers.
@@ -143,7 +147,12 @@ def build_index(bag: BagFile, names: Iterable[str], odom_frame: str) -> BagIndex
         index.stamps_ns.setdefault(message.topic, []).append(stamp_ns)
         is_odometry = types[message.topic] in ODOMETRY
         if is_odometry or message.topic not in index.first:
-            decoded = bag.decode(message)
+            try:
+                decoded = bag.decode(message)
+            except StreamError:
+                if is_odometry or not skip_damaged:
+                    raise
+                continue
             index.first.setdefault(message.topic, decoded)
             if is_odometry:
                 _take_odometry(index, bag, message.topic, decoded, stamp_ns)
@@ -169,7 +178,7 @@ def _take_transforms(index: BagIndex, bag: BagFile, message: RawMessage, odom_fr
             if not track.stamps_ns or track.stamps_ns[-1] != stamp_ns:  # tf is published again and again
                 track.add(stamp_ns, p, q, what)
         values = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-        if not np.isfinite(values).all() or not any(values[3:]):
+        if not (np.abs(values) <= FARTHEST_M).all() or np.isnan(yaw_from_quaternion(*values[3:])):
             index.unusable_transforms[f"{parent} -> {child}"] = None
             continue
         T = matrix((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))

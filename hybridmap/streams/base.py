@@ -203,12 +203,18 @@ class StreamReport:
     Attributes:
         counts: name (`odometry`, `frames`, `unmatched color`, ...) -> number.
         remarks: choices and assumptions, for the user.
-        lost: topic or file -> (messages that cannot be read, messages in all), where some cannot.
+        lost: topic or list of pictures -> (messages that were not used, messages in all), where the recording states to hold
+            messages that cannot be read, or damaged ones were skipped.
     """
 
     counts: dict[str, int] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     lost: dict[str, tuple[int, int]] = field(default_factory=dict)
+
+    def lose(self, name: str, total: int) -> None:
+        """Count one lost message of a topic or list that has `total` of them."""
+        gone, stated = self.lost.get(name, (0, total))
+        self.lost[name] = (gone + 1, stated)
 
     def count(self, name: str, increment: int = 1) -> None:
         """Add `increment` to the count of this name."""

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.inputs import CameraIntrinsics, CameraMounting, SensorsConfig
-from hybridmap.errors import StreamError
+from hybridmap.config.inputs import DISTORTIONS, CameraIntrinsics, CameraMounting, SensorsConfig
+from hybridmap.errors import StreamError, quoted
 from hybridmap.geometry import Array
 from hybridmap.streams.mounting import matrix
 
@@ -20,7 +20,15 @@ ColorImage = NDArray[np.uint8]
 
 _RECTIFIED = re.compile(r"rect[^/]*(/compressed(Depth)?)?$", re.IGNORECASE)  # image_rect, image_rect_color, ...
 
-_PNG = b"\x89PNG\r\n\x1a\n"
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""Markers of a JPEG's segments that hold its size."""
+MOST_PIXELS = 1 << 26
+"""Pixels of a picture, 8192 x 8192. A header can claim 4 billion, for which memory would be taken before any are read."""
+_LARGEST_PX = 1e6
+"""Focal length or principal point, pixels; a camera with this focal length sees a millionth of what lies before it."""
+_FINEST = 16
+"""How many times finer than the depth camera's the colour camera's pixels may be: a depth pixel is split by as much."""
 _DEPTH_HEADER_BYTES = 12  # compressedDepth: int32 format, float32 A, float32 B
 
 
@@ -134,9 +142,17 @@ class DepthRegistration:
         Args:
             depth, color: calibrations of undistorted images.
             T_color_depth: (4, 4) pose of the depth camera in the colour camera's optical frame, m.
+
+        Raises:
+            StreamError: the colour camera's pixels are so much finer that one of the calibrations must be wrong.
         """
         self._color, self._T = color, T_color_depth
         finer = max(color.K[0, 0] / depth.K[0, 0], color.K[1, 1] / depth.K[1, 1])
+        if not finer <= _FINEST:
+            raise StreamError(
+                f"depth cannot be registered to colour: the focal lengths are {color.K[0, 0]:g} px and {depth.K[0, 0]:g} px, "
+                f"expected no more than {_FINEST} times as much for colour; check both calibrations"
+            )
         self._split = max(1, int(np.ceil(finer - 1e-6)))
         offsets = (np.arange(self._split) + 0.5) / self._split - 0.5
         u = (np.arange(depth.width_px)[:, None] + offsets).ravel()
@@ -152,11 +168,12 @@ class DepthRegistration:
         points = self._rays[valid] * fine[valid][:, None] @ self._T[:3, :3].T + self._T[:3, 3]
         points = points[points[:, 2] > 0]
         K = self._color.K
-        u = np.rint(points[:, 0] / points[:, 2] * K[0, 0] + K[0, 2]).astype(np.int64)
-        v = np.rint(points[:, 1] / points[:, 2] * K[1, 1] + K[1, 2]).astype(np.int64)
+        u = np.rint(points[:, 0] / points[:, 2] * K[0, 0] + K[0, 2])
+        v = np.rint(points[:, 1] / points[:, 2] * K[1, 1] + K[1, 2])
         inside = (u >= 0) & (u < self._color.width_px) & (v >= 0) & (v < self._color.height_px)
         flat = np.full(self._color.height_px * self._color.width_px, np.inf)
-        np.minimum.at(flat, v[inside] * self._color.width_px + u[inside], points[inside, 2])
+        at = v[inside].astype(np.int64) * self._color.width_px + u[inside].astype(np.int64)
+        np.minimum.at(flat, at, points[inside, 2])
         flat[np.isinf(flat)] = 0.0
         return flat.reshape(self._color.height_px, self._color.width_px).astype(np.float32)
 
@@ -220,7 +237,7 @@ def _pixels(message: Any, layout: _Layout, what: str) -> NDArray[Any]:
     height, width = int(message.height), int(message.width)
     dtype = np.dtype((">" if message.is_bigendian else "<") + layout.dtype)
     row_bytes = width * layout.channels * dtype.itemsize
-    step = int(message.step) or row_bytes
+    step = (int(message.step) if height > 1 else 0) or row_bytes
     data = np.asarray(message.data, dtype=np.uint8)
     needed = step * (height - 1) + row_bytes
     if height < 1 or width < 1 or step < row_bytes or len(data) < needed:
@@ -233,15 +250,47 @@ def _pixels(message: Any, layout: _Layout, what: str) -> NDArray[Any]:
     return packed.reshape(height, width, layout.channels)
 
 
-def _decompress(data: bytes, flags: int, what: str) -> NDArray[Any]:
+def decode_picture(data: bytes, flags: int) -> NDArray[Any]:
+    """Decode a compressed picture.
+
+    Args:
+        data: PNG, JPEG or another format that OpenCV reads.
+        flags: OpenCV's, such as `cv2.IMREAD_UNCHANGED`.
+
+    Raises:
+        ValueError: it is empty, damaged, of an unknown kind, or its header claims more than `MOST_PIXELS`.
+    """
     import cv2
 
-    picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
+    width, height = _claimed_size(data)
+    if width * height > MOST_PIXELS:
+        raise ValueError(f"claims a size of {width}x{height}, expected at most {MOST_PIXELS} pixels")
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
+    except cv2.error as error:
+        raise ValueError(f"cannot be decoded ({quoted(error.err)[1:-1]})") from None
     if picture is None:
-        raise StreamError(
-            f"{what}: a compressed picture of {len(data)} bytes cannot be decoded: damaged, or of an unknown kind"
-        )
+        raise ValueError("cannot be decoded: damaged, or of an unknown kind")
     return np.asarray(picture)
+
+
+def _claimed_size(data: bytes) -> tuple[int, int]:
+    """Width and height by the header of a PNG or JPEG; (0, 0) if it has none. Other formats are limited by OpenCV alone."""
+    if data.startswith(_PNG):
+        return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    at = 2 if data.startswith(_JPEG) else len(data)
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        if data[at + 1] in _FRAMES:
+            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+        at += 1 if data[at + 1] == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return 0, 0
+
+
+def _decompress(data: bytes, flags: int, what: str) -> NDArray[Any]:
+    try:
+        return decode_picture(data, flags)
+    except ValueError as error:
+        raise StreamError(f"{what}: a compressed picture of {len(data)} bytes {error}") from None
 
 
 def _decompress_depth(message: Any, units_per_m: float, what: str) -> DepthImage:
@@ -276,13 +325,16 @@ def calibration_of(info: Any, image_topic: str, what: str) -> Calibration:
     model = info.distortion_model.strip().lower()
     if _RECTIFIED.search(image_topic) and P[0, 0] > 0:
         K, distortion = P[:, :3], ()
-    if not (K[0, 0] > 0 and K[1, 1] > 0 and np.isfinite(K).all()):
+    if not (K[0, 0] > 0 and K[1, 1] > 0 and (np.abs(K) <= _LARGEST_PX).all()):
         raise StreamError(f"{what}: found focal lengths {K[0, 0]}, {K[1, 1]}; the camera is not calibrated")
     if any(distortion) and model not in ("plumb_bob", "rational_polynomial", "equidistant", "fisheye", ""):
         raise StreamError(f"{what}: found distortion model {model!r}, expected plumb_bob, rational_polynomial or equidistant")
+    fisheye = model in ("equidistant", "fisheye")
+    lengths = range(4, 15) if fisheye else DISTORTIONS
+    if any(distortion) and not (np.isfinite(distortion).all() and len(distortion) in lengths):
+        raise StreamError(f"{what}: found the distortion {quoted(distortion)}, expected 4, 5, 8, 12 or 14 finite numbers")
     bin_x, bin_y = max(int(info.binning_x), 1), max(int(info.binning_y), 1)
     K = np.diag([1.0 / bin_x, 1.0 / bin_y, 1.0]) @ K if bin_x > 1 or bin_y > 1 else K.copy()
-    fisheye = model in ("equidistant", "fisheye")
     return Calibration(int(info.width) // bin_x, int(info.height) // bin_y, K, distortion, fisheye)
 
 

@@ -69,6 +69,7 @@ class Inspection:
         rig: sensors that mapping would use.
         remarks: choices and assumptions, for the user.
         problems: missing or damaged parts, one line each.
+        lost: topic -> (messages that cannot be read, messages in all), for the topics that mapping would use.
         reason: why the source cannot be mapped; None if it can.
     """
 
@@ -79,6 +80,7 @@ class Inspection:
     rig: Rig = field(default_factory=Rig)
     remarks: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
+    lost: dict[str, tuple[int, int]] = field(default_factory=dict)
     reason: str | None = None
 
     @property
@@ -124,10 +126,10 @@ def _try_to_open(found: Inspection, source: str | Path, config: Config) -> None:
     found.rig = stream.rig
     found.uses |= getattr(stream, "uses", {})
     found.remarks += getattr(stream, "remarks", [])
+    found.lost |= getattr(stream, "lost", {})
     losses: dict[str, int] = getattr(stream, "losses", {})
     found.problems += [f"{count} {name}" for name, count in losses.items() if count]
-    lost: dict[str, tuple[int, int]] = getattr(stream, "lost", {})
-    found.problems += [f"{name}: {gone} messages of {stated} cannot be read" for name, (gone, stated) in lost.items()]
+    found.problems += [f"{name}: {gone} messages of {stated} cannot be read" for name, (gone, stated) in found.lost.items()]
     if truth is not None:
         found.remarks.append(f"ground truth: {len(truth)} poses")
 

@@ -78,13 +78,21 @@ def kind_of(path: Path) -> str:
     return kind
 
 
-def open_stream(source: str | Path, config: Config, *, start_s: float | None = None, end_s: float | None = None) -> Stream:
+def open_stream(
+    source: str | Path,
+    config: Config,
+    *,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    skip_damaged: bool = False,
+) -> Stream:
     """Open a recording, or a simulated world by name.
 
     Args:
         source: path, or name of a world: `office` or `sim:office`.
         config: topics, mounting and synchronisation; for a world, the simulated drive.
         start_s, end_s: use only this part, seconds from the first stamp, both inclusive; None: no limit.
+        skip_damaged: leave out damaged scans and pictures of a recording, and count them in the stream's report (`lost`).
 
     Raises:
         StreamError: the source cannot be opened, or cannot be mapped; the message says why.
@@ -96,7 +104,7 @@ def open_stream(source: str | Path, config: Config, *, start_s: float | None = N
         stream: Stream = _simulator().SimulatedStream(simulation, config.seed)
         return stream if window == Window() else WindowedStream(stream, window)
     path = Path(source)
-    opened: Stream = loaded(f"hybridmap.streams.{_OPENERS[kind_of(path)]}")(path, config, window)
+    opened: Stream = loaded(f"hybridmap.streams.{_OPENERS[kind_of(path)]}")(path, config, window, skip_damaged=skip_damaged)
     return opened
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import logging
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +16,26 @@ from hybridmap.errors import StreamError
 from hybridmap.geometry import Array
 from hybridmap.streams.bagfile import TRANSFORM, BagFile, RawMessage
 from hybridmap.streams.bagindex import ODOMETRY, PoseTrack, build_index, select
-from hybridmap.streams.base import MessageKey, Observation, Sample, SelfMotion, SensorPlan, StreamReport
+from hybridmap.streams.base import (
+    Decoder,
+    InBag,
+    MessageKey,
+    Observation,
+    Planned,
+    Sample,
+    SelfMotion,
+    SensorPlan,
+    StreamReport,
+)
 from hybridmap.streams.mounting import clean_frame, planar
 from hybridmap.streams.order import Window, check_overlap, merge
 from hybridmap.streams.sensors import kind_of, kinds, message_types, wanted
 from hybridmap.trajectory import Trajectory
+
+log = logging.getLogger(__name__)
+
+_MOST_DAMAGED_FIRST = 10
+"""How many damaged messages at the beginning of a topic are skipped until its layout is known."""
 
 
 class BagStream:
@@ -28,18 +45,24 @@ class BagStream:
     table that the bag has.
     """
 
-    def __init__(self, path: Path, config: Config, window: Window | None = None) -> None:
+    def __init__(self, path: Path, config: Config, window: Window | None = None, *, skip_damaged: bool = False) -> None:
         """Index the bag.
+
+        Args:
+            path: of the bag.
+            config: topics, mounting, sensor.
+            window: the part to use.
+            skip_damaged: leave out scans and pictures that are damaged, and count them, instead of ending with an error.
 
         Raises:
             StreamError: the bag is damaged, or lacks data that mapping needs; the message names them.
         """
         self._bag = BagFile(path)
-        self._config, self._sensors = config, config.sensors
+        self._config, self._sensors, self._skip_damaged = config, config.sensors, skip_damaged
         self.name = path.name
         read = ODOMETRY + TRANSFORM + message_types()
-        named = (topic.name for topic in self._bag.topics if topic.msgtype in read)
-        self._index = build_index(self._bag, named, self._sensors.odom_frame)
+        self._known = [topic.name for topic in self._bag.topics if topic.msgtype in read]
+        self._index = build_index(self._bag, self._known, self._sensors.odom_frame, skip_damaged=skip_damaged)
         topics = [replace(topic, count=self._index.counts.get(topic.name, 0)) for topic in self._bag.topics]
         self.selection = select(topics, self._sensors, kinds(), self._index.frame_of, str(path))
         self.remarks = list(self.selection.remarks)
@@ -79,7 +102,7 @@ class BagStream:
         Raises:
             StreamError: a message is damaged; the message names topic and place.
         """
-        self.report = StreamReport(dict(self.losses), list(self.remarks), self.lost)
+        self.report = StreamReport(dict(self.losses), list(self.remarks), dict(self.lost))
         for sample in merge(self._motions(), self._observations()):
             self.report.count(kind_of(sample).counted if isinstance(sample, Observation) else "odometry")
             yield sample
@@ -105,12 +128,25 @@ class BagStream:
                 self._check_unchanged(message)
                 waiting[key] = message
             while planned is not None and all(key in waiting for key in planned.needs):
-                parts = tuple(self._bag.decode(waiting.pop(key)) for key in planned.needs)
-                yield decode(planned.stamp_ns, parts)
+                observation = self._decoded(planned, [waiting.pop(key) for key in planned.needs], decode)
+                if observation is not None:
+                    yield observation
                 planned = next(upcoming, None)
             if planned is None:
                 return
         raise StreamError(f"{self._bag.path}: holds fewer messages than at the first reading; was it changed meanwhile?")
+
+    def _decoded(self, planned: Planned, messages: list[RawMessage], decode: Decoder) -> Observation | None:
+        """The observation; None if it is damaged and damaged ones are skipped."""
+        try:
+            return decode(planned.stamp_ns, tuple(self._bag.decode(message) for message in messages))
+        except StreamError as error:
+            if not self._skip_damaged:
+                raise
+            log.info("skipped: %s", error)
+            topic = messages[0].topic
+            self.report.lose(topic, len(self._index.stamps_ns[topic]))
+            return None
 
     def _check_unchanged(self, message: RawMessage) -> None:
         if self._bag.stamp_ns(message) != self._index.stamps_ns[message.topic][message.number]:
@@ -134,10 +170,11 @@ class BagStream:
         return tracks[0], f"{self._bag.path}: transform {tracks[0].parent} -> {tracks[0].child}"
 
     def _lost_messages(self) -> dict[str, tuple[int, int]]:
-        """Topic -> (messages that cannot be read, messages that the bag states), for the used topics that lack some."""
+        """Topic -> (messages that cannot be read, messages that the bag states), for topics that are used or wholly lost."""
         read, used = self._index.counts, frozenset(self.uses.values())
-        lacking = {topic.name: (topic.count - read.get(topic.name, 0), topic.count) for topic in self._bag.topics}
-        return {name: (gone, stated) for name, (gone, stated) in lacking.items() if gone > 0 and name in used}
+        known = [topic for topic in self._bag.topics if topic.name in self._known]
+        lacking = {topic.name: (topic.count - read.get(topic.name, 0), topic.count) for topic in known}
+        return {name: (gone, all_) for name, (gone, all_) in lacking.items() if gone > 0 and (name in used or gone == all_)}
 
     def _choose_base(self, track: PoseTrack) -> str:
         """The frame to map: the configured one, else the child frame of the odometry, else a usual name."""
@@ -153,15 +190,40 @@ class BagStream:
         return planar(T)
 
     def _plan(self) -> SensorPlan:
-        looked_for, source = wanted(self._config.vision.sensor), str(self._bag.path)
+        looked_for = wanted(self._config.vision.sensor)
         for kind in looked_for:
             topics = self.selection.sensors.get(kind.sensor_name, {})
             if kind.in_bag is not None and (topics or len(looked_for) == 1):
-                return kind.in_bag.plan(topics, self._index, self._base_frame, self._sensors, source)
+                return self._planned_by(kind.in_bag, topics)
         if not looked_for:
             return SensorPlan()
         lacking = " and no ".join(kind.needs for kind in looked_for if kind.in_bag is not None)
         return SensorPlan(remarks=[f"no {lacking}: self-motion alone"])
+
+    def _planned_by(self, kind: InBag, topics: Mapping[str, str]) -> SensorPlan:
+        """Plan the observations. Where damaged ones are skipped, the layout is that of the first messages that are sound."""
+        for number in range(1, _MOST_DAMAGED_FIRST + 1):
+            try:
+                return kind.plan(topics, self._index, self._base_frame, self._sensors, str(self._bag.path))
+            except StreamError:
+                later = self._messages(topics.values(), number) if self._skip_damaged else {}
+                if not later:
+                    raise
+                self._index.first |= later
+        return kind.plan(topics, self._index, self._base_frame, self._sensors, str(self._bag.path))
+
+    def _messages(self, names: Iterable[str], number: int) -> dict[str, Any]:
+        """The decoded message of a number, of each of the topics that have it and of which it is sound."""
+        found: dict[str, Any] = {}
+        wanted = {name for name in names if self._index.counts.get(name, 0) > number}
+        for message in self._bag.raw(wanted):
+            if message.number == number:
+                wanted.discard(message.topic)
+                with suppress(StreamError):
+                    found[message.topic] = self._bag.decode(message)
+            if not wanted:
+                break
+        return found
 
     def _apply(self, window: Window) -> None:
         starts = [int(self._motion_ns[0])] + [planned.stamp_ns for planned in self._planned[:1]]

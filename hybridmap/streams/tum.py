@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.inputs import CameraIntrinsics, CameraMounting, SensorsConfig
-from hybridmap.config.root import Config
+from hybridmap.config.root import Config, is_allowed
 from hybridmap.config.section import read_mapping
-from hybridmap.errors import StreamError, quoted
+from hybridmap.errors import StreamError
 from hybridmap.geometry import Array
 from hybridmap.streams.base import Rig, Sample, SelfMotion, StreamReport
 from hybridmap.streams.cameras import (
     Calibration,
     check_size,
     clean_depth,
+    decode_picture,
     depth_from_units,
     from_intrinsics,
     mounted,
@@ -30,7 +31,9 @@ from hybridmap.streams.mounting import invert, matrix, planar
 from hybridmap.streams.order import Window, check_overlap, merge, pair_nearest, sorted_order
 from hybridmap.streams.rgbd import RGBD, RgbdFrame, pinhole
 from hybridmap.streams.sensors import wanted
-from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
+from hybridmap.trajectory import Trajectory, read_stamp_ns, read_tum
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,14 +49,21 @@ class TumStream:
     It holds `rgb/` and `depth/` with their lists or `associations.txt`, `odometry.txt` (poses of base_link), and `camera.yaml`.
     """
 
-    def __init__(self, folder: Path, config: Config, window: Window | None = None) -> None:
+    def __init__(self, folder: Path, config: Config, window: Window | None = None, *, skip_damaged: bool = False) -> None:
         """Read the lists, the odometry and the calibration, and check that every image exists.
+
+        Args:
+            folder: the folder.
+            config: calibration, mounting, synchronisation.
+            window: the part to use.
+            skip_damaged: leave out pictures that are damaged or missing, and count them, instead of ending with an error.
 
         Raises:
             StreamError: a file is missing, damaged or contradicts another; the message names it.
         """
         self.name = folder.name or str(folder)
-        self._folder, self._sensors = folder, config.sensors
+        self._folder, self._sensors, self._skip_damaged = folder, config.sensors, skip_damaged
+        self.report = StreamReport()
         self.remarks: list[str] = []
         self._odometry = self._read_odometry()
         self._calibration, self._T_base_camera, self._units_per_m = _read_calibration(folder, config.sensors)
@@ -64,16 +74,15 @@ class TumStream:
         elif all(kind.sensor_name != RGBD.sensor_name for kind in kinds):
             raise StreamError(f"{folder}: no {kinds[0].needs}: a TUM folder holds {RGBD.needs}; set vision.sensor to rgbd")
         for path in (path for pair in self._pairs for path in (pair.color, pair.depth)):
-            if not path.is_file():
+            if not path.is_file() and not skip_damaged:
                 raise StreamError(f"{path}: no such picture, though the folder's lists name it")
-        for _ in islice(self._frames(), 1):  # sizes and kinds that contradict each other show at once
-            pass
+        if self._pairs and not any(islice(self._frames(), 1)):  # sizes and kinds that contradict each other show at once
+            raise StreamError(f"{folder}: none of its {len(self._pairs)} pictures can be read")
         frame_ns = np.array([pair.stamp_ns for pair in self._pairs], dtype=np.int64)
         check_overlap(self._odometry.stamps_ns, frame_ns, str(folder))
         self.rig = Rig(camera=pinhole(self._calibration, self._T_base_camera) if self._pairs else None)
         self.groundtruth = self._read_groundtruth()
         self._apply(window or Window())
-        self.report = StreamReport()
 
     @property
     def expected_observations(self) -> int | None:
@@ -105,16 +114,29 @@ class TumStream:
             yield SelfMotion(int(stamp), pose)
 
     def _frames(self) -> Iterator[Sample]:
+        name = next(name for role, name in self.uses.items() if role in ("frames", "color")) if self._pairs else ""
         for pair in self._pairs:
-            color, depth = _read_color(pair.color), _read_depth(pair.depth)
-            if color.shape[:2] != depth.shape:
-                raise StreamError(
-                    f"{pair.depth}: depth is {depth.shape[1]}x{depth.shape[0]}, colour {color.shape[1]}x{color.shape[0]}; "
-                    "expected depth registered to colour"
-                )
-            check_size(color, self._calibration, str(pair.color))
-            depth_m = clean_depth(depth_from_units(depth, self._units_per_m), self._sensors)
-            yield RgbdFrame(pair.stamp_ns, self._calibration.undistort_color(color), self._calibration.undistort_depth(depth_m))
+            try:
+                frame = self._frame(pair)
+            except StreamError as error:
+                if not self._skip_damaged:
+                    raise
+                log.info("skipped: %s", error)
+                self.report.lose(name, len(self._pairs))
+                continue
+            yield frame
+
+    def _frame(self, pair: _Pair) -> RgbdFrame:
+        color, depth = _read_color(pair.color), _read_depth(pair.depth)
+        if color.shape[:2] != depth.shape:
+            raise StreamError(
+                f"{pair.depth}: depth is {depth.shape[1]}x{depth.shape[0]}, colour {color.shape[1]}x{color.shape[0]}; "
+                "expected depth registered to colour"
+            )
+        check_size(color, self._calibration, str(pair.color))
+        depth_m = clean_depth(depth_from_units(depth, self._units_per_m), self._sensors)
+        color, depth_m = self._calibration.undistort_color(color), self._calibration.undistort_depth(depth_m)
+        return RgbdFrame(pair.stamp_ns, color, depth_m)
 
     def _read_odometry(self) -> Trajectory:
         named = self._sensors.odometry_file
@@ -151,9 +173,9 @@ class TumStream:
 
 def _stamp_ns(text: str, path: Path, number: int) -> int:
     try:
-        return int((Decimal(text) * NS_PER_S).to_integral_value())
-    except (InvalidOperation, ValueError, OverflowError):
-        raise StreamError(f"{path}:{number}: expected a stamp in seconds, found {quoted(text)}") from None
+        return read_stamp_ns(text)
+    except ValueError as error:
+        raise StreamError(f"{path}:{number}: {error}") from None
 
 
 def _read_lines(path: Path, fields: int) -> list[tuple[int, list[str]]]:
@@ -243,8 +265,8 @@ def _read_calibration(folder: Path, sensors: SensorsConfig) -> tuple[Calibration
     except (KeyError, TypeError, ValueError) as error:
         found = str(error).replace("\n", " ")[:160]
         raise StreamError(f"{path}: missing or unusable entry: {found}") from None
-    if not units_per_m > 0:
-        raise StreamError(f"{path}: camera.depth_scale: found {units_per_m}, expected units per metre > 0")
+    if not is_allowed("sensors.depth_scale", units_per_m):
+        raise StreamError(f"{path}: camera.depth_scale: found {units_per_m:g}, expected units per metre, 0.001 to 1e6")
     return calibration, mounted(given), units_per_m
 
 
@@ -261,13 +283,12 @@ def _intrinsics_of(camera: dict[str, Any]) -> CameraIntrinsics:
 
 
 def _load(path: Path, flags: int) -> NDArray[Any]:
-    import cv2
-
-    data = np.fromfile(path, dtype=np.uint8)
-    picture = cv2.imdecode(data, flags) if len(data) else None
-    if picture is None:
-        raise StreamError(f"{path}: not a picture, or damaged")
-    return np.asarray(picture)
+    try:
+        return decode_picture(path.read_bytes(), flags)
+    except OSError as error:
+        raise StreamError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise StreamError(f"{path}: a picture that {error}") from None
 
 
 def _read_color(path: Path) -> NDArray[np.uint8]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from hybridmap.config.root import Config
 from hybridmap.errors import StreamError, quoted
 from hybridmap.streams.base import Rig, Sample, StreamReport, Velocity
 from hybridmap.streams.order import Window, sorted_order
-from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
+from hybridmap.trajectory import Trajectory, read_stamp_ns, read_tum
 
 COLUMNS = ("stamp_s", "v_m_s", "omega_rad_s")
 _FASTEST = 1000.0  # m/s and rad/s; no robot comes near it
@@ -22,8 +22,8 @@ _FASTEST = 1000.0  # m/s and rad/s; no robot comes near it
 class VelocityStream:
     """A velocity table as a stream. Its ground truth is the file `<name>_groundtruth.tum` next to it, if there is one."""
 
-    def __init__(self, path: Path, config: Config, window: Window | None = None) -> None:
-        """Read the table.
+    def __init__(self, path: Path, config: Config, window: Window | None = None, *, skip_damaged: bool = False) -> None:
+        """Read the table. There are no observations in it to be skipped.
 
         Raises:
             StreamError: missing, empty, wrong columns, a value that is not a finite number, or stamps out of order.
@@ -54,7 +54,7 @@ def read_table(path: Path) -> list[Velocity]:
         StreamError: the table is empty or damaged, or its stamps are out of order.
     """
     with path.open(encoding="utf-8", errors="replace", newline="") as file:
-        rows = csv.reader(file)
+        rows = _rows(path, file)
         header = tuple(name.strip() for name in next(rows, []))
         if header != COLUMNS:
             raise StreamError(
@@ -67,12 +67,22 @@ def read_table(path: Path) -> list[Velocity]:
     return [samples[i] for i in order]
 
 
+def _rows(path: Path, file: TextIO) -> Iterator[list[str]]:
+    try:
+        yield from csv.reader(file)
+    except csv.Error as error:
+        raise StreamError(f"{path}: no table of comma-separated values: {error}") from None
+
+
 def _read_row(path: Path, number: int, row: list[str]) -> Velocity:
     try:
-        stamp_ns = int((Decimal(row[0].strip()) * NS_PER_S).to_integral_value())
         values = [float(field) for field in row[1:]]
-    except (InvalidOperation, ValueError, OverflowError):
+    except ValueError:
         raise StreamError(f"{path}:{number}: expected numbers, found {quoted(','.join(row))}") from None
+    try:
+        stamp_ns = read_stamp_ns(row[0].strip())
+    except ValueError as error:
+        raise StreamError(f"{path}:{number}: {error}") from None
     if len(values) != 2:
         raise StreamError(f"{path}:{number}: expected 3 fields, found {len(row)}")
     if not np.isfinite(values).all():

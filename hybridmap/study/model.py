@@ -15,14 +15,18 @@ from pydantic import BeforeValidator, Field, ValidationError, model_validator
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.config.section import Section, read_mapping, said
 from hybridmap.errors import ConfigError
+from hybridmap.errors import quoted as quoted_value
+
+MOST_SEEDS = 10_000
+"""More runs of each cell than this would take years."""
 
 
 def _counted(seeds: Any) -> Any:
     """`seeds: 3` means 0, 1, 2."""
     if not isinstance(seeds, int) or isinstance(seeds, bool):
         return seeds
-    if seeds < 1:
-        raise ValueError(f"expected how many there are, 1 or more, or a list of them, found {seeds}")
+    if not 1 <= seeds <= MOST_SEEDS:
+        raise ValueError(f"expected how many there are, 1 to {MOST_SEEDS}, or a list of them, found {quoted_value(seeds)}")
     return tuple(range(seeds))
 
 
@@ -47,15 +51,15 @@ Names = Annotated[tuple[str, ...], BeforeValidator(_listed)]
 class SyntheticConfig(Section):
     """A pose graph without sensors: a robot drives in circles, and a loop joins each node to the node one lap earlier."""
 
-    nodes: int = Field(default=120, ge=4)
+    nodes: int = Field(default=120, ge=4, le=100_000)
     """Nodes of the drive."""
-    per_lap: int = Field(default=40, ge=3)
+    per_lap: int = Field(default=40, ge=3, le=100_000)
     """Nodes per lap; the graph has `nodes - per_lap` loops."""
-    step_m: float = Field(default=0.5, gt=0)
+    step_m: float = Field(default=0.5, gt=0, le=1000)
     """Distance from node to node, m."""
-    translation_m: float = Field(default=0.03, gt=0)
+    translation_m: float = Field(default=0.03, ge=1e-6, le=1000)
     """Standard deviation of every measured displacement, along and across, m."""
-    rotation_rad: float = Field(default=0.01, gt=0)
+    rotation_rad: float = Field(default=0.01, ge=1e-6, le=10)
     """Standard deviation of every measured turn, rad."""
 
 
@@ -120,11 +124,11 @@ class SourceConfig(Section):
 class DriftConfig(Section):
     """Errors added to the odometry edges of a frozen graph; the other edges stay."""
 
-    heading_bias_deg_per_m: float = 0.0
+    heading_bias_deg_per_m: float = Field(default=0.0, ge=-360, le=360)
     """Heading bias to the left, degrees per metre of each odometry edge."""
-    scale_bias: float = Field(default=0.0, gt=-1)
+    scale_bias: float = Field(default=0.0, gt=-1, le=100)
     """Relative error of each odometry edge's length."""
-    noise: float = Field(default=0.0, ge=0)
+    noise: float = Field(default=0.0, ge=0, le=1000)
     """Additional white noise, random by the seed, in standard deviations of the edge's information."""
     dropouts: float = Field(default=0.0, ge=0, le=1)
     """Share of the odometry edges, random by the seed, that turn by 20 deg more and slip by 0.5 m."""
@@ -203,7 +207,7 @@ class StatisticsConfig(Section):
     """Level of the confidence intervals."""
     method: Literal["t", "bootstrap"] = "t"
     """Student's t, or the bias-corrected and accelerated bootstrap."""
-    resamples: int = Field(default=2000, ge=100)
+    resamples: int = Field(default=2000, ge=100, le=1_000_000)
     """Resamples of the bootstrap."""
 
 

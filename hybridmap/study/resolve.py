@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Mapping
+from math import prod
 from pathlib import Path
 from typing import TypeVar
 
@@ -28,6 +30,7 @@ from hybridmap.study.model import (
 _OF_DRIVES = ("config", "overrides", "start_s", "end_s")
 _OF_RECORDINGS = ("reference", "relations")
 _PATHS = ("recording", "session", "graph", "reference", "relations")
+_MOST_CELLS = 1_000_000
 _Entry = TypeVar("_Entry", BackendVariant, SettingConfig)
 
 
@@ -74,6 +77,10 @@ def _expanded(entry: _Entry, field: str, origin_key: str, origin: str) -> list[_
     """One entry per combination of `vary`, whose values go into `field`."""
     if clash := sorted(set(entry.vary) & set(getattr(entry, field))):
         raise ConfigError(f"{origin}: {origin_key}: {entry.title}: {clash[0]} is in both {field} and vary")
+    if (count := prod(map(len, entry.vary.values()))) > _MOST_CELLS:
+        raise ConfigError(
+            f"{origin}: {origin_key}: {entry.title}: vary gives {count} combinations, expected {_MOST_CELLS} at most"
+        )
     entries = [entry.model_copy(update={"vary": {}})]
     for key, values in entry.vary.items():
         entries = [
@@ -99,9 +106,12 @@ def _check(study: StudyConfig, origin: str) -> None:
         "false_loops.kinds": list(study.false_loops.kinds),
     }
     for key, titles in lists.items():
-        twice = next((title for title in titles if titles.count(title) > 1), None)
+        twice = next((title for title, count in Counter(titles).items() if count > 1), None)
         if twice is not None:
             raise ConfigError(f"{origin}: {key}: {twice!r} is given twice; give each a name of its own")
+    cells = prod(map(len, lists.values()))
+    if cells > _MOST_CELLS:
+        raise ConfigError(f"{origin}: {cells} cells, expected at most {_MOST_CELLS}; split the study")
     for variant in study.backends:
         _check_backend(variant, f"{origin}: backends")
     for source in study.sources:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -152,7 +153,7 @@ def _content(path: Path) -> str:
         raise StreamError(f"{path}: no such file or folder")
     total = hashlib.sha256()
     for file in sorted(entry for entry in path.rglob("*") if entry.is_file()) if path.is_dir() else [path]:
-        total.update(f"{file.relative_to(path)}\0".encode())
+        total.update(os.fsencode(file.relative_to(path)) + b"\0")
         with file.open("rb") as opened:
             while block := opened.read(_BLOCK):
                 total.update(block)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
+import subprocess
+import sys
 
 import pytest
 from typer.testing import CliRunner
@@ -147,3 +150,14 @@ def test_an_option_that_does_not_fit_the_source_is_refused(laser_bag, tmp_path, 
     named = {"lab": "lab", "bag": str(laser_bag)}.get(source, str(tmp_path / source))
     with pytest.raises(ConfigError, match=f"^{option}: is for a"):
         CliRunner().invoke(app, ["inspect", named, option, "x"], catch_exceptions=False)
+
+
+def test_a_name_that_is_not_utf_8_is_printed_with_its_bytes_as_numbers(laser_bag, tmp_path):
+    path = tmp_path / os.fsdecode(b"drive\xff.bag")
+    path.write_bytes(laser_bag.read_bytes())
+    command = [sys.executable, "-c", "from hybridmap.cli import main; main()"]
+    environment = {**os.environ, "PYTHONIOENCODING": "utf-8:strict"}
+    for arguments in (["inspect", path], ["map", path, "--out", tmp_path / "session", "--end", "0.3", "--json"]):
+        done = subprocess.run([*command, *arguments], capture_output=True, env=environment, timeout=60)
+        assert done.returncode == 0, done.stderr
+    assert "drive" in (tmp_path / "session" / "report.html").read_text(encoding="utf-8")

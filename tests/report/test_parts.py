@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
 from hybridmap.geometry import compose, transform_points
 from hybridmap.graph.edges import Edge, EdgeKind, at_least, at_most
@@ -227,3 +228,17 @@ def test_times_are_said_as_people_say_them(value: float, said: tuple[str, str]) 
 def test_an_interval_has_the_decimals_that_it_bears_out(figures, text):
     value, low, high = figures
     assert page_tables.interval(Interval(value, low, high, 0 if math.isnan(value) else 7, 0.95)) == text
+
+
+def test_dollars_in_a_title_are_no_formula_and_powers_of_ten_are():
+    with style.figure(3.0, 2.0) as picture:
+        axes = picture.subplots()
+        axes.semilogy([1.0, 2.0], [1.0, 1e6], label="$\\frac$ a $")
+        axes.set_title("what $\\frac$ does")
+        axes.legend()
+        assert style.svg_uri(picture).startswith("data:image/svg+xml")
+        texts = {text.get_text(): text.get_parse_math() for text in picture.findobj(Text)}
+    assert texts["what $\\frac$ does"] is texts["$\\frac$ a $"] is False
+    powers = [formula for text, formula in texts.items() if "10^" in text]
+    assert powers
+    assert all(powers)

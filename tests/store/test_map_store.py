@@ -12,9 +12,9 @@ import pytest
 from hybridmap.backends.base import SolveReport, SolveStatus
 from hybridmap.errors import StoreError
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
-from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.graph.io import graph_hash
-from hybridmap.store import MapStore
+from hybridmap.store import MapStore, SessionFolder
 from hybridmap.streams.base import Rig
 from hybridmap.trajectory import anchors_on
 from tests.store.sessions import CAMERA, LASER, keyframe_of, ring_map, truth_at, write_session
@@ -61,8 +61,10 @@ def test_keyframes_snapshots_rig_and_solutions_come_back_exactly(tmp_path):
 def test_report_keeps_weights_and_rejected_edges(tmp_path):
     report = SolveReport("b", SolveStatus.STALLED, "m", 3, 2.0, 1.0, 0.5, (4, 9), {4: 0.25, 9: 0.0})
     with MapStore.create(tmp_path, "{}", Rig(), "x") as store:
+        for k in range(3):
+            store.add_node(k, Node(k, np.zeros(3), np.zeros(1, np.float32), -1, 0.0), np.zeros(3), {}, {})
         store.put_solution("b", np.zeros((2, 3)), report)
-        store.put_solution("a", np.ones((2, 3)), report)
+        store.put_solution("a", np.ones((3, 3)), report)
         store.put_solution("b", np.ones((3, 3)), report)
     with MapStore.open(tmp_path) as store:
         assert list(store.solutions()) == ["b", "a"]
@@ -237,3 +239,72 @@ def test_a_map_of_a_version_before_keeps_the_reasons_that_it_stored(tmp_path):
     assert edge.reason == "overlap 0.21 < 0.30"
     assert edge.figures == {"overlap": 0.21}
     assert edge.checks == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "read"),
+    [
+        ("UPDATE edges SET status = 'x'", "map"),
+        ("UPDATE edges SET kind = 'x'", "map"),
+        ("UPDATE edges SET target = 1000000", "map"),
+        ("UPDATE edges SET target = 'x'", "map"),
+        ("UPDATE edges SET covariance = x'00'", "map"),
+        ("UPDATE edges SET covariance = zeroblob(72)", "map"),
+        ("UPDATE edges SET x_m = 1e300", "map"),
+        ("UPDATE edges SET record = '[1]'", "map"),
+        ("""UPDATE edges SET record = '{"checks": [["x", "y", "at least", 1]]}'""", "map"),
+        ("""UPDATE edges SET record = '{"surprise": 1}'""", "map"),
+        ("DELETE FROM edges WHERE number = 3", "map"),
+        ("DELETE FROM nodes WHERE number = 3", "map"),
+        ("DELETE FROM arrays", "map"),
+        ("UPDATE arrays SET shape = '[1000000000000]'", "map"),
+        ("UPDATE arrays SET shape = 'x'", "map"),
+        ("UPDATE arrays SET dtype = 'O'", "map"),
+        ("UPDATE nodes SET odom_x_m = 9e999", "map"),
+        ("UPDATE nodes SET travel_m = 'x'", "map"),
+        ("UPDATE track SET node = 'x'", "track"),
+        ("UPDATE track SET x_m = 9e999", "track"),
+        ("UPDATE solutions SET poses = zeroblob(24)", "solutions"),
+        ("UPDATE solutions SET poses = zeroblob(7)", "solutions"),
+        ("UPDATE solutions SET report = '{}'", "solutions"),
+        ("UPDATE solutions SET report = replace(report, 'converged', 'x')", "solutions"),
+        ("UPDATE solutions SET report = '[' || report", "solutions"),
+        ("DROP TABLE track", "track"),
+    ],
+)
+def test_values_that_no_run_wrote_are_one_error(tmp_path, change, read):
+    folder = write_session(tmp_path / "session", ring_map(1.2))
+    with sqlite3.connect(folder.path / "map.db") as database:
+        database.execute(change)
+    with MapStore.open(folder.path) as store, pytest.raises(StoreError, match="map"):
+        getattr(store, read)()
+
+
+def test_a_rig_that_no_run_wrote_is_one_error(tmp_path):
+    for k, rig in enumerate(('{"laser": 3}', '{"laser": {"x": 1}}', '{"camera": {"width_px": "x"}}', "[" * 3000)):
+        folder = write_session(tmp_path / str(k), ring_map(1.2))
+        with sqlite3.connect(folder.path / "map.db") as database:
+            database.execute("UPDATE info SET value = ? WHERE key = 'rig'", (rig,))
+        with MapStore.open(folder.path) as store, pytest.raises(StoreError, match="damaged"):
+            _ = store.rig
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[]",
+        "[" * 3000,
+        '{"metrics": 3}',
+        '{"metrics": [{"name": "a", "value": "x", "unit": "m", "description": "d"}]}',
+        '{"metrics": [{"name": 3, "value": 1, "unit": "m", "description": "d"}]}',
+        '{"metrics": [], "remarks": 3}',
+        '{"metrics": [], "backends": [3]}',
+        '{"metrics": [], "reasons": ["x"]}',
+        '{"metrics": [], "failed_backends": [3]}',
+        '{"metrics": ' + "9" * 6000 + "}",
+    ],
+)
+def test_figures_that_no_run_wrote_are_one_error(tmp_path, text):
+    (tmp_path / "metrics.json").write_text(text)
+    with pytest.raises(StoreError, match="damaged"):
+        SessionFolder(tmp_path).read_metrics()

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+import resource
 import shutil
+import zlib
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from typer.testing import CliRunner
 
+from hybridmap.cli.app import app
+from hybridmap.cli.map import LOST
 from hybridmap.config import Config
 from hybridmap.config.inputs import SensorsConfig
 from hybridmap.errors import StreamError
+from hybridmap.store import SessionFolder
 from hybridmap.streams import open_stream
+from hybridmap.streams.cameras import Calibration, DepthRegistration, decode_color
+from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rosbag import BagStream
 from tests.narrowing import as_a
 from tests.streams.recordings import KINDS, NS, Recording, color_pixels, depth_mm, laser_drive, rgbd_drive
@@ -330,3 +342,78 @@ def test_odometry_of_tf_that_is_no_number(tmp_path):
         recording.transform("odom", "base_link", (np.nan if i == 2 else 0.1 * i, 0, 0), topic="/tf", stamp_ns=100 * NS + i)
     recording.scan(100 * NS, [1, 2, 3])
     _refuses(recording.write(tmp_path / "a.mcap"), "/tf", "odom -> base_link", "NaN", "100.000000002")
+
+
+def _claiming(width: int, height: int) -> bytes:
+    """A PNG of 8 x 6 pixels whose header says another size, with the right checksum."""
+    data = bytes(cv2.imencode(".png", color_pixels())[1].tobytes())
+    header = width.to_bytes(4, "big") + height.to_bytes(4, "big") + data[24:29]
+    return data[:16] + header + zlib.crc32(b"IHDR" + header).to_bytes(4, "big") + data[33:]
+
+
+@pytest.mark.parametrize("size", [(60_000, 60_000), (2**31 - 1, 2**31 - 1), (0, 0), (16, 6), (8, 5000)])
+def test_a_picture_whose_header_lies(tmp_path, size):
+    recording = rgbd_drive()
+    for k, (topic, _, message) in enumerate(recording.messages):
+        if topic.endswith("image_raw") and "depth" not in topic:
+            stamp_ns = message.header.stamp.sec * NS + message.header.stamp.nanosec
+            recording.compressed(stamp_ns, _claiming(*size), "png", topic=topic)
+            recording.messages[k] = recording.messages.pop()
+    path = recording.write(tmp_path / "a.mcap")
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    _refuses(path, "/camera/color/image_raw")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
+
+
+def test_a_single_row_with_a_huge_step_takes_no_memory():
+    message = SimpleNamespace(height=1, width=2, step=2**32 - 1, encoding="mono8", is_bigendian=0, data=np.zeros(2, np.uint8))
+    assert decode_color(message, "x").shape == (1, 2, 3)
+
+
+def test_a_colour_camera_that_cannot_be_finer_than_that():
+    depth = Calibration(8, 6, np.diag([1e-3, 1e-3, 1.0]))
+    with pytest.raises(StreamError, match="focal lengths"):
+        DepthRegistration(depth, Calibration(8, 6, np.diag([1e4, 1e4, 1.0])), np.eye(4))
+
+
+def _damage_some(path, topic_bytes: dict[str, list[int]]):
+    """Cut messages of an mcap short: topic -> their numbers. Their headers stay."""
+    with Reader(path) as reader:
+        messages = [(c.topic, c.msgtype, t, bytes(data)) for c, t, data in reader.messages()]
+    path.unlink()
+    numbers: dict[str, int] = {}
+    with Writer(path.parent / "again", version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections = {}
+        for topic, msgtype, time_ns, data in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, msgtype, typestore=get_typestore(Stores.ROS2_HUMBLE))
+            number = numbers.get(topic, 0)
+            numbers[topic] = number + 1
+            writer.write(connections[topic], time_ns, data[:40] if number in topic_bytes.get(topic, []) else data)
+    next((path.parent / "again").glob("*.mcap")).rename(path)
+
+
+@pytest.mark.parametrize("damaged", [[2, 4], [0], [0, 1, 5]])
+def test_damaged_scans_are_skipped_and_counted_on_request(tmp_path, damaged):
+    path = laser_drive().write(tmp_path / "a.mcap")
+    _damage_some(path, {"/scan": damaged})
+    _refuses(path, "/scan")
+    stream = open_stream(path, Config(), skip_damaged=True)
+    scans = [sample for sample in stream if isinstance(sample, LaserScan)]
+    assert len(scans) == 6 - len(damaged)
+    assert stream.report.lost == {"/scan": (len(damaged), 6)}
+
+
+def test_messages_that_zeros_replace_are_counted_and_strictness_makes_an_exit_code_of_it(tmp_path):
+    path = laser_drive(steps=60).write(tmp_path / "a.mcap")
+    data = bytearray(path.read_bytes())
+    at = data.index(b"laser", len(data) // 2)
+    data[at - 200 : at + 600] = bytes(800)
+    path.write_bytes(data)
+    stream = open_stream(path, Config())
+    samples = len(list(stream))
+    assert sum(gone for gone, _ in stream.report.lost.values()) == 120 - samples > 0
+    for arguments in (["inspect", str(path)], ["map", str(path), "--out", str(tmp_path / "session"), "--json"]):
+        assert CliRunner().invoke(app, [*arguments, "--strict"]).exit_code == LOST
+    head = SessionFolder(tmp_path / "session").read_metrics().head
+    assert {name: tuple(counts) for name, counts in head["lost"].items()} == stream.report.lost

@@ -138,7 +138,7 @@ def _write(name, text):
         (_write("camera.yaml", "camera: ["), ["camera.yaml", "YAML"]),
         (_write("camera.yaml", CAMERA.replace("width: 8", "width: 16")), ["8x6", "16x6"]),
         (_remove("rgb/1.png"), ["rgb/1.png", "no such picture"]),
-        (_write("depth/1.png", "no picture"), ["depth/1.png", "not a picture"]),
+        (_write("depth/1.png", "no picture"), ["depth/1.png", "cannot be decoded"]),
         (lambda f: cv2.imwrite(str(f / "depth/1.png"), np.zeros((3, 4), np.uint16)), ["depth/1.png", "4x3", "8x6"]),
         (lambda f: cv2.imwrite(str(f / "depth/1.png"), color_pixels()), ["depth/1.png", "16 bit"]),
         (_remove("depth.txt"), ["depth.txt"]),
@@ -170,3 +170,14 @@ def test_a_real_office_gives_what_its_readme_says(data_dir):
     valid = np.mean([(frame.depth_m > 0).mean() for frame in frames])
     assert 0.5 < valid < 0.75
     assert max(frame.depth_m.max() for frame in frames) < 7.5
+
+
+def test_damaged_and_missing_pictures_are_skipped_and_counted_on_request(folder):
+    (folder / "depth/0.png").write_text("no picture")
+    (folder / "rgb/2.png").unlink()
+    stream = open_stream(folder, Config(), skip_damaged=True)
+    assert len(_frames(stream)) == 1
+    assert stream.report.lost == {"rgb.txt": (2, 3)}
+    (folder / "rgb/1.png").unlink()
+    with pytest.raises(StreamError, match="none of its 3 pictures"):
+        open_stream(folder, Config(), skip_damaged=True)
