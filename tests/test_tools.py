@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import pytest
 import result_studies as studies
 import results
 import verdict_table
+from packaging.requirements import Requirement
 
 from hybridmap.metrics import Metric, to_json
 from tests.narrowing import known
@@ -144,3 +146,21 @@ def test_table_of_verdicts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     told = capsys.readouterr().out.splitlines()
     assert told[2:4] == ["| right | 2 | 1 | 1 | 0 |", "| wrong | 2 | 1 | 0 | 1 |"]
     assert [line.partition(":")[0] for line in told[4:]] == ["right and doubtful", "wrong and trusted"]
+
+
+def test_spoilt_tables_are_read_without_a_finding() -> None:
+    command = [sys.executable, "tools/mutate.py", "--kind", "csv", "--count", "12"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout
+    assert done.stdout.splitlines()[-1].split()[:2] == ["csv", "12"]
+
+
+def test_tested_versions_are_of_all_that_is_needed_and_allowed() -> None:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    tested = dict(line.lower().split("==") for line in lines if not line.startswith("#"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for text in (*project["dependencies"], *project["optional-dependencies"]["dev"]):
+        needed = Requirement(text)
+        assert needed.specifier.contains(tested[needed.name.lower()], prereleases=True), text
+    bounded = {Requirement(text).name for text in project["dependencies"] if "<" in text}
+    assert {"gtsam", "numpy", "open3d", "opencv-python-headless"} <= bounded

@@ -101,7 +101,7 @@ class BagIndex:
     """Result of the first pass over a bag.
 
     Attributes:
-        counts: topic -> number of messages read.
+        counts: topic -> number of messages read; 0 if none of them can be decoded.
         stamps_ns: topic -> header stamps in recorded order, ns.
         first: topic -> its first message, decoded.
         odometry: nav_msgs/Odometry topic -> its poses.
@@ -156,6 +156,7 @@ def build_index(bag: BagFile, names: Iterable[str], odom_frame: str, *, skip_dam
             index.first.setdefault(message.topic, decoded)
             if is_odometry:
                 _take_odometry(index, bag, message.topic, decoded, stamp_ns)
+    index.counts |= dict.fromkeys(index.stamps_ns.keys() - index.first.keys(), 0)  # none of their messages can be decoded
     return index
 
 

@@ -15,9 +15,9 @@ def readings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """One entry each time that a bag is indexed."""
     done: list[str] = []
 
-    def counted(bag, names, odom_frame):
+    def counted(bag, names, odom_frame, **options):
         done.append(str(bag.path))
-        return build_index(bag, names, odom_frame)
+        return build_index(bag, names, odom_frame, **options)
 
     monkeypatch.setattr(rosbag, "build_index", counted)
     return done

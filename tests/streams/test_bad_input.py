@@ -404,6 +404,14 @@ def test_damaged_scans_are_skipped_and_counted_on_request(tmp_path, damaged):
     assert stream.report.lost == {"/scan": (len(damaged), 6)}
 
 
+def test_a_topic_of_damaged_scans_alone_counts_as_lost(tmp_path):
+    path = laser_drive().write(tmp_path / "a.mcap")
+    _damage_some(path, {"/scan": list(range(6))})
+    stream = open_stream(path, Config(), skip_damaged=True)
+    assert not [sample for sample in stream if isinstance(sample, LaserScan)]
+    assert stream.report.lost == {"/scan": (6, 6)}
+
+
 def test_messages_that_zeros_replace_are_counted_and_strictness_makes_an_exit_code_of_it(tmp_path):
     path = laser_drive(steps=60).write(tmp_path / "a.mcap")
     data = bytearray(path.read_bytes())

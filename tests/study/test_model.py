@@ -84,8 +84,8 @@ def test_the_resolved_study_reads_back_to_an_equal_one(tmp_path, monkeypatch):
         ({"bars": [{"figure": "ate_m", "at_most": 1, "rates": 0.5}]}, "false_loops.rates has no '0.5'"),
         ({"false_loops": {"rates": [1.0]}}, "false_loops.rates.0: .*less than 1"),
         ({"seeds": [1, 1]}, "seeds: '1' is given twice"),
-        ({"seeds": 0}, "seeds: expected how many there are, 1 or more, or a list of them, found 0"),
-        ({"seeds": -1}, "seeds: expected how many there are, 1 or more, or a list of them, found -1"),
+        ({"seeds": 0}, "seeds: expected how many there are, 1 to 10000, or a list of them"),
+        ({"seeds": -1}, "seeds: expected how many there are, 1 to 10000, or a list of them"),
         ({"seeds": []}, r"seeds: expected at least 1 of them, found \[\]"),
     ],
 )
