@@ -90,6 +90,17 @@ def test_refused_loops_speak_if_they_missed_by_a_hair(share, speaks):
     assert ("loops refused" in judged(experiences)) is speaks
 
 
+def test_small_groups_of_a_drive_speak_together_and_those_of_a_file_do_not():
+    truth = drive(2)
+    experiences = mapped(truth[:60], slip=np.array([0.0, 2.0, 0.0]), per_lap=60)
+    for older in (0, 1, 2, 15, 16, 17):
+        relative, checks = loop(truth, older, older + CARRIED).relative, [at_least("near", 0.45, 0.5)]
+        experiences.add_edge(Edge.decided(older, older + CARRIED, EdgeKind.LOOP, relative, checks))
+    facts = Facts.of_drive(experiences, backends.create("gtsam-gnc").solve(experiences), "gtsam-gnc")
+    assert [(reason.kind, reason.count) for reason in reasons_of(facts)] == [("loops refused", 6)]
+    assert reasons_of(replace(facts, driven=False)) == ()
+
+
 def test_false_loops_against_many_true_ones_are_no_reason():
     graph = laps(SyntheticConfig(nodes=240, per_lap=60), 2).graph
     assert graph is not None

@@ -38,6 +38,7 @@ class Facts:
         free_m: (N,) way to each node on which odometry alone knows the motion, in one direction or in all.
         breaks: nodes to which the robot seems not to have driven, without a kidnapping that was found there.
         lost_since: the first node since which the robot is lost; None if it is not.
+        driven: whether the loops were proposed by a front-end on a drive, and not read from a file.
         lost: topic -> (messages that are missing or damaged, messages in all).
     """
 
@@ -52,6 +53,7 @@ class Facts:
     free_m: Array | None = None
     breaks: tuple[int, ...] = ()
     lost_since: int | None = None
+    driven: bool = False
     lost: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     @classmethod
@@ -83,6 +85,7 @@ class Facts:
             primary=primary,
             stamps_ns=np.array([node.stamp_ns for node in experiences.nodes], dtype=np.int64),
             wheels=_graph_of(experiences, [number for number, edge in enumerate(edges) if _driven(edge)]),
+            driven=True,
             free_m=free_lengths(experiences),
             breaks=tuple(sorted({edge.target for edge in edges if edge.broken_by} - found)),
             **more,

@@ -23,8 +23,6 @@ TOGETHER = 4
 groups, since of many false groups some fall where the map has nothing against them."""
 MOVES_M, MOVES_RAD = 0.1, math.radians(2.0)
 """A group of refused loops that would move the map by less than both says nothing that matters: a place is found within it."""
-OUTNUMBER = 2
-"""So many times as many loops of a group must stand against the map as loops of the map against the group."""
 BENT_MAX = 10.0
 """Standard deviations by which a map may bend a stretch of the chain of motion. Right maps stay below 6; wrong loops, a
 kidnapping or a bent odometry give more than 14."""
@@ -64,17 +62,23 @@ def no_map(facts: Facts) -> Iterable[Reason]:
 
 
 def refused_together(facts: Facts) -> Iterable[Reason]:
-    """Loops that are not in the map although they agree with each other, and more of them than the map has against them."""
+    """Loops that are not in the map although they agree with each other, and more of them than the map has against them.
+
+    The loops of a drive were verified by views, so that all groups of them count together. Of those in a file any share may be
+    false.
+    """
     graph, poses = facts.graph, facts.poses
     if poses is None:
         return []
     out = facts.plausible & graph.is_loop & (squared_norms(graph, poses) > BOUND)
     groups = rejected_clusters(graph, poses, tuple(graph.edge_ids[out].tolist()), BOUND)
+    if facts.driven and groups:
+        groups = (tuple(edge for group in groups for edge in group),)
     least = TOGETHER + math.log2(max(len(groups), 1))
     return [
         facts.reason("loops refused", one.shift_m, MOVES_M, node=one.node, count=one.spanning, against=one.against)
         for one in rivals(graph, poses, groups, facts.kept)
-        if _moves(one) and one.spanning >= max(least, OUTNUMBER * one.against)
+        if _moves(one) and one.spanning >= max(least, one.against)
     ]
 
 

@@ -18,7 +18,7 @@ class Rival:
     """A group of refused loops that agree with each other and contradict the map.
 
     If the group is right, then the chain is wrong somewhere between the older and the newer ends of its loops. The step of
-    the chain that most loops of the group and fewest loops of the map span is the one where this contradicts least.
+    the chain that most loops of the group for each loop of the map span is the one where this contradicts least.
 
     Attributes:
         edge_ids: the loops of the group.
@@ -49,7 +49,7 @@ def rivals(graph: PoseGraph, poses: Array, groups: Sequence[Sequence[int]], kept
     for group in groups:
         members = np.isin(graph.edge_ids, np.array(group, dtype=np.int64))
         spanning = spans(graph, members)
-        node = int(np.argmax(np.where(spanning > 0, spanning - against, -graph.n_edges)))
+        node = int(np.argmax(spanning / (against + 1)))
         apart = np.abs(residuals(graph.with_edges(members), poses))
         shift_m, turn_rad = float(np.median(np.hypot(apart[:, 0], apart[:, 1]))), float(np.median(apart[:, 2]))
         found.append(Rival(tuple(group), node, int(spanning[node]), int(against[node]), shift_m, turn_rad))
