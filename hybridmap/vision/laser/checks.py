@@ -8,6 +8,8 @@ FIT_MIN = "vision.laser.probes.fit_min"
 """The setting of the limit of `fit`."""
 INLIERS_WEAK, INLIERS_MIN = 0.45, 0.6
 """Least share of inliers at which a registration becomes an edge, and at which it is good: half of a view may have changed."""
+INLIERS_HINT = 0.25
+"""Least share of inliers at which scans after a break hint at where the robot is; at another place it is about 0.1."""
 TRANSLATION_MAX_M = 0.4
 """Largest distance of a registration that is not good from the odometry, m: more than wheels slip between nodes."""
 CONTRADICTION_SIGMAS = 4.0
@@ -51,16 +53,17 @@ def of_way(odometry_sigma: float | None, violation: float) -> tuple[Check, ...]:
     return (at_most("odometry_sigma", odometry_sigma, CONTRADICTION_SIGMAS), seen)
 
 
-def of_resumption(inliers: float, loosest_m: float, violation: float) -> tuple[Check, ...]:
-    """Check whether a scan after a break of the chain fits the scans before it so well that it tells where the robot is.
+def of_resumption(inliers: float, inliers_min: float, loosest_m: float, violation: float) -> tuple[Check, ...]:
+    """Check whether scans after a break of the chain fit the scans before it so well that they tell where the robot is.
 
     Args:
-        inliers: share of the scan's points that fit the submap before the break.
+        inliers: share of their points that fit the submap before the break.
+        inliers_min: least share that passes.
         loosest_m: largest standard deviation of the position in any direction.
-        violation: share of the walls of the two scans that lie in each other's free space.
+        violation: share of the walls of both that lie in each other's free space.
     """
     return (
-        at_least("inliers", inliers, INLIERS_MIN),
+        at_least("inliers", inliers, inliers_min),
         at_most("loosest_m", loosest_m, LOOSEST_MAX_M),
         at_most("violation", violation, RESUMED_VIOLATION),
     )

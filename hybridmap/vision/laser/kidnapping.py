@@ -43,6 +43,8 @@ OLD_M, OLD_NODES = 4.0, 20
 """The old nodes with which they are compared: largest distance, m, and number of the nearest."""
 LOOSE_M, LOOSE_RAD = 0.3, float(np.deg2rad(5.0))
 """Standard deviations of the pose of a single scan that is compared with the map, m and rad."""
+HINTS = 4
+"""So many nodes after a break whose scans hint that the robot drove on count as one that fits well."""
 DECIDED = 3.0
 """Going back from the node where the robot was localised, a sum of so many scans for the chain ends the search."""
 
@@ -72,6 +74,7 @@ class Continuity:
         self._atlas = atlas
         self._laser = laser
         self._tracker = tracker
+        self._hinted_at, self._hints = -1, 0
 
     def broken(
         self, node: int, step: Step, odometry: RelativePose, on_the_way: Sequence[tuple[Array, LaserScan]]
@@ -109,9 +112,11 @@ class Continuity:
             node: the newest node, after the last of them.
 
         Returns:
-            True if it drove on, False if it is elsewhere; None if the scan does not fit well enough to tell.
+            True if it drove on, False if it is elsewhere; None if the scans do not fit well enough to tell.
         """
         last = breaks[0].node - 1
+        self._hints = self._hints if self._hinted_at == breaks[-1].node else 0
+        self._hinted_at = breaks[-1].node
         by_wheels, expected = {b.node: b.odometry for b in breaks}, IDENTITY
         for i in range(last + 1, node + 1):
             chain = self._atlas.chain
@@ -121,11 +126,14 @@ class Continuity:
         loosest = np.linalg.eigvalsh(found.covariance(0, 0.0, 0.0)[:2, :2])[1] ** 0.5
         there = self._atlas.submap(last, self._atlas.along(last, RECENT_M, 0.0))
         seen = violation_both_ways(here, there, found.poses[0], self._atlas.ranges, self._laser)
-        if not passed(checks.of_resumption(float(found.inliers[0]), float(loosest), seen)):
-            return None
         off, wider = between(expected, found.poses[0]), np.sqrt(node - last)
-        near = np.hypot(off[0], off[1]) <= CONTRADICTION_M * wider
-        return bool(near and abs(off[2]) <= np.deg2rad(CONTRADICTION_DEG) * wider)
+        near = np.hypot(off[0], off[1]) <= CONTRADICTION_M * wider and abs(off[2]) <= np.deg2rad(CONTRADICTION_DEG) * wider
+        inliers = float(found.inliers[0])
+        if near and passed(checks.of_resumption(inliers, checks.INLIERS_HINT, float(loosest), seen)):
+            self._hints += 1
+        if not passed(checks.of_resumption(inliers, checks.INLIERS_MIN, float(loosest), seen)):
+            return True if self._hints >= HINTS else None
+        return bool(near)
 
     def contradicted(self, node: int, belief: Belief) -> bool:
         """Whether the last scans contradict the old scans around the robot's pose on the map, where that pose is certain."""

@@ -194,6 +194,8 @@ MARGIN_M, MARGIN_PER_M = 0.25, 0.03
 """A point is in free space where the range exceeds its distance by so much, m, plus this share of the distance."""
 VIEWPOINTS, POINTS = 6, 250
 """Most scans of one submap, and most points of the other, that are compared."""
+JUDGED = 10
+"""Fewer points in view tell nothing: two or three trees are no walls to look through."""
 GRAZING = 0.3
 """Least cosine between a wall's normal and the ray at which the wall is judged."""
 
@@ -216,7 +218,7 @@ def violation(
     free, hit = _look(cloud, inverse(poses), np.array([ranges[i] for i in seers.nodes[chosen].tolist()]), laser)
     through, seen = free.sum(axis=0), (free | hit).sum(axis=0)
     judged = seen > 0
-    return float((2.0 * through > seen)[judged].mean()) if judged.any() else 0.0
+    return float((2.0 * through > seen)[judged].mean()) if judged.sum() >= JUDGED else 0.0
 
 
 def violation_both_ways(
