@@ -8,14 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hybridmap.config.mapping import EdgesConfig
-from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose
-from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search
+from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, compose_relative
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.paths import covariances_from, odometry_covariance
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.streams.synchronise import Ready
 from hybridmap.trajectory import NS_PER_S
 from hybridmap.vision.base import Belief
+from hybridmap.wheel_noise import WheelNoise
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +53,7 @@ class Position:
         pose_odom: (3,) in `odom` by the path integrator.
         pose_odom_given: (3,) in the odometry as received.
         travel_m: path length so far.
+        driven: path length, m, and angle turned, rad, since the last node was made.
         at_node: the node from which the robot is seen, -1 before the first.
         pose_odom_at_node: (3,) of that node in `odom`.
         pose_map_at_node: (3,) of that node by every back-end, by name.
@@ -61,7 +63,7 @@ class Position:
         """Start before the first node; `primary` is the name of the back-end that `pose_map` uses."""
         self._config = config
         self._primary = primary
-        self._driven = (0.0, 0.0)  # since the last node was made: m and rad
+        self.driven = (0.0, 0.0)
         self.stamp_ns = 0
         self.pose_odom: Array = IDENTITY
         self.pose_odom_given: Array = IDENTITY
@@ -80,15 +82,15 @@ class Position:
         self.stamp_ns, self.pose_odom_given, self.pose_odom = ready.stamp_ns, ready.pose_odom_robot, pose_odom
         travel_m, turn_rad = float(np.hypot(ready.delta_robot[0], ready.delta_robot[1])), abs(float(ready.delta_robot[2]))
         self.travel_m += travel_m
-        self._driven = (self._driven[0] + travel_m, self._driven[1] + turn_rad)
+        self.driven = (self.driven[0] + travel_m, self.driven[1] + turn_rad)
 
     def odometry(self, pose_odom_before: Array) -> RelativePose:
-        """The motion from a pose (3,) in `odom` to here; its covariance is that of the drive since the last node was made."""
-        return RelativePose(between(pose_odom_before, self.pose_odom), odometry_covariance(self._config, *self._driven))
+        """The motion from a pose (3,) in `odom` to here, with the configured noise of the way since the last node."""
+        return RelativePose(between(pose_odom_before, self.pose_odom), odometry_covariance(self._config, *self.driven))
 
     def restart(self) -> None:
         """Set the path length since the last node to zero: a node was made here."""
-        self._driven = (0.0, 0.0)
+        self.driven = (0.0, 0.0)
 
     def attach(self, node: int, pose_odom_node: Array) -> None:
         """From now on, see the robot from a node that lies at a pose (3,) in `odom`."""
@@ -115,13 +117,18 @@ class EdgeBook:
 
     Attributes:
         tried_again: numbers of the loops that were measured again because a back-end down-weighted them as outliers.
+        wheels: the noise of the wheels, learnt from the edges.
     """
 
     def __init__(self, experiences: ExperienceMap, config: EdgesConfig) -> None:
         self._map = experiences
         self._config = config
         self._edge_of_proposal: dict[int, int] = {}
+        self._driven: dict[int, tuple[float, float]] = {}  # of each odometry edge
+        self._measured: dict[int, Edge] = {}  # registrations as they were proposed
+        self._contradicted: set[int] = set()  # odometry edges
         self.tried_again: tuple[int, ...] = ()
+        self.wheels = WheelNoise(config)
 
     def enter(self, proposals: Sequence[Edge]) -> list[int]:
         """Write proposed edges into the map; a proposal with the key of an earlier one replaces that one's edge.
@@ -132,18 +139,34 @@ class EdgeBook:
         for proposal in proposals:
             if proposal.key in self._edge_of_proposal:
                 number = self._edge_of_proposal[proposal.key]
+                self._measured.pop(number, None)
                 self._map.update_edge(number, proposal)
             else:
                 number = self._edge_of_proposal[proposal.key] = self._map.add_edge(proposal)
             changed.append(number)
+            if proposal.kind is EdgeKind.REGISTRATION and proposal.relative is not None and proposal.kidnapped_m is None:
+                self._note_registration(number, proposal)
             if proposal.contradicts_odometry and self._config.drop_contradicted:
-                changed += self._drop_odometry(proposal)
+                changed += self._contradict(proposal)
         return changed
 
-    def join(self, source: int, target: int, odometry: RelativePose) -> int:
-        """Add the odometry edge from the node that the robot was at to a new node; returns its number."""
+    def join(self, source: int, target: int, delta: Array, driven: tuple[float, float]) -> list[int]:
+        """Add the odometry edge from the node that the robot was at to a new node, with the noise that was learnt.
+
+        Args:
+            source, target: the two nodes.
+            delta: (3,) the motion between them, m and rad.
+            driven: path length of the motion, m, and angle turned, rad.
+
+        Returns:
+            The number of the new edge, then those of edges that changed because the noise of the wheels was learnt anew.
+        """
+        odometry = RelativePose(delta, self.wheels.covariance(*driven))
         edge = Edge.decided(source, target, EdgeKind.ODOMETRY, odometry, method=Method.ODOMETRY, search=Search.CHAIN)
-        return self._map.add_edge(edge)
+        number = self._map.add_edge(edge)
+        self._driven[number] = driven
+        changes = self.wheels.drive(*driven, delta)
+        return [number, *(self._weigh_again() if changes else [])]
 
     def belief(self, poses_of: Callable[[PoseGraph], Array], outliers: Sequence[int] = ()) -> Belief:
         """Poses of the nodes and their covariances, with which the front-end looks for loops.
@@ -173,12 +196,72 @@ class EdgeBook:
         self.tried_again = tuple(sorted({*self.tried_again, *changed}))
         return changed
 
-    def _drop_odometry(self, proposal: Edge) -> list[int]:
+    def _note_registration(self, number: int, proposal: Edge) -> None:
+        """Weigh a registration against the wheels, and let their noise be learnt from it."""
+        assert proposal.relative is not None
+        self._measured[number] = proposal
+        if self.wheels.trusted:
+            self._weigh_registration(number)
+        newest = len(self._map) - 1
+        if proposal.status is Status.ACCEPTED and proposal.target == newest and proposal.source == newest - 1:
+            self.wheels.register(proposal.relative)
+
+    def _weigh_again(self) -> list[int]:
+        """Give all edges of motion the covariance that the noise of the wheels now says; returns the edges that changed."""
+        changed = [number for number in self._driven if self._weigh_odometry(number)]
+        return changed + [number for number in self._measured if self._weigh_registration(number)]
+
+    def _weigh_odometry(self, number: int) -> bool:
+        edge = self._map.edge(number)
+        assert edge.relative is not None
+        covariance = self.wheels.covariance(*self._driven[number])
+        weighed = replace(edge, relative=RelativePose(edge.relative.delta, covariance))
+        if number in self._contradicted and (edge.lack is None) != self.wheels.trusted:
+            lack = None if self.wheels.trusted else Lack.OVERRULED
+            weighed = replace(weighed.settled(lack=lack), since_node=-1)
+        return self._write(number, weighed)
+
+    def _weigh_registration(self, number: int) -> bool:
+        proposal = self._measured[number]
+        assert proposal.relative is not None
+        wheels = RelativePose(IDENTITY, np.zeros((3, 3)))
+        for node in range(proposal.source + 1, proposal.target + 1):
+            number_of_step = self._own_odometry(node)
+            if number_of_step is None:
+                return False
+            step = self._map.edge(number_of_step).relative
+            assert step is not None
+            wheels = compose_relative(wheels, RelativePose(step.delta, self.wheels.covariance(*self._driven[number_of_step])))
+        relative = self.wheels.beside(proposal.relative, wheels)
+        return self._write(number, replace(self._map.edge(number), relative=relative))
+
+    def _write(self, number: int, edge: Edge) -> bool:
+        """Replace an edge if its covariance or status differs; returns whether it did."""
+        before = self._map.edge(number)
+        assert before.relative is not None
+        assert edge.relative is not None
+        if edge.status is before.status and np.array_equal(edge.relative.covariance, before.relative.covariance):
+            return False
+        self._map.update_edge(number, edge)
+        return True
+
+    def _own_odometry(self, node: int) -> int | None:
+        """Number of the odometry edge from the node before to a node; None if there is none."""
+        return next((n for n in self._map.edges_into(node) if n in self._driven and self._map.edge(n).source == node - 1), None)
+
+    def _contradict(self, proposal: Edge) -> list[int]:
+        """Drop the odometry edges that an edge contradicts; where the wheels are trusted, only a kidnapped robot's."""
         ends = {proposal.source, proposal.target}
         dropped = []
         for number in self._map.edges_into(max(ends)):
             edge = self._map.edge(number)
-            if edge.kind is EdgeKind.ODOMETRY and edge.source in ends:
+            if edge.kind is not EdgeKind.ODOMETRY or edge.source not in ends:
+                continue
+            if proposal.kidnapped_m is None:
+                self._contradicted.add(number)
+            else:
+                self._contradicted.discard(number)
+            if proposal.kidnapped_m is not None or not self.wheels.trusted:
                 self._map.update_edge(number, replace(edge.settled(lack=Lack.OVERRULED), since_node=-1))
                 dropped.append(number)
         return dropped

@@ -211,7 +211,7 @@ class Mapper:
         )
         self._novelty.remember(code)
         self.cells.remember(node)
-        edges = [self.book.join(at.at_node, node, at.odometry(at.pose_odom_at_node))] if node > 0 else []
+        edges = self.book.join(at.at_node, node, at.moved, at.driven) if node > 0 else []
         at.attach(node, at.pose_odom)
         return node, edges
 

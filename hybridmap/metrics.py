@@ -53,6 +53,8 @@ FIGURES: dict[str, tuple[str, str]] = {
     "loops_tried_again": ("1", "outlier loops, measured again on the final map"),
     "loops_readmitted": ("1", "of those, the ones that now agree with it"),
     "odometry_dropped": ("1", "odometry edges that a registration contradicted"),
+    "wheels_heading_noise": ("deg/√m", "heading noise of the wheels, learnt from registrations; below 0.5 they are trusted"),
+    "wheels_translation_noise": ("m/√m", "noise of the wheels' translation, learnt likewise"),
     "largest_correction": ("m", "largest shift of a node at one closure"),
     "travel": ("m", "path length by odometry"),
     "duration": ("s", "length of the recording"),

@@ -249,6 +249,14 @@ def _measured_again(mapper: Mapper) -> list[Metric]:
     ]
 
 
+def _learnt_noise(mapper: Mapper) -> list[Metric]:
+    learnt = mapper.book.wheels.learnt
+    if learnt is None:
+        return []
+    heading = figure("wheels_heading_noise", learnt.heading_deg)
+    return [heading, figure("wheels_translation_noise", learnt.translation_m)]
+
+
 def _figures(mapper: Mapper, recorder: _Recorder, duration_s: float) -> list[Metric]:
     edges = mapper.map.edges
     loops = [edge for edge in edges if edge.kind is EdgeKind.LOOP]
@@ -262,6 +270,7 @@ def _figures(mapper: Mapper, recorder: _Recorder, duration_s: float) -> list[Met
         figure("loops_retracted", count[Status.RETRACTED]),
         *_measured_again(mapper),
         figure("odometry_dropped", len(dropped)),
+        *_learnt_noise(mapper),
         figure("largest_correction", recorder.largest_correction_m),
         figure("travel", mapper.map.node(len(mapper.map) - 1).travel_m),
         figure("duration", duration_s),

@@ -53,6 +53,47 @@ def test_a_contradicted_odometry_edge_is_dropped(book, experiences):
     assert (experiences.edge(2).status, experiences.edge(2).lack) == (Status.RETRACTED, Lack.OVERRULED)
 
 
+def driven(book: EdgeBook, experiences: ExperienceMap, nodes: int, wheel_yaw_rad: float = 0.0) -> list[int]:
+    """Drive a metre from node to node, each one registered; returns the numbers of edges that changed at the last node."""
+    changed: list[int] = []
+    for k in range(nodes):
+        experiences.add_node(Node(k, IDENTITY, np.zeros(1, np.float32), -1, float(k)), IDENTITY)
+        if k:
+            changed = book.join(k - 1, k, np.array([1.0, 0.0, wheel_yaw_rad]), (1.0, 0.0))
+            seen = RelativePose(np.array([1.0, 0.0, 0.1 if k == 5 else 0.0]), COVARIANCE)
+            edge = Edge(k - 1, k, EdgeKind.REGISTRATION, Status.ACCEPTED, seen, key=k, contradicts_odometry=k == 5)
+            book.enter([edge])
+    return changed
+
+
+def odometry_into(experiences: ExperienceMap, node: int) -> Edge:
+    return next(edge for edge in map(experiences.edge, experiences.edges_into(node)) if edge.kind is EdgeKind.ODOMETRY)
+
+
+def test_wheels_that_prove_good_get_back_what_a_registration_dropped_and_all_edges_are_weighed_again():
+    experiences = ExperienceMap()
+    book = EdgeBook(experiences, EdgesConfig())
+    driven(book, experiences, 90)
+    before = odometry_into(experiences, 7)
+    assert odometry_into(experiences, 5).status is Status.RETRACTED
+    experiences = ExperienceMap()
+    book = EdgeBook(experiences, EdgesConfig())
+    assert len(driven(book, experiences, 102)) > 100
+    assert odometry_into(experiences, 5).status is Status.ACCEPTED
+    after = odometry_into(experiences, 7)
+    assert known(after.relative).covariance[2, 2] < known(before.relative).covariance[2, 2]
+    wrong = next(edge for edge in map(experiences.edge, experiences.edges_into(5)) if edge.kind is EdgeKind.REGISTRATION)
+    assert known(wrong.relative).covariance[2, 2] > 100.0 * COVARIANCE[2, 2]
+
+
+def test_wheels_that_do_not_prove_good_change_nothing():
+    experiences = ExperienceMap()
+    book = EdgeBook(experiences, EdgesConfig())
+    assert len(driven(book, experiences, 102, wheel_yaw_rad=0.1)) == 1
+    assert known(book.wheels.learnt).good is False
+    assert odometry_into(experiences, 5).status is Status.RETRACTED
+
+
 def test_proposed_edges_are_named_with_their_keys(book, experiences):
     book.enter([proposal(5), proposal(6)])
     assert [(edge.key, edge.source, edge.target) for edge in book.proposed([4])] == [(6, 3, 0)]
