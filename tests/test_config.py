@@ -205,3 +205,10 @@ def test_a_mounting_without_rotation_and_a_lens_of_three_numbers_are_refused():
     intrinsics = {"width_px": 8, "height_px": 6, "fx_px": 5, "fy_px": 5, "cx_px": 4, "cy_px": 3, "distortion": [0.1, 0.2, 0.3]}
     with pytest.raises(ConfigError, match="distortion"):
         Config.load(None, {"sensors.camera_intrinsics": intrinsics})
+
+
+def test_a_long_chain_of_files_is_refused(tmp_path):
+    for k in range(200):
+        (tmp_path / f"{k}.yaml").write_text(f"extends: {k + 1}.yaml")
+    with pytest.raises(ConfigError, match="chain of more than"):
+        Config.load(tmp_path / "0.yaml")

@@ -561,10 +561,17 @@ def _place(error: BaseException) -> str:
     return f"{Path(at.filename).name}:{at.lineno} {at.name}: {type(error).__name__}: {' '.join(str(error).split())[:120]}"
 
 
+class _Kept(io.BytesIO):
+    """What was printed; it stays when the stream around it is closed."""
+
+    def close(self) -> None:
+        pass
+
+
 @contextmanager
 def _caught(show: bool) -> Iterator[io.BytesIO]:
     """Take what is printed; a name that is not UTF-8 is refused by standard output, as on a terminal."""
-    said, printed, out, err = io.BytesIO(), io.BytesIO(), sys.stdout, sys.stderr
+    said, printed, out, err = _Kept(), _Kept(), sys.stdout, sys.stderr
     sys.stdout = io.TextIOWrapper(printed, "utf-8", errors="strict", write_through=True)
     sys.stderr = io.TextIOWrapper(said, "utf-8", errors="backslashreplace", write_through=True)
     try:

@@ -123,6 +123,10 @@ def named_configs() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
+_LONGEST_CHAIN = 20
+"""Configurations that extend one another."""
+
+
 def _find(source: str | Path, beside: Path | None) -> Path:
     path = Path(source)
     for candidate in (path, beside / path if beside else path):
@@ -136,8 +140,8 @@ def _find(source: str | Path, beside: Path | None) -> Path:
 
 def _read_tree(source: str | Path, seen: tuple[Path, ...], beside: Path | None = None) -> dict[str, Any]:
     path = _find(source, beside)
-    if path in seen:
-        raise ConfigError(f"{path}: `extends` forms a cycle; remove it from one of the files")
+    if path in seen or len(seen) >= _LONGEST_CHAIN:
+        raise ConfigError(f"{path}: `extends` forms a cycle, or a chain of more than {_LONGEST_CHAIN} files")
     tree = read_mapping(path)
     parent = tree.pop("extends", None)
     if parent is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -83,6 +82,10 @@ def pair_nearest(color_ns: Stamps, depth_ns: Stamps, tolerance_s: float) -> Pair
     return Pairs(table[:, 0], table[:, 1], int(free_color.sum()), int(free_depth.sum()))
 
 
+_LONGEST_S = 1e9
+"""No recording is 30 years long."""
+
+
 @dataclass(frozen=True, slots=True)
 class Window:
     """The part of a recording to use.
@@ -96,8 +99,8 @@ class Window:
 
     def __post_init__(self) -> None:
         for name, value in (("--start", self.start_s), ("--end", self.end_s)):
-            if value is not None and not (math.isfinite(value) and value >= 0.0):
-                raise StreamError(f"{name} {value}: expected seconds from the first stamp, 0 or more")
+            if value is not None and not 0.0 <= value <= _LONGEST_S:
+                raise StreamError(f"{name} {value}: expected seconds from the first stamp, 0 to {_LONGEST_S:g}")
         if self.start_s is not None and self.end_s is not None and self.end_s < self.start_s:
             raise StreamError(f"--end {self.end_s} s lies before --start {self.start_s} s; give a later end")
 

@@ -425,3 +425,11 @@ def test_messages_that_zeros_replace_are_counted_and_strictness_makes_an_exit_co
         assert CliRunner().invoke(app, [*arguments, "--strict"]).exit_code == LOST
     head = SessionFolder(tmp_path / "session").read_metrics().head
     assert {name: tuple(counts) for name, counts in head["lost"].items()} == stream.report.lost
+
+
+@pytest.mark.parametrize("seconds", [float("nan"), float("inf"), -1.0, 1e300])
+def test_a_part_that_no_recording_has(tmp_path, seconds):
+    path = laser_drive().write(tmp_path / "a.mcap")
+    for part in ({"start_s": seconds}, {"end_s": seconds}):
+        with pytest.raises(StreamError, match="expected seconds"):
+            open_stream(path, Config(), **part)
