@@ -18,7 +18,7 @@ from hybridmap.graph.gaps import free_lengths, kidnappings
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.verdict.reasons import Reason
 
-HAIR = 0.2
+HAIR = 0.1
 """A loop that missed its limits by up to this share of them may be right; in one that missed by more the views differ."""
 
 
