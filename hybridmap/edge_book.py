@@ -216,8 +216,8 @@ class EdgeBook:
         assert edge.relative is not None
         covariance = self.wheels.covariance(*self._driven[number])
         weighed = replace(edge, relative=RelativePose(edge.relative.delta, covariance))
-        if number in self._contradicted and (edge.lack is None) != self.wheels.trusted:
-            lack = None if self.wheels.trusted else Lack.OVERRULED
+        lack = None if self.wheels.trusted else Lack.OVERRULED
+        if number in self._contradicted and edge.lack in (None, Lack.OVERRULED) and edge.lack is not lack:
             weighed = replace(weighed.settled(lack=lack), since_node=-1)
         return self._write(number, weighed)
 

@@ -53,10 +53,10 @@ def test_a_contradicted_odometry_edge_is_dropped(book, experiences):
     assert (experiences.edge(2).status, experiences.edge(2).lack) == (Status.RETRACTED, Lack.OVERRULED)
 
 
-def driven(book: EdgeBook, experiences: ExperienceMap, nodes: int, wheel_yaw_rad: float = 0.0) -> list[int]:
+def driven(book: EdgeBook, experiences: ExperienceMap, nodes: int, wheel_yaw_rad: float = 0.0, first: int = 0) -> list[int]:
     """Drive a metre from node to node, each one registered; returns the numbers of edges that changed at the last node."""
     changed: list[int] = []
-    for k in range(nodes):
+    for k in range(first, nodes):
         experiences.add_node(Node(k, IDENTITY, np.zeros(1, np.float32), -1, float(k)), IDENTITY)
         if k:
             changed = book.join(k - 1, k, np.array([1.0, 0.0, wheel_yaw_rad]), (1.0, 0.0))
@@ -84,6 +84,17 @@ def test_wheels_that_prove_good_get_back_what_a_registration_dropped_and_all_edg
     assert known(after.relative).covariance[2, 2] < known(before.relative).covariance[2, 2]
     wrong = next(edge for edge in map(experiences.edge, experiences.edges_into(5)) if edge.kind is EdgeKind.REGISTRATION)
     assert known(wrong.relative).covariance[2, 2] > 100.0 * COVARIANCE[2, 2]
+
+
+def test_an_edge_across_a_kidnapping_does_not_come_back():
+    experiences = ExperienceMap()
+    book = EdgeBook(experiences, EdgesConfig())
+    driven(book, experiences, 90)
+    number = experiences.edges.index(odometry_into(experiences, 5))
+    experiences.update_edge(number, experiences.edge(number).settled(lack=Lack.KIDNAPPED))
+    driven(book, experiences, 102, first=90)
+    assert known(book.wheels.learnt).good
+    assert experiences.edge(number).lack is Lack.KIDNAPPED
 
 
 def test_wheels_that_do_not_prove_good_change_nothing():
