@@ -15,7 +15,7 @@ from hybridmap.graph.paths import covariances_from, odometry_covariance
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.streams.synchronise import Ready
 from hybridmap.trajectory import NS_PER_S
-from hybridmap.vision.base import Belief
+from hybridmap.vision.base import Belief, FrontEnd, Overruling
 from hybridmap.wheel_noise import WheelNoise
 
 
@@ -95,6 +95,10 @@ class Position:
     def attach(self, node: int, pose_odom_node: Array) -> None:
         """From now on, see the robot from a node that lies at a pose (3,) in `odom`."""
         self.at_node, self.pose_odom_at_node = node, pose_odom_node
+
+    def retime(self, pose_odom_at_node: Array, pose_odom: Array) -> None:
+        """Replace the poses (3,) of the node that the robot is at, and of the robot, in `odom`: odometry was measured again."""
+        self.pose_odom_at_node, self.pose_odom = pose_odom_at_node, pose_odom
 
     def correct(self, poses_of: Mapping[str, Array]) -> None:
         """Take in new poses (N, 3) of all nodes by each back-end, by name."""
@@ -195,6 +199,52 @@ class EdgeBook:
         changed = self.enter(proposals)
         self.tried_again = tuple(sorted({*self.tried_again, *changed}))
         return changed
+
+    def retime(self, poses_odom: Array, vision: FrontEnd | Overruling | None) -> list[int]:
+        """Measure the odometry of the whole chain again; where no registration contradicts it any more, it counts again.
+
+        Args:
+            poses_odom: (N, 3) new poses of all nodes in `odom`.
+            vision: judges whether the registrations still contradict the odometry.
+
+        Returns:
+            The numbers of the changed edges.
+        """
+        self._map.move_odometry(poses_odom)
+        changed: list[int] = []
+        for number in self._driven:
+            edge = self._map.edge(number)
+            delta = between(poses_odom[edge.source], poses_odom[edge.target])
+            edge = replace(edge, relative=RelativePose(delta, self.wheels.covariance(*self._driven[number])))
+            if number in self._contradicted and isinstance(vision, Overruling):
+                changed += self._judge_again(number, edge, vision)
+            else:
+                self._map.update_edge(number, edge)
+        deltas = between(poses_odom[:-1], poses_odom[1:])
+        changed += self._weigh_again() if self.wheels.measure_again(deltas) else []
+        return sorted({*self._driven, *changed})
+
+    def _judge_again(self, number: int, odometry: Edge, vision: Overruling) -> list[int]:
+        """Write a contradicted odometry edge, measured again; it counts again if no registration contradicts it any more."""
+        assert odometry.relative is not None
+        against = [n for n in self._map.edges_into(odometry.target) if self._contradicts(n, odometry.source)]
+        measured = [self._measured[n].relative for n in against]
+        if any(one is not None and vision.overrules(one, odometry.relative) for one in measured):
+            self._map.update_edge(number, odometry)
+            return []
+        self._contradicted.discard(number)
+        back = odometry if odometry.lack is not Lack.OVERRULED else replace(odometry.settled(), since_node=-1)
+        self._map.update_edge(number, back)
+        for n in against:
+            self._measured[n] = replace(self._measured[n], contradicts_odometry=False)
+            self._map.update_edge(n, replace(self._map.edge(n), contradicts_odometry=False))
+        return against
+
+    def _contradicts(self, number: int, source: int) -> bool:
+        """Whether an edge from a node is a registration that contradicts the odometry."""
+        return (
+            number in self._measured and self._measured[number].contradicts_odometry and self._map.edge(number).source == source
+        )
 
     def _note_registration(self, number: int, proposal: Edge) -> None:
         """Weigh a registration against the wheels, and let their noise be learnt from it."""

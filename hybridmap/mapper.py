@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hybridmap.backends.base import Backend
 from hybridmap.backends.driver import Ensemble
-from hybridmap.calibration.online import OnlineCalibration
+from hybridmap.calibration.online import OdometryWatch
 from hybridmap.config import Config
 from hybridmap.edge_book import EdgeBook, Position, Update
 from hybridmap.geometry import IDENTITY, Array, between, compose, inverse
@@ -18,7 +18,6 @@ from hybridmap.graph.edges import Edge, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node, Novelty
 from hybridmap.metrics import StageClock
 from hybridmap.neural.path_integrator import PathIntegrator, Reanchoring
-from hybridmap.odometry_model import Gains
 from hybridmap.second_look import SecondLook
 from hybridmap.streams.base import Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.laser import LaserScan
@@ -61,9 +60,9 @@ class Mapper:
         self.vision = create_front_end(config.vision, rig or rig_of(config.sensors), config.seed, self.clock)
         self.backends = Ensemble(config.backends, self.clock, backends)
         self.second_look = SecondLook(self.map, self.book, self.backends, self.vision, config)
-        self.calibration = OnlineCalibration(Gains.of(config.neural)) if config.calibration.online else None
         self.anchors = NO_ANCHORS
-        self._synchroniser = Synchroniser(latency_s=config.sensors.latency_s, odometry_delay_s=config.sensors.odometry_delay_s)
+        self._synchroniser = Synchroniser(config.sensors.latency_s, config.sensors.odometry_delay_s or 0.0)
+        self.calibration = OdometryWatch(config, self.integrator, self._synchroniser)
         self._novelty = Novelty(config.nodes)
         self._position = Position(config.edges, self.backends.primary)
 
@@ -113,14 +112,14 @@ class Mapper:
                 edges += self._close_loops(node)
             self._position.restart()
             self._correct()
-        return self._position.update(reason + self._calibrate(), node, edges)
+        return self._position.update(reason + self.calibration.follow(self.map, self.poses), node, edges)
 
     def finish(self) -> list[Update]:
         """End of the drive: find more loops, solve, measure outlier loops again, and register the frames between nodes."""
         updates = [self.step(ready) for ready in self._synchroniser.flush()]
         self._position.pose_odom = self.cells.pose_odom_robot
         if len(self.map):
-            updates += self._propose_again()
+            updates += self._retime() + self._propose_again()
             self._correct(final=True)
             updates += self._look_again()
             self._measure_between_nodes()
@@ -181,20 +180,21 @@ class Mapper:
             with self.clock.stage("retrace"):
                 self.anchors = self.vision.dense_trajectory(replace(self.belief(), poses_map_node=self.poses()))
 
-    def _calibrate(self) -> str:
-        """Correct the gains where the map shows an error; returns what to add to the reason."""
-        change = self.calibration.follow(self._position.stamp_ns, self.map.pose_graph, self.poses) if self.calibration else None
-        if change is None:
-            return ""
-        self.integrator.gains = change.gains
-        return f"; {change}"
+    def _retime(self) -> list[Update]:
+        """Measure the odometry of the whole drive again on the clock of the views, if that was off."""
+        if not (clock := self.calibration.clock).finish(self.map):
+            return []
+        poses = clock.poses_at(np.array([*(node.stamp_ns for node in self.map.nodes), self._position.stamp_ns]))
+        edges = self.book.retime(poses[:-1], self.vision)
+        self._position.retime(poses[-2], poses[-1])
+        self._correct()
+        return [self._position.update(str(clock.offset), None, edges)]
 
     def _path_integrate(self, ready: Ready) -> None:
-        if self.calibration is not None:
-            self.calibration.observe(ready.stamp_ns, ready.delta_robot)
         with self.clock.stage("neural"):
             self.integrator.step(ready.delta_robot, ready.dt_s)
             self._position.drive(ready, self.cells.pose_odom_robot)
+        self.calibration.observe(ready, self._position.pose_odom)
 
     def _look(self, ready: Ready) -> View | None:
         if self.vision is None or ready.observation is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from hybridmap.backends import objective
 from hybridmap.backends.base import ODOMETRY, SolveReport
-from hybridmap.calibration.online import GainChange
-from hybridmap.calibration.sessions import GAIN_CHANGES
+from hybridmap.calibration.clock import ClockOffset
+from hybridmap.calibration.sessions import CLOCK_OFFSET, GAIN_CHANGES
 from hybridmap.config import Config
 from hybridmap.edge_book import Update
 from hybridmap.errors import StreamError
@@ -93,6 +93,7 @@ def _drive(stream: Stream, mapper: Mapper, recorder: _Recorder, progress: Progre
         log.warning("%s: %s: %d messages of %d are damaged or missing; they were left out", stream.name, name, gone, stated)
     for update in mapper.finish():
         recorder.record(update)
+    recorder.rewrite_odometry()
     if not len(mapper.map):
         counts = ", ".join(f"{count} {name}" for name, count in stream.report.counts.items()) or "no sample"
         raise StreamError(f"{stream.name}: gave nothing to map (found {counts}); expected odometry and views at the same time")
@@ -129,6 +130,17 @@ class _Recorder:
         if update.new_node is not None:
             self.store.commit()
 
+    def rewrite_odometry(self) -> None:
+        """At the end of the drive, write its odometry on the clock of the views, if that was corrected."""
+        clock, experiences = self._mapper.calibration.clock, self._mapper.map
+        self.store.put_info(CLOCK_OFFSET, clock.offset.used_s)
+        if not clock.offset.used_s:
+            return
+        track = self.store.track()
+        poses, nodes = clock.poses_at(track.stamps_ns), np.array([node.pose_odom for node in experiences.nodes])
+        moved = replace(track, deltas=between(nodes[track.nodes], poses), poses_odom=poses)
+        self.store.replace_odometry(moved, experiences)
+
     def _write_node(self, number: int) -> None:
         mapper = self._mapper
         keyframe = mapper.vision.keyframe(number) if mapper.vision is not None else {}
@@ -136,7 +148,7 @@ class _Recorder:
         self.store.add_node(number, mapper.map.node(number), initial, keyframe, mapper.cells.activity_at(number))
 
     def _write_gain_changes(self) -> None:
-        changes = _gain_changes(self._mapper)
+        changes = self._mapper.calibration.changes
         if len(changes) > self._gain_changes:
             self._gain_changes = len(changes)
             self.store.put_info(GAIN_CHANGES, [change.row for change in changes])
@@ -186,7 +198,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
             if name != ODOMETRY:
                 folder.write_trajectory(name, trajectory_of(track, solution.poses))
             folder.write_trajectory(f"{name}_online", store.online(name))
-    free = unobserved(mapper.map, mapper.poses())
+    free, offset = unobserved(mapper.map, mapper.poses()), mapper.calibration.clock.offset
     head = {
         **said_of(reasons_of(facts_of(mapper, stream.report))),
         "graph_hash": graph_hash(mapper.map),
@@ -198,7 +210,8 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
         "lost": {name: list(counts) for name, counts in stream.report.lost.items()},
         "remarks": [
             *stream.report.remarks,
-            *map(str, _gain_changes(mapper)),
+            *map(str, mapper.calibration.changes),
+            *([str(offset)] if offset.worth_saying else []),
             *map(str, kidnappings(mapper.map)),
         ],
     }
@@ -209,10 +222,6 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
     for key in ("graph_hash", "primary_backend"):
         store.put_info(key, head[key])
     return Session(folder, head, metrics)
-
-
-def _gain_changes(mapper: Mapper) -> list[GainChange]:
-    return mapper.calibration.changes if mapper.calibration is not None else []
 
 
 def facts_of(mapper: Mapper, report: StreamReport) -> Facts:
@@ -235,6 +244,14 @@ def _weak(name: str, report: SolveReport) -> list[Metric]:
     return [
         figure(f"weak_edges/{name}", len(report.weak_edges)),
         figure(f"hanging_nodes/{name}", report.hanging_nodes),
+    ]
+
+
+def _clock_figures(offset: ClockOffset) -> list[Metric]:
+    return [
+        figure("clock_offset", offset.offset_s, said=offset),
+        figure("clock_offset_sigma", offset.sigma_s),
+        figure("clock_offset_used", offset.used_s),
     ]
 
 
@@ -271,6 +288,7 @@ def _figures(mapper: Mapper, recorder: _Recorder, duration_s: float) -> list[Met
         *_measured_again(mapper),
         figure("odometry_dropped", len(dropped)),
         *_learnt_noise(mapper),
+        *_clock_figures(mapper.calibration.clock.offset),
         figure("largest_correction", recorder.largest_correction_m),
         figure("travel", mapper.map.node(len(mapper.map) - 1).travel_m),
         figure("duration", duration_s),

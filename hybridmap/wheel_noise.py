@@ -137,6 +137,19 @@ class WheelNoise:
         """Add the motion of the newest step by registration."""
         self._steps[-1].registration = registration
 
+    def measure_again(self, deltas: Array) -> bool:
+        """Replace the motion of all steps by the wheels, (S, 3), and learn again what was learnt from them.
+
+        Returns:
+            Whether the covariances of edges must change.
+        """
+        for step, delta in zip(self._steps, deltas, strict=True):
+            step.wheels = delta
+        was_trusted = self.trusted
+        if self.learnt is not None:
+            self._learn()
+        return was_trusted or self.trusted
+
     def _learn(self) -> None:
         travel = np.cumsum([step.travel_m for step in self._steps])
         difference = np.array([step.difference for step in self._steps])

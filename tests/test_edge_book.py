@@ -137,3 +137,30 @@ def test_a_loop_that_was_measured_wrongly_is_measured_again_at_the_end():
     assert spoilt not in solution.report.rejected_edge_ids
     off = between(known(edge.relative).delta, between(*solution.poses[[edge.source, edge.target]]))
     assert np.hypot(off[0], off[1]) < 0.03
+
+
+class Strict:
+    """Registrations further than 0.2 m from the odometry overrule it."""
+
+    def overrules(self, registration: RelativePose, odometry: RelativePose) -> bool:
+        return bool(abs(registration.delta[0] - odometry.delta[0]) > 0.2)
+
+
+@pytest.mark.parametrize(("step_m", "status"), [(1.1, Status.ACCEPTED), (1.5, Status.RETRACTED)])
+def test_odometry_that_is_measured_again_counts_again_if_nothing_contradicts_it_any_more(step_m, status):
+    experiences = ExperienceMap()
+    book = EdgeBook(experiences, EdgesConfig())
+    for k in range(3):
+        experiences.add_node(Node(k, np.array([1.5 * k, 0, 0]), np.zeros(1, np.float32), -1, 1.5 * k), IDENTITY)
+        if k:
+            book.join(k - 1, k, np.array([1.5, 0, 0]), (1.5, 0.0))
+            registration = RelativePose(np.array([1.0, 0, 0]), COVARIANCE)
+            book.enter([Edge(k - 1, k, EdgeKind.REGISTRATION, Status.ACCEPTED, registration, key=k, contradicts_odometry=True)])
+    dropped = [n for n, edge in enumerate(experiences.edges) if edge.kind is EdgeKind.ODOMETRY]
+    assert {experiences.edge(n).status for n in dropped} == {Status.RETRACTED}
+    poses = np.array([[step_m * k, 0.0, 0.0] for k in range(3)])
+    assert set(dropped) <= set(book.retime(poses, Strict()))
+    assert {experiences.edge(n).status for n in dropped} == {status}
+    assert all(known(experiences.edge(n).relative).delta[0] == pytest.approx(step_m) for n in dropped)
+    assert [node.pose_odom[0] for node in experiences.nodes] == poses[:, 0].tolist()
+    np.testing.assert_allclose(experiences.initial, poses)

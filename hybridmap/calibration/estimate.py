@@ -79,7 +79,7 @@ class Estimate:
         return bool(np.any(np.abs(self.off(other)) > SIGNIFICANT_SIGMAS))
 
 
-def metrics_of(estimate: Estimate, in_use: Gains) -> list[Metric]:
+def metrics_of(estimate: Estimate, in_use: Gains, delay_s: float = 0.0) -> list[Metric]:
     """Each gain with its standard deviation and distance from the value in use (NaN if unobservable), and the data used."""
     rows: list[Metric] = []
     told, sigmas, off = estimate.measured, estimate.sigmas, estimate.off(in_use)
@@ -93,8 +93,9 @@ def metrics_of(estimate: Estimate, in_use: Gains) -> list[Metric]:
         ]
     return [
         *rows,
-        Metric("delay/calibration", float(values[3]), "s", "odometry of stamp t is where the robot is at t + delay"),
-        Metric("delay_sigma/calibration", float(sigmas[3]), "s", "its standard deviation"),
+        Metric("delay/calibration", float(values[3]), "s", "odometry of stamp t is where the robot is at t + delay, beside:"),
+        Metric("delay_in_use/calibration", delay_s, "s", "delay that the map was made with: configured, or found driving"),
+        Metric("delay_sigma/calibration", float(sigmas[3]), "s", "standard deviation of the delay"),
         Metric("leg/calibration", estimate.leg_m, "m", "length of the legs that were compared"),
         Metric("legs/calibration", estimate.legs, "1", "independent legs"),
         Metric("travel/calibration", estimate.travel_m, "m", "path length that was used"),
@@ -128,11 +129,17 @@ def verdict(estimate: Estimate, in_use: Gains) -> str:
     return "; ".join(said)
 
 
-def calibrated(config_tree: dict[str, Any], estimate: Estimate, in_use: Gains) -> str:
+def calibrated(config_tree: dict[str, Any], estimate: Estimate, in_use: Gains, delay_s: float | None = None) -> str:
     """Put the estimate into a configuration (the nested mapping of its file); returns YAML that `Config.load` reads.
 
     If one gain differs significantly, all observable gains change together, as each is estimated given the others. The delay
     is decided separately. The drive was mapped with the delay in use, so the estimated delay is added to it.
+
+    Args:
+        config_tree: the configuration.
+        estimate: what was estimated.
+        in_use: the gains in use.
+        delay_s: the delay in use, s; None: that of the configuration.
 
     Raises:
         ConfigError: the result is not a valid configuration of this version, e.g. a delay beyond its limit.
@@ -142,7 +149,8 @@ def calibrated(config_tree: dict[str, Any], estimate: Estimate, in_use: Gains) -
     if estimate.differs(in_use):
         neural |= dict(zip(GAIN_KEYS, estimate.kept(in_use).to_array().tolist(), strict=True))
     if estimate.delay_differs:
-        sensors["odometry_delay_s"] = float(sensors.get("odometry_delay_s", 0.0)) + estimate.delay_s
+        used_s = float(sensors.get("odometry_delay_s") or 0.0) if delay_s is None else delay_s
+        sensors["odometry_delay_s"] = used_s + estimate.delay_s
     tree |= {"neural": neural, "sensors": sensors}
     Config.from_tree(tree, "calibrated configuration, not written")
     return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True)

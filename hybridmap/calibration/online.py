@@ -1,4 +1,4 @@
-"""Online calibration: the gains change while driving, once the map shows with certainty that they are wrong."""
+"""Calibration while driving: the clock of the odometry, and its gains once the map shows with certainty that they are wrong."""
 
 from __future__ import annotations
 
@@ -9,14 +9,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.calibration.clock import SensorClock
 from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.legs import Motion
 from hybridmap.calibration.regression import Sighting, regress
+from hybridmap.config import Config
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array
 from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.neural.path_integrator import PathIntegrator
 from hybridmap.odometry_model import Gains
+from hybridmap.streams.synchronise import Ready, Synchroniser
 
 FIRST_M, EVERY_M = 50.0, 25.0
 """Travel before the first estimate and between two, m: legs between closures are then long enough to tell gains from noise."""
@@ -99,3 +104,46 @@ class OnlineCalibration:
         self.changes.append(change)
         _logger.warning("%s", change)
         return change
+
+
+class OdometryWatch:
+    """What is learnt about the odometry while driving, and put to use at once: its clock, and its gains if so configured.
+
+    Attributes:
+        clock: the offset between views and odometry.
+    """
+
+    def __init__(self, config: Config, integrator: PathIntegrator, synchroniser: Synchroniser) -> None:
+        """Start before the drive; gains go to the integrator, the offset to the synchroniser."""
+        self.clock = SensorClock(config.sensors, config.edges)
+        self._gains = OnlineCalibration(Gains.of(config.neural)) if config.calibration.online else None
+        self._integrator, self._synchroniser = integrator, synchroniser
+
+    @property
+    def changes(self) -> list[GainChange]:
+        """The changes of the gains so far."""
+        return [] if self._gains is None else self._gains.changes
+
+    def observe(self, ready: Ready, pose_odom: Array) -> None:
+        """Take note of a step of raw odometry, and of the pose (3,) in `odom` after it."""
+        self.clock.observe(ready, pose_odom)
+        if self._gains is not None:
+            self._gains.observe(ready.stamp_ns, ready.delta_robot)
+
+    def follow(self, experiences: ExperienceMap, poses: Callable[[], Array]) -> str:
+        """Take note of a new node, and correct what the map shows to be wrong; returns what was corrected, in words.
+
+        Args:
+            experiences: the map with the new node.
+            poses: called for the poses (N, 3) of all nodes, only if an estimate of the gains is due.
+        """
+        said = ""
+        if (late_s := self.clock.follow(experiences)) is not None:
+            self._synchroniser.retime(late_s)
+            said = f"; {self.clock.offset}"
+        stamp_ns = experiences.node(len(experiences) - 1).stamp_ns
+        change = self._gains.follow(stamp_ns, experiences.pose_graph, poses) if self._gains is not None else None
+        if change is None:
+            return said
+        self._integrator.gains = change.gains
+        return f"{said}; {change}"

@@ -31,6 +31,9 @@ log = logging.getLogger(__name__)
 GAIN_CHANGES = "gain_changes"
 """Under this key of the map file: `[stamp_ns, gain, turn_gain, heading_bias_rad_m]` for each change made while driving."""
 
+CLOCK_OFFSET = "clock_offset"
+"""Under this key: the offset between views and odometry that was estimated and corrected, s; 0 if it was not."""
+
 ESTIMATORS = ("alternating", "joint")
 
 _IN_USE = {"neural": GAIN_KEYS, "sensors": ("odometry_delay_s",)}
@@ -51,6 +54,7 @@ class Drive:
         config: the part of the session's configuration that a calibration needs: gains, delay and back-ends.
         config_tree: the whole configuration, as stored in the map file.
         sensors: description of the session's sensors, for people.
+        delay_s: delay of the odometry in use: as configured, or as estimated while driving, s.
     """
 
     name: str
@@ -61,6 +65,7 @@ class Drive:
     config: Config
     config_tree: dict[str, Any]
     sensors: str
+    delay_s: float = 0.0
 
 
 def read_drive(folder: Path) -> Drive:
@@ -77,6 +82,7 @@ def read_drive(folder: Path) -> Drive:
         tree = store.config_tree
         config = _understood(tree, f"{store.path}: configuration")
         changes, primary = store.info(GAIN_CHANGES) or [], store.primary
+        delay_s = (config.sensors.odometry_delay_s or 0.0) + float(store.info(CLOCK_OFFSET) or 0.0)
         sensors = " and ".join(words(store.rig)) or "no sensor but odometry"
     if len(track) < 2:
         raise EvaluationError(f"{folder}: holds no odometry to calibrate; give a session of a drive with wheel odometry")
@@ -85,7 +91,7 @@ def read_drive(folder: Path) -> Drive:
     graph = experiences.pose_graph()
     poses = solutions[primary].poses if primary in solutions else graph.initial
     stamps = np.array([node.stamp_ns for node in experiences.nodes], dtype=np.int64)
-    return Drive(str(folder), motion, graph, stamps, poses, config, tree, sensors)
+    return Drive(str(folder), motion, graph, stamps, poses, config, tree, sensors, delay_s)
 
 
 def estimate_of(
@@ -248,7 +254,9 @@ def _understood(tree: dict[str, Any], origin: str) -> Config:
 
 
 def _in_use(config: Config) -> dict[str, float]:
-    return {f"{section}.{key}": getattr(getattr(config, section), key) for section, keys in _IN_USE.items() for key in keys}
+    return {
+        f"{section}.{key}": getattr(getattr(config, section), key) or 0.0 for section, keys in _IN_USE.items() for key in keys
+    }
 
 
 def _same_recording(one: Motion, other: Motion) -> bool:

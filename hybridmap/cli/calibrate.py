@@ -58,7 +58,7 @@ def calibrate(
         estimate = estimate_of(drives, truths, estimator, leg)
         in_use = Gains.of(drives[0].config.neural)
         if out is not None and work is not None:
-            write_text(work / out.name, calibrated(tree, estimate, in_use))
+            write_text(work / out.name, calibrated(tree, estimate, in_use, drives[0].delay_s))
     how = "reference" if truths else estimator or "alternating"
     head = {
         "sessions": [str(folder) for folder in folders],
@@ -66,6 +66,6 @@ def calibrate(
         "significant": changes(estimate, in_use),
         "message": verdict(estimate, in_use),
     }
-    emit(head, metrics_of(estimate, in_use), as_json=as_json, title=f"{', '.join(map(str, folders))}: {how}")
+    emit(head, metrics_of(estimate, in_use, drives[0].delay_s), as_json=as_json, title=f"{', '.join(map(str, folders))}: {how}")
     if not as_json:
         typer.echo(head["message"])

@@ -121,9 +121,9 @@ class SensorsConfig(Section):
 
     Watch: the pose is delayed by this time.
     """
-    odometry_delay_s: float = Field(default=0.0, ge=-1, le=1)
+    odometry_delay_s: float | None = Field(default=None, ge=-1, le=1)
     """Time added to the stamps of odometry, s: how much later scans and images are stamped than odometry of the same moment.
-    `hybridmap calibrate` finds it.
+    None: estimated while driving, and corrected if it matters. A number, 0 too, is taken as it is.
 
     Watch: updates of a live robot are delayed by this time.
     """

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.mapping import NodesConfig
 from hybridmap.errors import GraphError
-from hybridmap.geometry import Array
+from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.edges import Edge, Status
 from hybridmap.graph.pose_graph import PoseGraph
 
@@ -121,6 +121,12 @@ class ExperienceMap:
         _require_measurement(edge)
         self._edges[number] = self._dated(edge)
         self._write(number)
+
+    def move_odometry(self, poses_odom: Array) -> None:
+        """Replace the poses (N, 3) in `odom` of all nodes, and their poses along the chain; edges stay as they are."""
+        self._nodes = [replace(node, pose_odom=pose) for node, pose in zip(self._nodes, poses_odom, strict=True)]
+        initial = self._initial.view()
+        initial[:] = compose(initial[0], between(poses_odom[0], poses_odom))
 
     def pose_graph(self) -> PoseGraph:
         """The pose graph of all nodes and the accepted edges."""

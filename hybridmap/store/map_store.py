@@ -164,6 +164,21 @@ class MapStore:
         row = (int(stamp_ns), int(node), *_floats(delta_node_robot), *_floats(pose_odom))
         self._write(f"INSERT OR REPLACE INTO track VALUES ({_marks(len(row))})", row)
 
+    def replace_odometry(self, track: Track, experiences: ExperienceMap) -> None:
+        """Write new poses of the whole track, and of all nodes in `odom` and along the chain, in place of the earlier ones.
+
+        Args:
+            track: as read from this file, with other poses.
+            experiences: the map, with the nodes of this file.
+        """
+        moved = np.column_stack([track.deltas, track.poses_odom]).tolist()
+        columns = "x_m = ?, y_m = ?, yaw_rad = ?, odom_x_m = ?, odom_y_m = ?, odom_yaw_rad = ?"
+        for stamp_ns, row in zip(track.stamps_ns.tolist(), moved, strict=True):
+            self._write(f"UPDATE track SET {columns} WHERE stamp_ns = ?", (*row, stamp_ns))
+        columns = "odom_x_m = ?, odom_y_m = ?, odom_yaw_rad = ?, initial_x_m = ?, initial_y_m = ?, initial_yaw_rad = ?"
+        for number, (node, initial) in enumerate(zip(experiences.nodes, experiences.initial, strict=True)):
+            self._write(f"UPDATE nodes SET {columns} WHERE number = ?", (*_floats(node.pose_odom), *_floats(initial), number))
+
     def add_online(self, backend: str, stamp_ns: int, pose_map: Array) -> None:
         """Write the pose (3,) in `map` (m, rad) that a back-end gave at that time; replaces one of the same stamp."""
         self._write("INSERT OR REPLACE INTO online VALUES (?, ?, ?, ?, ?)", (backend, int(stamp_ns), *_floats(pose_map)))

@@ -6,6 +6,7 @@ The mapper calls it, so a live robot and a recording give the same steps.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +30,7 @@ class Ready:
         dt_s: time since the previous step, s.
         pose_odom_robot: (3,) pose in `odom` at the stamp (velocities: integrated from the identity), m and rad.
         observation: the observation at the stamp; None for a step of self-motion alone.
+        odometry_ns: stamp of the self-motion before any `retime`, ns; None for a step with an observation.
     """
 
     stamp_ns: int
@@ -36,6 +38,7 @@ class Ready:
     dt_s: float
     pose_odom_robot: Array
     observation: Observation | None = None
+    odometry_ns: int | None = None
 
 
 class Synchroniser:
@@ -61,37 +64,62 @@ class Synchroniser:
         self.report = StreamReport()
         self._arrived = ReorderBuffer(latency_s + abs(odometry_delay_s))
         self._odometry_delay_ns = round(odometry_delay_s * NS_PER_S)
+        self._aligned = ReorderBuffer(0.0)
+        self._later_ns = 0  # by `retime`
         self._last: tuple[int, Array] | None = None  # newest self-motion: stamp, pose
         self._velocity: Velocity | None = None
         self._kind: type | None = None
         self._step: tuple[int, Array] | None = None  # newest step given out: stamp, pose
         self._waiting: deque[Observation] = deque()
 
-    def push(self, sample: Sample) -> list[Ready]:
-        """Add a sample; returns the steps that have become ready.
+    def retime(self, later_s: float) -> None:
+        """From the next sample on, add `later_s`, which may be negative, to the stamps of self-motion, beside the first delay.
+
+        Steps stay in order of stamp. Self-motion that now lies before the last step is left out; its motion is in the step
+        that follows. Call it once, and between two steps.
+        """
+        self._later_ns = round(later_s * NS_PER_S)
+        self._aligned = ReorderBuffer(abs(later_s))
+        if self._last is not None:
+            self._last = self._last[0] + self._later_ns, self._last[1]
+
+    def push(self, sample: Sample) -> Iterator[Ready]:
+        """Add a sample, and yield the steps that have become ready. The sample is only taken in as the steps are consumed.
 
         Raises:
             StreamError: stamps out of order, self-motion that is not finite, or odometry mixed with velocities.
         """
         if self._odometry_delay_ns and isinstance(sample, SelfMotion | Velocity):
             sample = replace(sample, stamp_ns=sample.stamp_ns + self._odometry_delay_ns)
-        return [step for ready in self._arrived.push(sample) for step in self._take(ready)]
+        for arrived in self._arrived.push(sample):
+            yield from self._align(arrived)
 
-    def flush(self) -> list[Ready]:
-        """End of the stream: returns the steps of all samples that still wait.
+    def flush(self) -> Iterator[Ready]:
+        """End of the stream: yield the steps of all samples that still wait.
 
         Observations shortly after the last odometry get its pose; later ones are dropped and counted.
         """
-        steps = [step for ready in self._arrived.flush() for step in self._take(ready)]
+        for arrived in self._arrived.flush():
+            yield from self._align(arrived)
+        for sample in self._aligned.flush():
+            yield from self._take(sample)
         if self._last is None:
             self._drop("observations before odometry", len(self._waiting))
             self._waiting.clear()
-            return steps
+            return
         stamp_ns, pose = self._last
         held = [sample for sample in self._waiting if sample.stamp_ns - stamp_ns <= _MAX_HOLD_NS]
         self._drop("observations after odometry", len(self._waiting) - len(held))
         self._waiting.clear()
-        return steps + [self._make(sample.stamp_ns, pose, sample) for sample in held]
+        for sample in held:
+            yield self._make(sample.stamp_ns, pose, sample)
+
+    def _align(self, sample: Sample) -> Iterator[Ready]:
+        """Put a sample on the clock of the observations; samples come in order of their stamps before that."""
+        if isinstance(sample, SelfMotion | Velocity):
+            sample = replace(sample, stamp_ns=sample.stamp_ns + self._later_ns)
+        for aligned in self._aligned.push(sample):
+            yield from self._take(aligned)
 
     def _take(self, sample: Sample) -> list[Ready]:
         return self._push_observation(sample) if isinstance(sample, Observation) else self._push_motion(sample)
@@ -103,7 +131,7 @@ class Synchroniser:
             before = [waiting for waiting in self._waiting if waiting.stamp_ns < sample.stamp_ns]
             self._drop("observations before odometry", len(before))
             self._waiting = deque(waiting for waiting in self._waiting if waiting.stamp_ns >= sample.stamp_ns)
-            steps = [self._make(sample.stamp_ns, pose, None)]
+            steps = [self._make_motion(sample, pose)]
         elif sample.stamp_ns == self._last[0]:
             self.report.count("equal odometry stamps")
             self._velocity = sample if isinstance(sample, Velocity) else None
@@ -111,7 +139,8 @@ class Synchroniser:
         else:
             pose = sample.pose_odom_robot if isinstance(sample, SelfMotion) else self._held(sample.stamp_ns)
             steps = self._release(sample.stamp_ns, pose)
-            steps.append(self._make(sample.stamp_ns, pose, None))
+            if self._step is None or sample.stamp_ns > self._step[0]:  # else left out, see `retime`
+                steps.append(self._make_motion(sample, pose))
         self._last = (sample.stamp_ns, pose)
         self._velocity = sample if isinstance(sample, Velocity) else None
         while self._waiting and self._waiting[0].stamp_ns == sample.stamp_ns:
@@ -139,10 +168,11 @@ class Synchroniser:
         before_ns, before = self._last
         while self._waiting and self._waiting[0].stamp_ns < stamp_ns:
             sample = self._waiting.popleft()
+            at_ns = max(sample.stamp_ns, before_ns)  # it may lie before that just after `retime`
             if self._velocity is not None:
-                there = self._held(sample.stamp_ns)
+                there = self._held(at_ns)
             else:
-                there = interpolate(before, pose, (sample.stamp_ns - before_ns) / (stamp_ns - before_ns))
+                there = interpolate(before, pose, (at_ns - before_ns) / (stamp_ns - before_ns))
             steps.append(self._make(sample.stamp_ns, there, sample))
         return steps
 
@@ -153,6 +183,9 @@ class Synchroniser:
         dt_s = (stamp_ns - self._last[0]) / NS_PER_S
         twist = np.array([self._velocity.v_m_s * dt_s, 0.0, self._velocity.omega_rad_s * dt_s])
         return compose(self._last[1], exp(twist))
+
+    def _make_motion(self, sample: Motion, pose: Array) -> Ready:
+        return replace(self._make(sample.stamp_ns, pose, None), odometry_ns=sample.stamp_ns - self._later_ns)
 
     def _make(self, stamp_ns: int, pose: Array, observation: Observation | None) -> Ready:
         if self._step is None:

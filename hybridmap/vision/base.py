@@ -128,6 +128,14 @@ class PartingFrontEnd(FrontEnd, Protocol):
 
 
 @runtime_checkable
+class Overruling(Protocol):
+    """A front-end that can judge again whether its registrations contradict the odometry."""
+
+    def overrules(self, registration: RelativePose, odometry: RelativePose) -> bool:
+        """Whether a good registration of two consecutive nodes says that the odometry between them is wrong."""
+
+
+@runtime_checkable
 class DenseFrontEnd(FrontEnd, Protocol):
     """A front-end that can register the frames between nodes to the final map."""
 

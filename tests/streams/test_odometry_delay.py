@@ -16,7 +16,7 @@ def steps_with(delay_s):
     samples += [LaserScan(k * 100 * MS + 50 * MS, np.ones(3, np.float32)) for k in range(3, 15)]
     samples.sort(key=lambda sample: sample.stamp_ns)
     synchroniser = Synchroniser(odometry_delay_s=delay_s)
-    steps = [step for sample in samples for step in synchroniser.push(sample)] + synchroniser.flush()
+    steps = [step for sample in samples for step in synchroniser.push(sample)] + list(synchroniser.flush())
     return steps, synchroniser
 
 

@@ -29,7 +29,7 @@ def _scan(ms: int) -> LaserScan:
 def _run(samples, **settings):
     synchroniser = Synchroniser(**settings)
     steps = [step for sample in samples for step in synchroniser.push(sample)]
-    return steps + synchroniser.flush(), synchroniser.report.counts
+    return steps + list(synchroniser.flush()), synchroniser.report.counts
 
 
 def test_an_observation_waits_for_odometry_and_is_interpolated():
@@ -37,7 +37,7 @@ def test_an_observation_waits_for_odometry_and_is_interpolated():
     (first,) = synchroniser.push(_motion(0, 1.0))
     np.testing.assert_array_equal(first.delta_robot, 0)
     assert (first.dt_s, first.observation) == (0.0, None)
-    assert synchroniser.push(_scan(25)) == []
+    assert list(synchroniser.push(_scan(25))) == []
     seen, moved = synchroniser.push(_motion(100, 1.4, 0.0, 0.4))
     assert (seen.stamp_ns, known(seen.observation).stamp_ns) == (25 * MS, 25 * MS)
     expected = geometry.interpolate([1.0, 0, 0], [1.4, 0, 0.4], 0.25)

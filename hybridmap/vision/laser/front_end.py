@@ -24,7 +24,7 @@ from hybridmap.vision.laser.hypotheses import LENGTH_M, Prober
 from hybridmap.vision.laser.kidnapping import Continuity, GlobalLocalisation
 from hybridmap.vision.laser.revisits import Reviser
 from hybridmap.vision.laser.submap import Atlas, violation_of_step
-from hybridmap.vision.laser.tracking import Step, Tracker
+from hybridmap.vision.laser.tracking import Step, Tracker, contradicts
 from hybridmap.vision.profile import laser_profile
 from hybridmap.vision.templates import ViewTemplates
 
@@ -165,6 +165,10 @@ class LaserFrontEnd:
     def part(self, node: int) -> None:
         """Begin a new piece of the atlas at a node: the robot was kidnapped before it."""
         self.atlas.part(node)
+
+    def overrules(self, registration: RelativePose, odometry: RelativePose) -> bool:
+        """Whether a good registration says that the odometry is wrong."""
+        return contradicts(registration.delta, odometry.delta)
 
     def dense_trajectory(self, belief: Belief) -> Anchors:
         """Register every scan to the final map; returns the poses between nodes."""

@@ -123,9 +123,7 @@ class Tracker:
     def _is_weak(self, alignment: Alignment, expected: Array) -> bool:
         """Whether a registration is weak, or contradicts the odometry without being very good."""
         inliers = alignment.inliers[0]
-        return bool(
-            inliers < checks.INLIERS_MIN or (inliers < INLIERS_SURE and self._contradicts(alignment.poses[0], expected))
-        )
+        return bool(inliers < checks.INLIERS_MIN or (inliers < INLIERS_SURE and contradicts(alignment.poses[0], expected)))
 
     def _field(self, extra: Sequence[Cloud] = ()) -> LikelihoodField:
         n = len(self._atlas)
@@ -141,7 +139,7 @@ class Tracker:
     def _search(self, field: LikelihoodField, cloud: Cloud, expected: Array) -> Alignment:
         """Search narrowly; if that is weak or contradicts the odometry, widely too, and take the one of more inliers."""
         narrow = self._grid(field, cloud, expected, NARROW)
-        if narrow.inliers[0] >= checks.INLIERS_MIN and not self._contradicts(narrow.poses[0], expected):
+        if narrow.inliers[0] >= checks.INLIERS_MIN and not contradicts(narrow.poses[0], expected):
             return narrow
         return _better(narrow, self._grid(field, cloud, expected, WIDE), WIDE_GAIN)
 
@@ -170,10 +168,6 @@ class Tracker:
                 field = self._field(seen)
         return self._search(field, cloud, compose(pose, between(last, odometry)))
 
-    def _contradicts(self, pose: Array, expected: Array) -> bool:
-        off_m = float(np.hypot(*(pose - expected)[:2]))
-        return off_m > CONTRADICTION_M or abs(wrap_angle(pose[2] - expected[2])) > np.deg2rad(CONTRADICTION_DEG)
-
     def _judge(self, alignment: Alignment, odometry: RelativePose) -> Step:
         pose, inliers, fit = alignment.poses[0], float(alignment.inliers[0]), float(alignment.fit[0])
         off_m = float(np.hypot(*(pose - odometry.delta)[:2]))
@@ -183,9 +177,15 @@ class Tracker:
         covariance = alignment.covariance(0, FLOOR_M, np.deg2rad(FLOOR_DEG))
         if self._is_weak(alignment, odometry.delta):
             covariance = covariance + np.diag([WEAK_M**2, WEAK_M**2, np.deg2rad(WEAK_DEG) ** 2])
-        wrong = bool(inliers >= checks.INLIERS_MIN and self._contradicts(pose, odometry.delta))
+        wrong = bool(inliers >= checks.INLIERS_MIN and contradicts(pose, odometry.delta))
         edge = self._atlas.joining(len(self._atlas) - 1, pose, covariance)
         return Step(edge, asked, wrong, inliers, fit, covariance)
+
+
+def contradicts(pose: Array, expected: Array) -> bool:
+    """Whether a good registration (3,) says that the odometry (3,) of the same two scans is wrong."""
+    off_m = float(np.hypot(*(pose - expected)[:2]))
+    return bool(off_m > CONTRADICTION_M or abs(wrap_angle(pose[2] - expected[2])) > np.deg2rad(CONTRADICTION_DEG))
 
 
 def _better(first: Alignment, second: Alignment, gain: float) -> Alignment:

@@ -18,6 +18,7 @@ from hybridmap.streams.base import Observation, Rig
 from hybridmap.streams.rgbd import RGBD, Camera, RgbdFrame
 from hybridmap.vision.base import Belief, View
 from hybridmap.vision.profile import image_profile
+from hybridmap.vision.rgbd.checks import CONTRADICTION_SIGMA
 from hybridmap.vision.rgbd.closing import LoopCloser
 from hybridmap.vision.rgbd.depth_grid import cell_px, make_grid, place
 from hybridmap.vision.rgbd.features import detect
@@ -31,7 +32,7 @@ from hybridmap.vision.rgbd.keyframe import (
 from hybridmap.vision.rgbd.noise_level import NoiseLevel
 from hybridmap.vision.rgbd.pnp import Verifier
 from hybridmap.vision.rgbd.posture import Posture
-from hybridmap.vision.rgbd.tracking import Tracker
+from hybridmap.vision.rgbd.tracking import Tracker, odometry_sigma
 from hybridmap.vision.templates import ViewTemplates
 
 
@@ -127,6 +128,10 @@ class RgbdFrontEnd:
     def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
         """Measure again, from the poses of the map, loops that a back-end down-weighted as outliers."""
         return self.closer.verify(outliers, belief)
+
+    def overrules(self, registration: RelativePose, odometry: RelativePose) -> bool:
+        """Whether a good registration says that the odometry is wrong."""
+        return odometry_sigma(registration, odometry) > CONTRADICTION_SIGMA
 
     @property
     def reach_m(self) -> float:

@@ -124,8 +124,7 @@ class Tracker:
             return Edge.decided(source, target, EdgeKind.REGISTRATION, None, lack=Lack.NO_DEPTH, **registered)
         held = self._keyframes[source].held or self._keyframes[target].held
         relative = self._level.applied(fit.relative, *(HELD_FLOORS if held else FLOORS), HELD_SHARED if held else 1.0)
-        error = log(between(prior.delta, relative.delta))
-        distance = float(np.sqrt(error @ np.linalg.solve(prior.covariance + relative.covariance, error)))
+        distance = odometry_sigma(relative, prior)
         asked = checks.of_step(fit.inliers, fit.slack_m, distance)
         far = passed(asked) and distance > checks.CONTRADICTION_SIGMA
         figures = {
@@ -138,6 +137,12 @@ class Tracker:
         }
         registered |= {"figures": figures, "contradicts_odometry": far}
         return Edge.decided(source, target, EdgeKind.REGISTRATION, relative, asked, **registered)
+
+
+def odometry_sigma(registration: RelativePose, odometry: RelativePose) -> float:
+    """Distance of a registration from the odometry of the same two nodes, in standard deviations."""
+    error = log(between(odometry.delta, registration.delta))
+    return float(np.sqrt(error @ np.linalg.solve(odometry.covariance + registration.covariance, error)))
 
 
 def _what_slides(relative: RelativePose, odometry: RelativePose) -> dict[str, float]:
