@@ -143,6 +143,13 @@ def test_a_back_end_that_gave_nothing_has_failed():
         assert (reason.kind, verdict_of([reason])) == (kind, Verdict.FAILED)
 
 
+def test_a_back_end_that_stalled_is_doubted():
+    experiences = mapped(drive())
+    solution = backends.create("gtsam-lm").solve(experiences)
+    stalled = replace(solution, report=replace(solution.report, status=SolveStatus.STALLED))
+    assert [reason.kind for reason in reasons_of(Facts.of_drive(experiences, stalled, "gtsam-lm"))] == ["other way"]
+
+
 def test_poses_that_were_returned_as_they_were_given_are_no_map():
     graph = mapped(drive(), slip=np.array([1.0, 0.0, 0.0])).pose_graph()
     moved = replace(graph, initial=graph.initial + np.array([0.0, 0.0, 0.0]))

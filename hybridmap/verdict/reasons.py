@@ -46,6 +46,7 @@ class Kind:
 KINDS = {
     "back-end failed": Kind(Verdict.FAILED, "1", "{name}; the map is dead reckoning"),
     "no map": Kind(Verdict.FAILED, "1", "{name} gave no map: chi2 is {value:.4g} at the poses that it began with"),
+    "other way": Kind(Verdict.DOUBTFUL, "1", "{name} could not go on as it should, and its map was made another way"),
     "dead reckoning": Kind(Verdict.DOUBTFUL, "1", "the map is dead reckoning, which uses no loop; there are {value:.0f}"),
     "loops refused": Kind(
         Verdict.DOUBTFUL,

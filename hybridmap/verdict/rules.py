@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.backends.base import ODOMETRY
+from hybridmap.backends.base import ODOMETRY, SolveStatus
 from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.judging.rivals import Rival, rivals, spans
 from hybridmap.backends.judging.strain import bend_of, largest_bend, optimum
@@ -21,6 +21,8 @@ from hybridmap.verdict.reasons import Reason, Verdict
 TOGETHER = 4
 """Fewest refused loops that speak against a map, as many as find a lost robot; one more for each doubling of the number of
 groups, since of many false groups some fall where the map has nothing against them."""
+AS_MEANT = (SolveStatus.CONVERGED, SolveStatus.WAITING, SolveStatus.MAX_ITERATIONS)
+"""Ends of a solver that was not disturbed. Whether it is at an optimum is asked apart: a relaxation has a number of sweeps."""
 MOVES_M, MOVES_RAD = 0.1, math.radians(2.0)
 """A group of refused loops that would move the map by less than both says nothing that matters: a place is found within it."""
 BENT_MAX = 10.0
@@ -46,13 +48,15 @@ FREE_MAX_M = 10.0
 
 
 def no_map(facts: Facts) -> Iterable[Reason]:
-    """The primary back-end failed, diverged, or returned the poses that it was given."""
+    """The primary back-end failed, diverged, returned the poses that it was given, or ended in another way than meant."""
     solution = facts.solution
     if solution is None or facts.failure:
         return [facts.reason("back-end failed", name=f"{facts.primary}: {facts.failure or 'it gave no map'}")]
     report = solution.report
     if not report.status.has_map:
         return [facts.reason("no map", report.chi2, report.chi2_initial, name=f"{facts.primary} ({report.status})")]
+    if report.status not in AS_MEANT:
+        return [facts.reason("other way", name=f"{facts.primary} ({report.status})")]
     if facts.primary == ODOMETRY:
         return [facts.reason("dead reckoning", len(facts.graph.edge_ids[facts.graph.is_loop]), 0, name=facts.primary)]
     moved = not np.array_equal(solution.poses, facts.graph.initial)
