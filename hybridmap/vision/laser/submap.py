@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, compose_relative, inverse
 from hybridmap.streams.laser import Laser
 from hybridmap.vision.laser.cloud import Cloud, LikelihoodField, build_field, merged_at
-from hybridmap.vision.laser.scene import Scene
+from hybridmap.vision.laser.scene import CELL_M, Scene
 
 SEARCH_M = 4.5
 """Largest distance of starts from the anchor of a submap, m."""
@@ -172,8 +172,12 @@ class Atlas:
         return self._submaps.get(_span(anchor, nodes), lambda: self.submap(anchor, nodes))
 
     def scoring_field(self, target: Submap, kind: Field) -> LikelihoodField:
-        """A likelihood field of a submap, on which poses up to `SEARCH_M` from its anchor can be scored; cached."""
+        """A likelihood field of a submap, on which poses up to `SEARCH_M` from its anchor can be scored; cached.
+
+        Its cells grow with those of the cloud: a field as far as 80 m would else take 20 MB.
+        """
         cell_m, reach_m, sigma_m, _ = kind.value
+        cell_m *= target.cloud.cell_m / CELL_M
         return self._scoring[kind].get(
             _span(target.anchor, target.nodes), lambda: build_field(target.cloud, cell_m, reach_m, sigma_m, SEARCH_M)
         )
