@@ -166,6 +166,14 @@ def yaw_from_quaternion(x: ArrayLike, y: ArrayLike, z: ArrayLike, w: ArrayLike) 
     A quaternion that is not of length 1, by more than rounding, is normalised first. One of length 0 or infinity is no
     rotation.
     """
+    if (
+        isinstance(x, float)
+        and isinstance(y, float)
+        and isinstance(z, float)
+        and isinstance(w, float)
+        and abs(x * x + y * y + z * z + w * w - 1.0) <= _ROUNDED
+    ):  # of a message: a recording has many, and this takes a quarter of the time
+        return np.asarray(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
     qx, qy, qz, qw = (np.asarray(q, dtype=np.float64) for q in (x, y, z, w))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         squared = qx * qx + qy * qy + qz * qz + qw * qw

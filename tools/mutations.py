@@ -203,7 +203,7 @@ def tree(value: Any, rng: np.random.Generator) -> Any:
         if isinstance(held, dict | list) and held and rng.random() < 0.85:
             changed = tree(held, rng)
         else:
-            changed = VALUES[_some(rng, len(VALUES))]
+            changed = _alike(held, rng) if rng.random() < 0.6 else VALUES[_some(rng, len(VALUES))]
         how = rng.random()
         if how < 0.15:
             return type(value)(pair for pair in inner if pair[0] != key) if isinstance(value, dict) else value[:key]
@@ -211,6 +211,17 @@ def tree(value: Any, rng: np.random.Generator) -> Any:
             name = "x" if how < 0.2 else key
             return {name if each == key else each: changed if each == key else old for each, old in inner}
         return [changed if each == key else old for each, old in inner]
+
+
+def _alike(value: Any, rng: np.random.Generator) -> Any:
+    """Another value of the same kind, so that it may well be allowed: numbers as small and as large as they come."""
+    if isinstance(value, bool) or value is None:
+        return not value
+    if isinstance(value, int):
+        return int(rng.choice((0, 1, 2, 3, 4, 7, 16, 80, 1000, 16_384, 10**6, -1))) if rng.random() < 0.7 else 10 * value
+    if isinstance(value, float):
+        return float(rng.choice((0.0, 1e-6, 1e-3, 0.5, 1.0, 10.0, 100.0, 1e3, 1e4, -1.0))) if rng.random() < 0.7 else -value
+    return value
 
 
 def table(path: Path, rng: np.random.Generator) -> None:
