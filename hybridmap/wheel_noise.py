@@ -22,10 +22,8 @@ LEAST_DEG = 0.05
 """Wheels are never taken to have less heading noise than this, degrees per root metre."""
 CONTRADICTED_MAX = 0.02
 """Largest share of registrations that contradict good wheels. One in a hundred does if the covariances are right. A laser has
-0.1 % on a campus that it sees to 80 m, and 4 to 8 % among trees and hedges, or where it sees a quarter of the way."""
-REGISTRATION_SHARE = 2.0
-"""If more of them contradict good wheels, a registration's heading is at best so many times as uncertain as that of the wheels:
-its residuals do not show how much it errs."""
+0.1 % on a campus that it sees to 80 m, and 4 to 8 % among trees and hedges, or where it sees a quarter of the way. If more of
+them do, residuals do not show how much they err, and a registration's heading is at best as uncertain as that of the wheels."""
 GOOD_M = 0.1
 """So is its translation if the two differ by less than this, m per root metre. Wheels whose scale is wrong by 3 % differ by
 twice that, and a registration knows better."""
@@ -110,9 +108,8 @@ class WheelNoise:
             return registration
         covariance = registration.covariance
         if self.learnt.overrules:
-            least = REGISTRATION_SHARE**2 * wheels.covariance
             in_all = self.learnt.translation_m < GOOD_M
-            covariance = covariance + (least if in_all else np.diag([0.0, 0.0, least[2, 2]]))
+            covariance = covariance + (wheels.covariance if in_all else np.diag([0.0, 0.0, wheels.covariance[2, 2]]))
         squared = _squared(RelativePose(registration.delta, covariance), wheels)
         return RelativePose(registration.delta, covariance * max(1.0, squared / AGREEING) ** 2)
 

@@ -8,7 +8,7 @@ import pytest
 from hybridmap.config.mapping import EdgesConfig
 from hybridmap.geometry import RelativePose, between, log
 from hybridmap.graph.paths import odometry_covariance
-from hybridmap.wheel_noise import AGREEING, FIRST_M, REGISTRATION_SHARE, WheelNoise
+from hybridmap.wheel_noise import AGREEING, FIRST_M, WheelNoise
 from tests.narrowing import known
 
 CONFIG = EdgesConfig(rotation_deg_per_sqrt_m=2.0, rotation_floor_deg=0.3, rotation_per_turn=0.1, translation_per_sqrt_m=0.05)
@@ -74,7 +74,7 @@ def test_where_many_registrations_contradict_good_wheels_none_is_surer_than_they
     noise = driven(0.2, wrong_every=50, scale=scale)
     assert known(noise.learnt).contradicting == pytest.approx(0.04, abs=0.01)
     wheels = RelativePose(TRUE, noise.covariance(STEP_M, 0.0))
-    least = REGISTRATION_SHARE**2 * wheels.covariance
+    least = wheels.covariance
     if scale != 1.0:  # of these wheels only the heading is good
         least = np.diag([0.0, 0.0, least[2, 2]])
     assert noise.beside(RelativePose(TRUE, SURE), wheels).covariance == pytest.approx(SURE + least)
