@@ -31,6 +31,7 @@ from hybridmap.edge_book import EdgeBook
 from hybridmap.geometry import Array, RelativePose, between, log
 from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, at_most
 from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.graph.gaps import kidnappings
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.metrics import StageClock
 from hybridmap.vision.base import Belief, FrontEnd, PartingFrontEnd, VerifyingFrontEnd
@@ -79,7 +80,8 @@ class SecondLook:
         self._backends = backends
         self._vision = vision
         self._gate = gate_of(config.backends)
-        self._enabled, self._may_part = config.edges.gate != "odometry", config.vision.relocalising.enabled
+        self._enabled = config.edges.gate != "odometry"
+        self._may_part = config.vision.relocalising.enabled and config.edges.hanging == "chain"
 
     def take(self, belief: Callable[[Sequence[int]], Belief], clock: StageClock) -> Iterator[tuple[str, list[int]]]:
         """Change edges of the map in steps; the graph must be solved for good before the first step and after each.
@@ -123,7 +125,7 @@ class SecondLook:
         groups = rejected_clusters(graph, poses, ids, self._gate)
         places = {one.node for one in rivals(graph, poses, groups, graph.is_loop & ~outliers) if one.spanning >= LEAST_LOOPS}
         paying = []
-        for place in sorted(places | _oddest(asked)):
+        for place in sorted((places | _oddest(asked)) - {one.after for one in kidnappings(self._map)}):
             signs = tuple(check for check in asked.get(place, ()) if not check.passed)
             trial = self._trial(graph, poses, np.flatnonzero(outliers), place, signs)
             if trial is not None and trial.found.pays:

@@ -10,6 +10,7 @@ from typing import Any
 import barred
 import cv2
 import figures
+import kidnappings
 import numpy as np
 import pytest
 import result_studies as studies
@@ -31,6 +32,13 @@ def test_picture_of_a_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert picture.shape[1] > 1000
     assert picture.min() < 100 < 250 < picture.max()
     assert "picture.png" in capsys.readouterr().out
+
+
+def test_a_carried_robot_is_a_row() -> None:
+    row = kidnappings.drive("lab", "laser", 1.0, seed=1)
+    assert row["kidnapped"] == str(row["node"])
+    assert row["right"]
+    assert not row["silent"]
 
 
 def row(results: Any, **changes: str) -> dict[str, str]:
