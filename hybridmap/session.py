@@ -211,7 +211,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
         "remarks": [
             *stream.report.remarks,
             *map(str, mapper.calibration.changes),
-            *([str(offset)] if offset.worth_saying else []),
+            *([str(offset)] if offset.used_s else []),
             *map(str, kidnappings(mapper.map)),
         ],
     }
@@ -233,6 +233,7 @@ def facts_of(mapper: Mapper, report: StreamReport) -> Facts:
         primary,
         failure=mapper.backends.failures.get(primary, ""),
         lost_since=mapper.lost_since,
+        clock=mapper.calibration.clock.offset,
         lost=report.lost,
     )
 

@@ -8,6 +8,7 @@ import pytest
 
 from hybridmap import backends
 from hybridmap.backends.base import Solution, SolveStatus
+from hybridmap.calibration.clock import ClockOffset, ClockState
 from hybridmap.geometry import RelativePose, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status, at_least
 from hybridmap.graph.experience_map import ExperienceMap, Node
@@ -195,6 +196,21 @@ def test_contradicted_odometry_is_counted():
     found = judged(experiences)["odometry dropped"]
     assert found.count == 40
     assert found.value == pytest.approx(100.0 * 40 / 79)
+
+
+@pytest.mark.parametrize(
+    ("clock", "left_s"),
+    [
+        (None, None),
+        (ClockOffset(), None),
+        (ClockOffset(ClockState.KNOWN, 0.14, 0.003, used_s=0.135), None),
+        (ClockOffset(ClockState.KNOWN, 0.14, 0.003), 0.14),
+        (ClockOffset(ClockState.TIME_BASE, 4.0), 4.0),
+    ],
+)
+def test_clocks_that_are_apart_are_a_reason_unless_that_was_corrected(clock, left_s):
+    found = judged(mapped(drive()), clock=clock).get("clocks apart")
+    assert left_s == (found and found.value)
 
 
 def test_a_way_on_odometry_alone_is_named_where_no_loop_spans_it():

@@ -102,11 +102,6 @@ class ClockOffset:
         return self.known and abs(self.offset_s) > max(MATTERS_S, 2.0 * self.sigma_s)
 
     @property
-    def worth_saying(self) -> bool:
-        """Whether the user should hear of it: it was corrected, ought to be, or is another time base."""
-        return self.used_s != 0.0 or self.matters or self.state is ClockState.TIME_BASE
-
-    @property
     def left_s(self) -> float:
         """What of a known offset was not corrected, s; NaN if none is known."""
         return self.offset_s - self.used_s

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.base import Solution
+from hybridmap.calibration.clock import ClockOffset
 from hybridmap.geometry import Array
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
 from hybridmap.graph.experience_map import ExperienceMap
@@ -38,6 +39,7 @@ class Facts:
         free_m: (N,) way to each node on which odometry alone knows the motion, in one direction or in all.
         breaks: nodes to which the robot seems not to have driven, without a kidnapping that was found there.
         lost_since: the first node since which the robot is lost; None if it is not.
+        clock: the offset between the clocks of views and odometry; None if it was not looked for.
         driven: whether the loops were proposed by a front-end on a drive, and not read from a file.
         lost: topic -> (messages that are missing or damaged, messages in all).
     """
@@ -53,6 +55,7 @@ class Facts:
     free_m: Array | None = None
     breaks: tuple[int, ...] = ()
     lost_since: int | None = None
+    clock: ClockOffset | None = None
     driven: bool = False
     lost: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 

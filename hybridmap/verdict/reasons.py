@@ -81,6 +81,11 @@ KINDS = {
         "registrations contradict {count} odometry edges, {value:.0f} % of them (at most {limit:.0f} %): the wheels slip, or"
         " the clock of the sensor is not theirs",
     ),
+    "clocks apart": Kind(
+        Verdict.DOUBTFUL,
+        "s",
+        "views are stamped {value:+.2f} s from the odometry (at most {limit:.2f} s), which was not corrected",
+    ),
     "nodes hang": Kind(Verdict.DOUBTFUL, "1", "{value:.0f} nodes are joined to the rest by edges that have no weight"),
     "nothing held": Kind(
         Verdict.DOUBTFUL,

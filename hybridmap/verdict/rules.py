@@ -13,6 +13,7 @@ from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.judging.rivals import Rival, rivals, spans
 from hybridmap.backends.judging.strain import bend_of, largest_bend, optimum
 from hybridmap.backends.objective import SLACK, squared_norms, unit_variance
+from hybridmap.calibration.clock import MATTERS_S, TRANSPORT_S, ClockState
 from hybridmap.graph.agreement import BOUND
 from hybridmap.graph.paths import chain_of
 from hybridmap.verdict.facts import Facts
@@ -39,7 +40,8 @@ DROPPED_MAX = 0.2
 """Largest share of contradicted odometry edges. Wheels that slip now and then lose some per cent; a clock that is off, or a
 registration that is, contradicts the wheels all the way."""
 WHEELS_MAX = 5.0
-"""Standard deviations of the odometry by which the map may contradict it where no loop decides between them."""
+"""Standard deviations of the odometry by which the map may contradict it where no loop decides between them; on short ways
+a single slip is more."""
 BREAKS_MAX = 2
 """Most breaks of the motion without a kidnapping. Indoors there are none; bushes and trees, which look different from every
 side, give dozens, and then a kidnapping that was found may be one of them."""
@@ -129,8 +131,11 @@ def against_wheels(facts: Facts) -> Iterable[Reason]:
     if facts.poses is None or facts.wheels is None:
         return
     chain = chain_of(facts.wheels)
+    travel = np.concatenate([[0.0], np.hypot(*np.diff(chain.poses[:, :2], axis=0).T).cumsum()])
     for run in _runs(spans(facts.graph, facts.kept)[1:] == 0):
         first, last = int(run[0]), int(run[-1]) + 1
+        if travel[last] - travel[first] < FREE_MAX_M:
+            continue
         bend = bend_of(chain, facts.poses, first, last)
         if bend is not None and bend.sigmas > WHEELS_MAX:
             yield facts.reason("against odometry", bend.sigmas, WHEELS_MAX, node=first, until=last, apart_m=bend.apart_m)
@@ -149,6 +154,17 @@ def contradicted_odometry(facts: Facts) -> Iterable[Reason]:
     dropped = int(np.count_nonzero(~np.isin(facts.wheels.edge_ids, facts.graph.edge_ids)))
     share = dropped / facts.wheels.n_edges
     return [facts.reason("odometry dropped", 100.0 * share, 100.0 * DROPPED_MAX, count=dropped)] if share > DROPPED_MAX else []
+
+
+def clocks_apart(facts: Facts) -> Iterable[Reason]:
+    """The clocks of views and odometry are apart, and the map was not corrected by it."""
+    clock = facts.clock
+    if clock is None:
+        return []
+    if clock.state is ClockState.TIME_BASE:
+        return [facts.reason("clocks apart", clock.offset_s, TRANSPORT_S)]
+    least_s = max(MATTERS_S, 2.0 * clock.sigma_s)
+    return [facts.reason("clocks apart", clock.left_s, least_s)] if clock.known and abs(clock.left_s) > least_s else []
 
 
 def not_held(facts: Facts) -> Iterable[Reason]:
@@ -197,6 +213,7 @@ RULES: tuple[Callable[[Facts], Iterable[Reason]], ...] = (
     at_odds,
     against_wheels,
     contradicted_odometry,
+    clocks_apart,
     not_held,
     broken,
     lost,
