@@ -24,6 +24,8 @@ _NAMES = (r"^/scan$", r"^/base_scan$", r"/(scan|base_scan)$", r"front|laser")
 """Usual names of its topic: the first pattern that fits counts; what fits none comes last."""
 _MOST_TILT_COS = 0.9  # a planar laser may lean by 25 deg at most
 _GREY = 0.25
+_MOST_BEAMS = 50_000
+"""Beams of a scan; the finest scanners of 2D have some 10,000."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +74,10 @@ class ScanDecoder:
         """
         self._config, self._upside_down, self._what = config, upside_down, what
         bearings = self._bearings(first)
-        if len(bearings) < 2 or not np.isfinite(bearings).all() or bearings[0] == bearings[-1]:
+        if not 2 <= len(bearings) <= _MOST_BEAMS or not np.isfinite(bearings).all() or bearings[0] == bearings[-1]:
             raise StreamError(
-                f"{what}: found {len(first.ranges)} beams in steps of {first.angle_increment} rad; expected at least 2 apart"
+                f"{what}: found {len(first.ranges)} beams in steps of {first.angle_increment} rad; "
+                f"expected 2 to {_MOST_BEAMS} beams apart"
             )
         self._reversed = bool(bearings[-1] < bearings[0])
         self._shape = self._layout(first)
@@ -95,7 +98,8 @@ class ScanDecoder:
 
     def _bearings(self, message: Any) -> Array:
         step = np.float64(np.float32(message.angle_increment))
-        bearings = np.float64(np.float32(message.angle_min)) + np.arange(len(message.ranges)) * step
+        with np.errstate(invalid="ignore"):  # a step of Inf gives NaN, which no bearing is near
+            bearings = np.float64(np.float32(message.angle_min)) + np.arange(len(message.ranges)) * step
         return -bearings if self._upside_down else bearings
 
     def _limits(self, message: Any) -> tuple[float, float]:

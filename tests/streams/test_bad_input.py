@@ -433,3 +433,12 @@ def test_a_part_that_no_recording_has(tmp_path, seconds):
     for part in ({"start_s": seconds}, {"end_s": seconds}):
         with pytest.raises(StreamError, match="expected seconds"):
             open_stream(path, Config(), **part)
+
+
+@pytest.mark.parametrize(("beams", "step"), [(200_000, 1e-5), (5, float("inf")), (5, float("nan")), (5, 0.0), (1, 0.1)])
+def test_a_scan_that_no_laser_takes(tmp_path, beams, step):
+    recording = laser_drive()
+    for topic, _, message in recording.messages:
+        if topic == "/scan":
+            message.ranges, message.angle_increment = np.full(beams, 2.0, np.float32), step
+    _refuses(recording.write(tmp_path / "a.mcap"), "/scan", f"{beams} beams")
