@@ -32,6 +32,9 @@ from hybridmap.verdict import Facts, reasons_of, said_of
 
 log = logging.getLogger(__name__)
 
+LOOK_M = 40.0
+"""Path length after which a first look ends, m: most drives have told the offset of their clocks by then."""
+
 Progress = Callable[[int, int | None], None]
 
 
@@ -78,6 +81,24 @@ def run(stream: Stream, config: Config, out: Path, *, overwrite: bool = False, p
             recorder = _Recorder(mapper, store)
             _drive(stream, mapper, recorder, progress)
             return _conclude(stream, mapper, recorder, folder)
+
+
+def first_look(stream: Stream, config: Config) -> ClockOffset:
+    """Estimate how late the views of a stream are stamped, from its first `LOOK_M` metres at most, without making a map of it.
+
+    Raises:
+        StreamError: the stream is damaged or unordered.
+        ConfigError: the configuration names a sensor that the stream does not have.
+    """
+    mapper = Mapper(config, stream.rig, [ODOMETRY])
+    clock = mapper.calibration.clock
+    for sample in stream:
+        mapper.add(sample)
+        if clock.offset.known or (len(mapper.map) and mapper.map.nodes[-1].travel_m > LOOK_M):
+            break
+    if not clock.offset.known and len(mapper.map):
+        clock.finish(mapper.map)
+    return replace(clock.offset, used_s=0.0)
 
 
 def _drive(stream: Stream, mapper: Mapper, recorder: _Recorder, progress: Progress | None) -> None:

@@ -2,7 +2,7 @@
 
 Between two consecutive nodes the turn by registration must be that of the wheels, at times that are shifted by the offset d:
 
-    turn_registered(k - 1, k) = (1 + g) [yaw(t_k - d) - yaw(t_k-1 - d)] + b s + noise,
+    turn_registered(k - 1, k) = (1 + g) [yaw(t_k - d) - yaw(t_k-1 - d)] + b s + error,
 
 g the error of the wheels' turn gain, b their heading bias and s the way in metres. For each d the two are fitted with Cauchy
 weights; the lowest cost wins, refined by a parabola. Only changes of the turn rate tell the offset: a robot that drives
@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.inputs import SensorsConfig
-from hybridmap.config.mapping import EdgesConfig
 from hybridmap.geometry import Array, interpolate, wrap_angle
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
@@ -48,10 +47,13 @@ to fifth message of two logs left out, the estimate errs by up to 0.05 of the ga
 GAP_SHARE = 0.05
 JITTER_S = 0.01
 """Standard deviation of a single stamp, s."""
+WANDER_DEG, TURN_NOISE = 0.6, 0.02
+"""Noise of the heading by usual wheels: degrees per root metre, radians per root radian turned. Its scale is estimated."""
 GAIN_SIGMA, BIAS_SIGMA_RAD_M = 0.05, 0.03
 """Standard deviations of g and b before the drive: those of usual wheels."""
 FIRST_M, AGAIN = 20.0, 1.1
-"""Path length before the first estimate, m, and the factor to the next one: the cost of all is then linear in the drive."""
+"""Path length before the first estimate, m, and the factor from one estimate to the next. On a shorter drive a slip in one of
+few turns looks like an offset. With the factor the cost of all estimates is linear in the drive."""
 MATTERS_S = 0.02
 """Least offset that is corrected, s: the turn of a robot in that time is less than the registrations' error."""
 _FEWEST = 12  # registrations: three unknowns and a scale
@@ -172,13 +174,12 @@ class Turns:
         return Turns(self.first_s[kept], self.last_s[kept], self.turn_rad[kept], self.sigma_rad[kept])
 
 
-def offset_of(headings: Headings, turns: Turns, noise: EdgesConfig, *, wide: bool = False) -> ClockOffset:
+def offset_of(headings: Headings, turns: Turns, *, wide: bool = False) -> ClockOffset:
     """Estimate the offset from registered turns and odometry; costs some 200 robust fits of two unknowns to the R turns.
 
     Args:
         headings: the odometry.
         turns: the registrations.
-        noise: assumed noise of the odometry's heading.
         wide: whether to look for another time base too, at ten times the cost, if no delay is found.
     """
     turns = turns.select(turns.sigma_rad < _WEAK_RAD)
@@ -188,7 +189,7 @@ def offset_of(headings: Headings, turns: Turns, noise: EdgesConfig, *, wide: boo
     dense = gap_s <= GAP_MAX_S
     if 2 * int(dense.sum()) < len(turns):
         return ClockOffset(ClockState.SPARSE)
-    fit, kept_gap_s = _Fit(headings, turns.select(dense), noise), float(np.median(gap_s[dense]))
+    fit, kept_gap_s = _Fit(headings, turns.select(dense)), float(np.median(gap_s[dense]))
     if int(dense.sum()) < _FEWEST:
         return ClockOffset()
     found = fit.best(_grid(TRANSPORT_S, STEP_S))
@@ -218,8 +219,8 @@ class _Minimum:
 class _Fit:
     """Robust fits of g and b at given offsets."""
 
-    def __init__(self, headings: Headings, turns: Turns, noise: EdgesConfig) -> None:
-        self._headings, self._turns, self._noise = headings, turns, noise
+    def __init__(self, headings: Headings, turns: Turns) -> None:
+        self._headings, self._turns = headings, turns
         self._precision = np.array([1.0 / GAIN_SIGMA**2, 1.0 / BIAS_SIGMA_RAD_M**2])
         self._scale = 1.0
         self._sigma = self._sigmas(0.0)
@@ -245,9 +246,9 @@ class _Fit:
 
     def _sigmas(self, offset_s: float) -> Array:
         """(R,) standard deviation of the difference of the turns, rad: registration, wheels, and the jitter of both stamps."""
-        t, noise = self._turns, self._noise
+        t = self._turns
         turn, way = self._headings.turns(t.first_s, t.last_s, offset_s)
-        wheels = np.deg2rad(noise.rotation_deg_per_sqrt_m) ** 2 * way + noise.rotation_per_turn**2 * np.abs(turn)
+        wheels = np.deg2rad(WANDER_DEG) ** 2 * way + TURN_NOISE**2 * np.abs(turn)
         rates = [self._headings.rates(at - offset_s) for at in (t.first_s, t.last_s)]
         jitter = JITTER_S**2 * (rates[0] ** 2 + rates[1] ** 2)
         return np.asarray(np.sqrt(t.sigma_rad**2 + _LEAST_SIGMA_RAD**2 + wheels + jitter))
@@ -290,10 +291,10 @@ class SensorClock:
         offset: the newest estimate.
     """
 
-    def __init__(self, sensors: SensorsConfig, noise: EdgesConfig) -> None:
+    def __init__(self, sensors: SensorsConfig) -> None:
         """Start before the drive; an offset that the settings give is taken as it is, and only the rest is estimated."""
         self.offset = ClockOffset()
-        self._given, self._noise = sensors.odometry_delay_s is not None, noise
+        self._given = sensors.odometry_delay_s is not None
         self._stamps_ns, self._poses = array("q"), array("d")
         self._due_m = FIRST_M
 
@@ -341,8 +342,9 @@ class SensorClock:
         way = np.hypot(*np.diff(poses[:, :2], axis=0).T)
         stamps_s = (times - times[0]) / NS_PER_S
         headings = Headings(stamps_s, np.unwrap(poses[:, 2]), np.concatenate([[0.0], np.cumsum(way)]))
-        found = offset_of(headings, _turns(experiences, int(times[0])), self._noise, wide=wide)
-        return replace(found, travel_m=float(headings.travel_m[-1]))
+        travel_m = float(headings.travel_m[-1])
+        found = offset_of(headings, _turns(experiences, int(times[0])), wide=wide) if travel_m >= FIRST_M else ClockOffset()
+        return replace(found, travel_m=travel_m)
 
     def _track(self) -> tuple[NDArray[np.int64], Array]:
         times = np.array(self._stamps_ns, dtype=np.int64)

@@ -115,7 +115,7 @@ class OdometryWatch:
 
     def __init__(self, config: Config, integrator: PathIntegrator, synchroniser: Synchroniser) -> None:
         """Start before the drive; gains go to the integrator, the offset to the synchroniser."""
-        self.clock = SensorClock(config.sensors, config.edges)
+        self.clock = SensorClock(config.sensors)
         self._gains = OnlineCalibration(Gains.of(config.neural)) if config.calibration.online else None
         self._integrator, self._synchroniser = integrator, synchroniser
 

@@ -12,6 +12,9 @@ from hybridmap.cli.map import LOST
 from hybridmap.cli.options import OdometryFile, Source, Topic, sensor_settings
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from hybridmap.calibration.clock import ClockOffset
     from hybridmap.metrics import Metric
     from hybridmap.streams.inspection import Inspection
 
@@ -51,15 +54,32 @@ def inspect(
     )
     overrides = {**topics, **parse_settings(setting)}
     found = inspect_source(source, Config.load(config, overrides))
+    clock = _clock(found, config, overrides)
     if as_json:
-        sys.stdout.write(to_json(_head(found), _metrics(found)) + "\n")
+        sys.stdout.write(to_json(_head(found, clock), _metrics(found, clock)) + "\n")
     else:
-        _show(found)
+        _show(found, clock)
     if strict and found.lost:
         raise typer.Exit(LOST)
 
 
-def _head(found: Inspection) -> dict[str, Any]:
+def _clock(found: Inspection, config: str | None, overrides: Mapping[str, Any]) -> ClockOffset | None:
+    """The offset between views and odometry by the first metres of a recording; None if there is nothing to look at."""
+    if not found.mappable or not found.parts or not found.rig.sensors:
+        return None
+    from hybridmap.cli.choose import choose
+    from hybridmap.errors import HybridMapError
+    from hybridmap.session import first_look
+
+    try:
+        opened = choose(found.source, config, overrides)
+        return first_look(opened.stream, opened.config)
+    except HybridMapError as error:
+        found.problems.append(str(error))
+        return None
+
+
+def _head(found: Inspection, clock: ClockOffset | None) -> dict[str, Any]:
     parts = [{"name": part.name, "type": part.kind, "count": part.count, "span_s": part.span_s} for part in found.parts]
     return {
         "source": found.source,
@@ -70,15 +90,18 @@ def _head(found: Inspection) -> dict[str, Any]:
         "remarks": found.remarks,
         "problems": found.problems,
         "lost": found.lost,
+        "clock": None if clock is None else {"state": str(clock.state), "words": str(clock)},
         "mappable": found.mappable,
         "reason": found.reason,
     }
 
 
-def _metrics(found: Inspection) -> list[Metric]:
-    from hybridmap.metrics import Metric
+def _metrics(found: Inspection, clock: ClockOffset | None) -> list[Metric]:
+    from hybridmap.metrics import Metric, figure
 
     rows = []
+    if clock is not None:
+        rows += [figure("clock_offset", clock.offset_s, said=clock), figure("clock_offset_sigma", clock.sigma_s)]
     for part in found.parts:
         name = part.name.lstrip("/")
         rows += [
@@ -96,10 +119,11 @@ def _sensor(found: Inspection) -> str:
     return next(iter(words(found.rig)), "none")
 
 
-def _show(found: Inspection) -> None:
+def _show(found: Inspection, clock: ClockOffset | None) -> None:
     lines = [f"{found.source}: {found.kind}", *_table(found)]
     lines += [f"uses {role}: {name}" for role, name in found.uses.items()]
     lines.append(f"maps with: {_sensor(found)}")
+    lines += [] if clock is None else [f"clock: {clock}"]
     lines += [f"note: {remark}" for remark in found.remarks]
     lines += [f"problem: {problem}" for problem in found.problems]
     lines.append("mappable: yes" if found.mappable else f"mappable: no, because {found.reason}")

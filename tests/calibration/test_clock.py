@@ -11,12 +11,11 @@ import pytest
 from hybridmap.calibration.clock import ClockOffset, ClockState, Headings, Turns, offset_of
 from hybridmap.calibration.sessions import read_drive
 from hybridmap.config import Config
-from hybridmap.config.mapping import EdgesConfig
 from hybridmap.geometry import compose
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.io import graph_hash
 from hybridmap.mapper import Mapper
-from hybridmap.session import run
+from hybridmap.session import first_look, run
 from hybridmap.streams.base import Sample, SelfMotion
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.order import merge
@@ -37,7 +36,7 @@ def told_by(one: Drive, late_s: float, every: int = 1, *, wide: bool = False) ->
     seen = one.truth[::NODE_STEPS, 2] + rng.normal(0.0, 1e-3, len(one.truth[::NODE_STEPS]))
     at_s = stamps_s[::NODE_STEPS] + late_s
     turns = Turns(at_s[:-1], at_s[1:], np.diff(seen), np.full(len(at_s) - 1, 2e-3))
-    return offset_of(headings, turns, EdgesConfig(), wide=wide)
+    return offset_of(headings, turns, wide=wide)
 
 
 @pytest.mark.parametrize("late_s", [-0.2, -0.05, 0.0, 0.13, 0.3])
@@ -166,3 +165,11 @@ def test_the_session_holds_the_odometry_on_the_clock_of_the_views(tmp_path):
     assert np.abs(np.diff(yaw) - np.diff(true)).max() < 0.06
     again = run(replace(one), config, tmp_path / "t")
     assert again.head["graph_hash"] == session.head["graph_hash"]
+
+
+def test_a_first_look_finds_the_offset_without_a_map():
+    config = Config.load("laser", {"nodes.distance_m": 0.3})
+    found = first_look(LateRoom(laps=3.0, late_s=0.15), config)
+    assert (found.state, found.used_s) == (ClockState.KNOWN, 0.0)
+    assert found.offset_s == pytest.approx(0.15, abs=0.015)
+    assert first_look(LateRoom(laps=0.5, late_s=0.15), config).state is ClockState.OPEN
