@@ -18,12 +18,14 @@ class SolveStatus(StrEnum):
     """Why a solver stopped. After `diverged`, `singular` and `failed` the poses are the initial ones.
 
     `waiting`: the update only placed new nodes; the solver takes the new edges at a loop closure or at the end of the drive.
+    `fell-back`: a robust solver could not go on, and its poses are those of a simpler method, which the message names.
     """
 
     CONVERGED = "converged"
     WAITING = "waiting"
     MAX_ITERATIONS = "max-iterations"
     STALLED = "stalled"
+    FELL_BACK = "fell-back"
     DIVERGED = "diverged"
     SINGULAR = "singular"
     FAILED = "failed"

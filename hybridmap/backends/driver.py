@@ -185,7 +185,7 @@ class Driver:
         try:
             return solver(graph, start)
         except RuntimeError as error:  # gtsam raises nothing more specific
-            raise BackendError(f"{self._name}: the solver gave up: {_first_line(error)}") from error
+            raise BackendError(f"{self._name}: the solver gave up: {first_line(error)}") from error
 
     def _extended(self, start: Array, waiting: int) -> Outcome:
         """The outcome of an update without the solver."""
@@ -267,7 +267,8 @@ def _anchored(poses: Array, first: Array) -> Array:
     return moved
 
 
-def _first_line(error: BaseException) -> str:
+def first_line(error: BaseException) -> str:
+    """The first line of an error's text, or the name of its class if it has none."""
     text = str(error).strip()
     return text.splitlines()[0] if text else type(error).__name__
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridmap.config.backends import BackendsConfig, RobustConfig
 from hybridmap.geometry import Array, log
@@ -117,8 +118,8 @@ def softened(graph: PoseGraph, poses: Array, config: RobustConfig) -> PoseGraph:
     return replace(graph, information=graph.information * weights[:, None, None])
 
 
-def hanging_nodes(graph: PoseGraph, without: tuple[int, ...]) -> int:
-    """Number of nodes without a path to node 0 if the edges with the ids `without` are left out."""
+def parts(graph: PoseGraph, without: tuple[int, ...]) -> NDArray[np.int32]:
+    """Number (N,) of the connected part of each node if the edges with the ids `without` are left out."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
@@ -126,4 +127,10 @@ def hanging_nodes(graph: PoseGraph, without: tuple[int, ...]) -> int:
     n = graph.n_nodes
     joined = csr_array((np.ones(int(kept.sum())), (graph.sources[kept], graph.targets[kept])), shape=(n, n))
     _, label = connected_components(joined, directed=False)
-    return int(np.count_nonzero(label != label[0]))
+    return np.asarray(label, dtype=np.int32)
+
+
+def hanging_nodes(graph: PoseGraph, without: tuple[int, ...]) -> int:
+    """Number of nodes without a path to node 0 if the edges with the ids `without` are left out."""
+    part = parts(graph, without)
+    return int(np.count_nonzero(part != part[0]))

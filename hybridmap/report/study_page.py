@@ -25,7 +25,7 @@ from hybridmap.study.statistics import LEAST, Interval, Summary
 from hybridmap.study.study import Study
 
 _TEMPLATE = "study.html.j2"
-_SOLVED = ("converged", "waiting", "max-iterations", "mapped")
+_SOLVED = ("converged", "waiting", "max-iterations", "fell-back", "mapped")
 _HEADS = {"ate_m": "ATE", "relation_m": "relation error", "chi2_own": "χ² own"}
 SHOWN_M = 5e-7
 """Differences below it are shown as 0."""

@@ -13,7 +13,8 @@ from hybridmap.config.backends import BackendsConfig, RelaxationConfig
 from hybridmap.geometry import align, transform_points, wrap_angle
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.paths import chain
-from hybridmap.study.false_loops import inject
+from hybridmap.study.false_loops import inject, with_drift
+from hybridmap.study.model import DriftConfig
 from tests.backends.graphs_for_tests import laps, star
 from tests.narrowing import known
 
@@ -192,3 +193,21 @@ def test_relaxing_first_ends_no_worse_than_either_start_on_a_real_experience_map
         assert hybrid.chi2 <= from_start * (1 + 1e-7)
     assert hybrid.chi2 <= backends.create("gtsam-lm").solve(graph).report.chi2 * (1 + 1e-7)
     assert hybrid.chi2 == pytest.approx(143.149, abs=1e-3)
+
+
+@pytest.mark.parametrize("bias", [1.0, 3.0])
+def test_the_robust_rule_keeps_true_loops_after_a_bad_drift(bias):
+    graph, truth = laps(np.random.default_rng(5), nodes=400, per_lap=100, every=15)
+    drifted = chain(with_drift(graph, DriftConfig(heading_bias_deg_per_m=bias), 0))
+    solution = backends.create("relaxation-robust").solve(drifted)
+    assert solution.report.rejected_edge_ids == ()
+    assert ate(solution.poses, truth) < 0.3 * ate(drifted.initial, truth)
+
+
+def test_the_robust_rule_still_rejects_a_lone_false_loop():
+    graph, truth = laps(np.random.default_rng(5), nodes=400, per_lap=100, every=15)
+    false = inject(graph, 0.05, "random", np.random.default_rng(2))
+    solution = backends.create("relaxation-robust").solve(false)
+    injected = set(false.edge_ids.tolist()) - set(graph.edge_ids.tolist())
+    assert injected <= set(solution.report.rejected_edge_ids)
+    assert ate(solution.poses, truth) < 0.5

@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from hybridmap import backends
+from hybridmap.backends.base import SolveStatus
 from hybridmap.backends.gtsam import gnc
 from hybridmap.backends.gtsam.gnc import Truncated
 from hybridmap.backends.objective import gate_of
 from hybridmap.config.backends import BackendsConfig, GncConfig
-from hybridmap.errors import GraphError
+from hybridmap.errors import BackendError, GraphError
 from hybridmap.geometry import align, transform_points
 from hybridmap.graph.io import read_graph
+from hybridmap.graph.pose_graph import prefix
 from hybridmap.study.false_loops import inject
 from tests.backends.graphs_for_tests import laps
 
@@ -148,3 +150,55 @@ def test_a_back_end_that_trusts_no_loop_still_trusts_registrations():
     lied_to = replace(graph, initial=bent)
     for name in ("gtsam-cauchy", "gtsam-huber", "gtsam-gnc"):
         assert ate(backends.create(name).solve(lied_to).poses, truth) < 0.1, name
+
+
+def in_two_pieces():
+    """Laps whose chain has a gap in the middle; two lone loops join the pieces, one loop is false."""
+    laps_of_20, _ = laps(np.random.default_rng(3), nodes=60, per_lap=20)
+    joins = laps_of_20.is_loop & np.isin(laps_of_20.sources, (32, 48))
+    false = laps_of_20.is_loop & (laps_of_20.sources == 56)
+    gap = (laps_of_20.sources == 29) & (laps_of_20.targets == 30)
+    deltas = laps_of_20.deltas.copy()
+    deltas[false] += [4.0, -3.0, 1.0]
+    graph = replace(laps_of_20, deltas=deltas)
+    return graph.with_edges(joins | false | (graph.is_motion & ~gap)), int(graph.edge_ids[false][0])
+
+
+def test_probation_never_takes_a_map_apart():
+    graph, false = in_two_pieces()
+    kept = graph.edge_ids[graph.is_loop] != false
+    config = BackendsConfig()
+    found = gnc.on_probation(graph, Truncated(graph.initial, kept, 1, gate_of(config)), config)
+    assert np.array_equal(found.kept, kept)
+    assert backends.create("gtsam-gnc").solve(graph).report.hanging_nodes == 0
+
+
+def raising(*_, **__):
+    raise BackendError("covariance: the graph is singular")
+
+
+def test_a_judge_that_cannot_go_on_leaves_the_loops_and_says_so(monkeypatch, disturbed):
+    _, false, clean = disturbed
+    monkeypatch.setattr(gnc, "on_probation", raising)
+    solution = backends.create("gtsam-gnc").solve(false)
+    assert solution.report.status is SolveStatus.FELL_BACK
+    assert solution.report.status.has_map
+    assert ate(solution.poses, clean) < 0.1
+
+
+def test_least_squares_takes_over_where_no_attempt_comes_to_an_end(monkeypatch, disturbed):
+    graph, _, clean = disturbed
+    for name in ("trusting", "graduate", "grow"):
+        monkeypatch.setattr(gnc, name, raising)
+    solution = backends.create("gtsam-gnc").solve(graph)
+    assert solution.report.status is SolveStatus.FELL_BACK
+    assert solution.report.rejected_edge_ids == ()
+    assert np.allclose(solution.poses, clean, atol=1e-3)
+
+
+@pytest.mark.data
+def test_a_map_bent_until_all_loops_fit_is_not_taken_for_a_good_one(data_dir):
+    graph = prefix(read_graph(data_dir / "posegraphs" / "intel.g2o"), 500)
+    clean = backends.create("gtsam-lm").solve(graph).poses
+    false = inject(graph, 0.1, "random", np.random.default_rng(0))
+    assert ate(backends.create("gtsam-gnc").solve(false).poses, clean) < 0.05

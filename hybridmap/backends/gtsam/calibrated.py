@@ -21,6 +21,7 @@ from hybridmap.backends.gtsam.factors import factor_graph, noise_models
 from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.objective import gate_of, residuals, softened, truncated_cost
 from hybridmap.config.backends import BackendsConfig
+from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, adjoint, between, log
 from hybridmap.graph.paths import own_odometry
 from hybridmap.graph.pose_graph import PoseGraph
@@ -110,7 +111,10 @@ def _calibrate(graph: PoseGraph, gains: Array, outcome: Outcome, config: Backend
     for _ in range(_ROUNDS):
         straight = with_calibrated_odometry(graph, Gains.from_array(gains)).with_edges(kept)
         poses = run("lm", factor_graph(straight, models), poses, config.max_iterations).poses
-        step = _gain_step(graph.with_edges(kept), softened(straight, poses, config.robust), poses, gains)
+        try:
+            step = _gain_step(graph.with_edges(kept), softened(straight, poses, config.robust), poses, gains)
+        except (BackendError, np.linalg.LinAlgError):  # singular: nothing tells the gains from the poses
+            break
         if not np.isfinite(step).all():
             break
         gains = gains + step

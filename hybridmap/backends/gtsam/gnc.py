@@ -15,15 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.base import Outcome, SolveStatus
-from hybridmap.backends.driver import Driver
+from hybridmap.backends.driver import Driver, first_line
 from hybridmap.backends.gtsam.batch import run
 from hybridmap.backends.gtsam.covariance import expected_loops
 from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph, factors, noise_models, poses_of, values
 from hybridmap.backends.gtsam.initial import best_start, trusted_start
 from hybridmap.backends.gtsam.robust import WarmKernel, with_kernel
 from hybridmap.backends.judging.clusters import neighbouring_pairs, rejected_clusters
-from hybridmap.backends.objective import SLACK, gate_of, softened, squared_norms, truncated_cost, unit_variance, weak_edges
+from hybridmap.backends.objective import (
+    SLACK,
+    gate_of,
+    parts,
+    softened,
+    squared_norms,
+    truncated_cost,
+    unit_variance,
+    weak_edges,
+)
 from hybridmap.config.backends import BackendsConfig
+from hybridmap.errors import BackendError
 from hybridmap.geometry import Array
 from hybridmap.graph.paths import extend
 from hybridmap.graph.pose_graph import PoseGraph, prefix
@@ -40,6 +50,8 @@ _ROUGHLY = 10.0  # of the bound, before the first iteration
 _QUICK = (2, 12)  # iterations before each look: where loops agree few are needed, where they do not they are of no use
 _MOSTLY, _ALMOST_ALL = 0.9, 0.97  # share of loops that least squares must agree with, on the way and in the end
 
+_GIVES_UP = (RuntimeError, BackendError, np.linalg.LinAlgError)  # gtsam raises nothing more specific than the first
+
 Whole = Callable[[PoseGraph, BackendsConfig, Array | None], Outcome]
 """Solves a whole graph; the poses (N, 3), if given, are those that a drive led to."""
 
@@ -53,12 +65,14 @@ class Truncated:
         kept: (L,) whether each loop is an inlier.
         rounds: number of annealing steps and of iterations after them.
         bound: squared residual beyond which a loop was an outlier at the end.
+        lack: what could not be done, in words; empty if all was done.
     """
 
     poses: Array
     kept: NDArray[np.bool_]
     rounds: int
     bound: float
+    lack: str = ""
 
 
 class _Problem:
@@ -136,7 +150,10 @@ def graduate(graph: PoseGraph, start: Array, config: BackendsConfig, negligible:
 
 
 def trusting(graph: PoseGraph, config: BackendsConfig) -> Truncated | None:
-    """Least squares with all loops, then with those that are no outliers; None if too many loops are outliers."""
+    """Least squares with all loops, then with those that are no outliers; None if too many loops are outliers.
+
+    False loops may bend the map so that nearly all loops fit at first. So those that fit in the end are counted as well.
+    """
     bound = gate_of(config)
     poses, rounds = best_start(graph, graph.initial), 0
     if _share(squared_norms(graph, poses)[graph.is_loop] <= _ROUGHLY * bound) < _MOSTLY:
@@ -149,8 +166,10 @@ def trusting(graph: PoseGraph, config: BackendsConfig) -> Truncated | None:
         if _share(kept) < least:
             return None
     found = Truncated(poses, kept, rounds, bound)
-    done = kept.all() and config.robust.odometry == "none"
-    return found if done else _settle(_Problem(graph, config), poses, bound, config.max_iterations)
+    if kept.all() and config.robust.odometry == "none":
+        return found
+    settled = _settle(_Problem(graph, config), poses, bound, config.max_iterations)
+    return settled if _share(settled.kept) >= _ALMOST_ALL else None
 
 
 def _share(true: NDArray[np.bool_]) -> float:
@@ -170,12 +189,18 @@ def on_probation(graph: PoseGraph, result: Truncated, config: BackendsConfig) ->
     """Remove accepted loops without an accepted neighbour; then re-admit those consistent with the map made without them.
 
     If a graph overstates its noise, false loops may happen to be consistent. Each removed loop is tested by its innovation
-    under the covariance of loop and map, scaled by the unit variance of the map without the loop.
+    under the covariance of loop and map, scaled by the unit variance of the map without the loop. Loops without which the
+    map would fall into parts stay.
+
+    Raises:
+        BackendError: the map is singular without the loops.
     """
     loops = np.flatnonzero(graph.is_loop)
     accepted = loops[result.kept]
     backed = np.unique(neighbouring_pairs(graph, accepted))
     lone = np.delete(accepted, backed)
+    part = parts(graph, tuple(graph.edge_ids[np.union1d(loops[~result.kept], lone)].tolist()))
+    lone = lone[part[graph.sources[lone]] == part[graph.targets[lone]]]
     if len(lone) == 0:
         return result
     without = result.kept & ~np.isin(loops, lone)
@@ -264,17 +289,23 @@ def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outc
 
     A result convinces if no rejected loops agree with each other, or if two different attempts lead to it. With a kernel on
     odometry, which false loops may tear, every loop must fit as well. The map of the drive `driven` (N, 3) may be bent by false
-    loops: if a run from it rejects loops, it only competes with the next convincing result.
+    loops: if a run from it rejects loops, it only competes with the next convincing result. An attempt that fails is left out;
+    if all fail, the result is that of least squares with all loops, and the status says so.
     """
     results: dict[str, Truncated] = {}
     unconfirmed: dict[str, Truncated] = {}
+    failures: list[str] = []
     tearable = config.robust.odometry != "none"
     for name, attempt in attempts(graph, config, driven).items():
-        found = attempt()
+        try:
+            found = attempt()
+        except _GIVES_UP as error:
+            failures.append(f"{name}: {first_line(error)}")
+            continue
         if found is None:
             continue
         if not found.kept.all():
-            found = on_probation(graph, found, config)
+            found = _tested(graph, found, config)
         agreed = name == "grown" and any(np.array_equal(found.kept, other.kept) for other in results.values())
         if tearable:
             convincing = found.kept.all() and unit_variance(graph, squared_norms(graph, found.poses)) <= SLACK
@@ -285,7 +316,29 @@ def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outc
         elif convincing:
             return _cheapest(graph, {**unconfirmed, name: found}, config)
         results[name] = found
-    return _cheapest(graph, results, config)
+    return _cheapest(graph, results, config) if results else _least_squares(graph, config, "; ".join(failures))
+
+
+def _tested(graph: PoseGraph, found: Truncated, config: BackendsConfig) -> Truncated:
+    """The result after `on_probation`, or as it was where that cannot go on."""
+    try:
+        return on_probation(graph, found, config)
+    except _GIVES_UP as error:
+        return replace(found, lack=f"lone loops were not tested ({first_line(error)})")
+
+
+def _least_squares(graph: PoseGraph, config: BackendsConfig, why: str) -> Outcome:
+    """Least squares with all loops, where no attempt of graduated non-convexity came to an end."""
+    start = best_start(graph, graph.initial)
+    outcome = run("lm", factor_graph(graph, NoiseModels()), start, config.max_iterations)
+    message = f"gnc could not go on ({why}); least squares with all loops instead; {outcome.message}"
+    weights = dict.fromkeys(graph.edge_ids[graph.is_loop].tolist(), 1.0)
+    return replace(
+        outcome,
+        status=SolveStatus.FELL_BACK if outcome.status.has_map else outcome.status,
+        message=message,
+        weights=weights,
+    )
 
 
 def attempts(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> dict[str, Callable[[], Truncated | None]]:
@@ -332,4 +385,6 @@ def _cheapest(graph: PoseGraph, results: dict[str, Truncated], config: BackendsC
     rejected = tuple(edge for edge, weight in weights.items() if weight == 0.0)
     variance = _variance(graph, result, config)
     message = f"gnc: {len(rejected)} of {len(loops)} loops rejected (start: {start}; unit variance {variance:.3g})"
+    if result.lack:
+        return Outcome(result.poses, SolveStatus.FELL_BACK, f"{message}; {result.lack}", result.rounds, weights, rejected)
     return Outcome(result.poses, SolveStatus.CONVERGED, message, result.rounds, weights, rejected)

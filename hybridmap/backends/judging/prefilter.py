@@ -14,7 +14,7 @@ from hybridmap.backends.gtsam.covariance import expected_loops
 from hybridmap.backends.judging.clusters import loops_of, neighbouring_pairs, rejected_clusters
 from hybridmap.backends.objective import SLACK, chi2, gate_of, softened, truncated_cost
 from hybridmap.config.backends import BackendsConfig
-from hybridmap.errors import GraphError
+from hybridmap.errors import BackendError, GraphError
 from hybridmap.graph.agreement import BOUND, agreement, chi2_quantile, largest_consistent_set, ring
 from hybridmap.graph.paths import chain_of
 from hybridmap.graph.pose_graph import PoseGraph
@@ -128,7 +128,10 @@ class ConsistentBackend:
         judged = softened(_without(graph, rejected), solution.poses, self._config.robust)
         loops = np.flatnonzero(np.isin(judged.edge_ids, graph.edge_ids[out]))
         variance = solution.report.unit_variance
-        return out[expected_loops(judged, solution.poses, loops, most if variance is None else min(variance, most))]
+        try:
+            return out[expected_loops(judged, solution.poses, loops, most if variance is None else min(variance, most))]
+        except BackendError:  # the map is singular without them, so that it expects nothing of them
+            return out[:0]
 
     def _on_whole(self, graph: PoseGraph, tried: _Tried, cpu_s: float) -> Solution:
         """The solution with a report about the whole graph."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hybridmap.backends.base import Outcome, SolveStatus
 from hybridmap.backends.driver import Driver, Works
+from hybridmap.backends.gtsam.initial import best_start
 from hybridmap.backends.objective import chi2, gate_of, truncated_cost
 from hybridmap.backends.relaxation.relaxing import TOLERANCE_M, relaxing, swept
 from hybridmap.compiled import compiled
@@ -156,7 +157,8 @@ def robust(name: str, config: BackendsConfig) -> Driver:
     """A back-end with RatSLAM's rule and each loop's correction multiplied by a Geman-McClure weight of its error.
 
     The scale of the weight shrinks geometrically to 1 during a call. For a whole graph that takes a quarter of the sweeps; the
-    others use the plain rule on the inlier loops, which are chosen once more in between.
+    others use the plain rule on the inlier loops, which are chosen once more in between. Where loops were rejected, the graph
+    is also relaxed with all loops at first, and the better map is kept (`_in_rounds`).
     At the end of a drive, the whole graph is solved from the map of the drive, and the better of the two maps is kept.
     """
     rules = config.relaxation
@@ -195,10 +197,14 @@ def then_least_squares(name: str, config: BackendsConfig) -> Driver:
 
 def weights(graph: PoseGraph, poses: Array) -> Array:
     """The Geman-McClure weight (E,) of each edge's error at poses (N, 3), as if every edge were a loop, at the final scales."""
+    return np.asarray(1.0 / (1.0 + _squared(graph, poses)) ** 2)
+
+
+def _squared(graph: PoseGraph, poses: Array) -> Array:
+    """Squared error (E,) of each edge at poses (N, 3), in units of the scales."""
     predicted = compose(poses[graph.sources], graph.deltas)
     errors = between(predicted, poses[graph.targets])
-    squared = np.sum(errors[:, :2] ** 2, axis=1) / ROBUST_SCALE_M**2 + errors[:, 2] ** 2 / ROBUST_SCALE_RAD**2
-    return np.asarray(1.0 / (1.0 + squared) ** 2)
+    return np.asarray(np.sum(errors[:, :2] ** 2, axis=1) / ROBUST_SCALE_M**2 + errors[:, 2] ** 2 / ROBUST_SCALE_RAD**2)
 
 
 def _relaxed(config: RelaxationConfig, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
@@ -206,14 +212,44 @@ def _relaxed(config: RelaxationConfig, graph: PoseGraph, start: Array, sweeps: i
 
 
 def _in_rounds(config: RelaxationConfig, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
+    """Relax with weighted loops; where that rejects any, also with all loops at first, and return the better map.
+
+    A weight trusts the start more than the loops. After a long drift it rejects true ones, and so it may not have the last
+    word. A map that keeps most loops is better than one that does not; else the one with the lower `_cost` is. False
+    loops bend the map of all loops, which costs far more than to reject them.
+    """
     quarter = max(sweeps // 4, 1)
-    relaxed = replace(relax_links(graph, start, min(sweeps, quarter), config, robust=True), settled=False)
+    weighted = _pruned(config, graph, relax_links(graph, start, min(sweeps, quarter), config, robust=True), sweeps, quarter)
+    judged = _judged(graph, weighted)
+    if not judged.rejected:
+        return judged
+    trusting = relax_links(graph, best_start(graph, start), max(sweeps - quarter, 1), config)
+    other = _judged(graph, _pruned(config, graph, trusting, sweeps, quarter))
+    if not np.isfinite(other.poses).all():
+        return judged
+    better = min((judged, other), key=lambda one: (_rejects_most(one), _cost(graph, one.poses)))
+    return judged if better is judged else replace(other, message=f"{other.message} (start: all loops)")
+
+
+def _pruned(config: RelaxationConfig, graph: PoseGraph, relaxed: Relaxed, sweeps: int, quarter: int) -> Relaxed:
+    """Spend the rest of the sweeps on the plain rule and the inlier loops, which are chosen anew after each quarter."""
+    relaxed = replace(relaxed, settled=False)
     while relaxed.sweeps < sweeps and not relaxed.settled:
         kept = ~(graph.is_loop & (weights(graph, relaxed.poses) < _REJECTED))
         part = min(quarter, sweeps - relaxed.sweeps)
         onward = relax_links(graph.with_edges(kept), relaxed.poses, part, config)
         relaxed = replace(onward, sweeps=relaxed.sweeps + onward.sweeps)
-    return _judged(graph, relaxed)
+    return relaxed
+
+
+def _rejects_most(outcome: Outcome) -> bool:
+    return 2 * len(outcome.rejected) > len(outcome.weights)
+
+
+def _cost(graph: PoseGraph, poses: Array) -> float:
+    """Sum of the squared errors of the edges, in units of the scales, that of a loop truncated where it is rejected."""
+    squared = _squared(graph, poses)
+    return float(np.where(graph.is_loop, np.minimum(squared, 1.0), squared).sum())
 
 
 def _judged(graph: PoseGraph, relaxed: Relaxed) -> Outcome:
