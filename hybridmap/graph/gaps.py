@@ -78,6 +78,9 @@ def grounded(trajectory: Trajectory, experiences: ExperienceMap) -> Trajectory:
     return Trajectory(np.concatenate([p.stamps_ns for p in parts]), np.concatenate([p.poses for p in parts]))
 
 
+FREE = 1.5
+"""A registration that is so many times less certain than the odometry leaves the motion to it. One that is as certain as wheels
+which proved good still holds it; along a bare wall the factor is 10 and more."""
 _ALIKE = 0.7  # mean resultant length of doubled angles from which stretches are said to share a direction
 
 
@@ -86,7 +89,7 @@ class Unobserved:
     """Path lengths over which the motion from node to node is known by odometry alone, in one direction or in all.
 
     Attributes:
-        sliding_m: length where registration is no more certain than odometry in one direction (a bare corridor).
+        sliding_m: length where registration is far less certain than odometry in one direction (a bare corridor).
         blind_m: length where nothing was registered.
         travel_m: length of the whole drive.
         direction_rad: direction in the map that registration leaves free, an axis in [-pi/2, pi/2); mean by length.
@@ -114,8 +117,8 @@ class Unobserved:
 def unobserved(experiences: ExperienceMap, poses: Array) -> Unobserved | None:
     """Find where the motion from node to node is known by odometry alone.
 
-    A stretch slides where the registration's standard deviation in its loosest direction is no less than that of the
-    odometry edge in the same direction.
+    A stretch slides where the registration's standard deviation in its loosest direction is at least `FREE` times that of
+    the odometry edge in the same direction.
 
     Args:
         experiences: the map.
@@ -182,10 +185,10 @@ def _by_target(experiences: ExperienceMap, kind: EdgeKind) -> dict[int, list[Edg
 
 
 def _free_direction(registrations: list[Edge], odometry: list[Edge]) -> float | None:
-    """Direction (rad, in the node's frame) in which the best registration is no more certain than odometry, if any."""
+    """Direction (rad, in the node's frame) in which the best registration is far less certain than odometry, if any."""
     nearest = max(registrations, key=lambda edge: edge.source)
     assert nearest.relative is not None
     sigma_m, direction = loosest_direction(nearest.relative.covariance)
     along = np.array([np.cos(direction), np.sin(direction)])
     held = [along @ edge.relative.covariance[:2, :2] @ along for edge in odometry if edge.relative is not None]
-    return direction if held and sigma_m**2 >= min(held) else None
+    return direction if held and sigma_m**2 >= FREE**2 * min(held) else None

@@ -56,6 +56,11 @@ def test_a_room_is_held_and_no_remark():
     assert str(found) == "registration held all of the way"
 
 
+def test_registrations_as_certain_as_good_wheels_hold_the_motion():
+    found = known(unobserved(*drive([1.2 * ODOMETRY] * 5)))
+    assert (found.sliding_m, found.blind_m) == (0.0, 0.0)
+
+
 def test_what_was_not_registered_is_blind():
     found = known(unobserved(*drive([HELD, None, None])))
     assert found.blind_m == pytest.approx(1.0)
