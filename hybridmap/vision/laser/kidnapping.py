@@ -35,10 +35,8 @@ from hybridmap.vision.templates import Matcher
 
 MAP_VIOLATION = 0.4
 """Share of the walls of the map or of the last scans in the other's free space above which they contradict each other."""
-SURE_M = 0.3
-"""Largest standard deviation of their position on the map at which they can, m."""
-RECENT_M = 4.0
-"""Travel of the last scans that are compared with the map, m."""
+SURE_M, RECENT_M = 0.3, 4.0
+"""Largest standard deviation of their position on the map at which they can, and travel of the last scans, m."""
 OLD_M, OLD_NODES = 4.0, 20
 """The old nodes with which they are compared: largest distance, m, and number of the nearest."""
 LOOSE_M, LOOSE_RAD = 0.3, float(np.deg2rad(5.0))
