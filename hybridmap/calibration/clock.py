@@ -11,21 +11,14 @@ straight, or circles at one speed, leaves it open.
 
 from __future__ import annotations
 
-import logging
-from array import array
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from math import hypot, inf, nan
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.config.inputs import SensorsConfig
-from hybridmap.geometry import Array, interpolate, wrap_angle
-from hybridmap.graph.edges import EdgeKind, Status
-from hybridmap.graph.experience_map import ExperienceMap
-from hybridmap.streams.synchronise import Ready
-from hybridmap.trajectory import NS_PER_S
+from hybridmap.geometry import Array, wrap_angle
 
 TRANSPORT_S = 0.5
 """Largest offset that the transport of messages explains, s. A larger one is another time base, and is not corrected."""
@@ -51,9 +44,6 @@ WANDER_DEG, TURN_NOISE = 0.6, 0.02
 """Noise of the heading by usual wheels: degrees per root metre, radians per root radian turned. Its scale is estimated."""
 GAIN_SIGMA, BIAS_SIGMA_RAD_M = 0.05, 0.03
 """Standard deviations of g and b before the drive: those of usual wheels."""
-FIRST_M, AGAIN = 20.0, 1.1
-"""Path length before the first estimate, m, and the factor from one estimate to the next. On a shorter drive a slip in one of
-few turns looks like an offset. With the factor the cost of all estimates is linear in the drive."""
 MATTERS_S = 0.02
 """Least offset that is corrected, s: the turn of a robot in that time is less than the registrations' error."""
 _FEWEST = 12  # registrations: three unknowns and a scale
@@ -63,7 +53,6 @@ _CAUCHY = 2.385  # in units of the scale: 95 % efficiency for normal residuals
 _SCALE_MIN = 0.5  # of residuals over their assumed standard deviation: fewer residuals may agree by chance
 _ITERATIONS = 8
 _RATE_S = 0.1  # half of the time over which a turn rate is taken
-_logger = logging.getLogger(__name__)
 
 
 class ClockState(StrEnum):
@@ -279,85 +268,3 @@ class _Fit:
         weights = 1.0 / (1.0 + (residuals / (_CAUCHY * self._scale)) ** 2) / self._scale**2
         information = design.T @ (design * weights[:, None]) + np.diag([1e-6, *self._precision])
         return float(np.sqrt(np.linalg.inv(information)[0, 0]))
-
-
-class SensorClock:
-    """Collects the odometry of a drive, and estimates from its registrations how late the views are stamped.
-
-    The estimate is due after `FIRST_M` metres and then whenever the drive has grown by a tenth, until it is known; and once
-    more from the whole drive at its end.
-
-    Attributes:
-        offset: the newest estimate.
-    """
-
-    def __init__(self, sensors: SensorsConfig) -> None:
-        """Start before the drive; an offset that the settings give is taken as it is, and only the rest is estimated."""
-        self.offset = ClockOffset()
-        self._given = sensors.odometry_delay_s is not None
-        self._stamps_ns, self._poses = array("q"), array("d")
-        self._due_m = FIRST_M
-
-    def observe(self, ready: Ready, pose_odom: Array) -> None:
-        """Take note of a step of self-motion and of the pose (3,) in `odom` after it; a view between two steps is ignored."""
-        if ready.odometry_ns is not None and (not self._stamps_ns or ready.odometry_ns > self._stamps_ns[-1]):
-            self._stamps_ns.append(ready.odometry_ns)
-            self._poses.extend(pose_odom.tolist())
-
-    def follow(self, experiences: ExperienceMap) -> float | None:
-        """Take note of a new node; returns the offset to correct from now on, s, at the one node where it becomes known."""
-        travel_m = experiences.node(len(experiences) - 1).travel_m
-        if self._given or self.offset.known or travel_m < self._due_m:
-            return None
-        self._due_m = AGAIN * travel_m
-        self.offset = self._estimated(experiences)
-        if not self.offset.matters:
-            return None
-        self.offset = replace(self.offset, used_s=self.offset.offset_s)
-        _logger.info("%s", self.offset)
-        return self.offset.used_s
-
-    def finish(self, experiences: ExperienceMap) -> bool:
-        """Estimate the offset from the whole drive; returns whether all its odometry must be computed again with `used_s`."""
-        before, self.offset = self.offset, self._estimated(experiences, wide=True)
-        if not self.offset.known and before.known:
-            self.offset = before
-        corrected = not self._given and (self.offset.matters or before.used_s != 0.0)
-        if corrected:
-            self.offset = replace(self.offset, used_s=self.offset.offset_s)
-        return corrected
-
-    def poses_at(self, stamps_ns: NDArray[np.int64]) -> Array:
-        """Poses (N, 3) in `odom` at stamps (N,) of views, by corrected odometry; held before its first and after its last."""
-        times, poses = self._track()
-        wanted = np.clip(stamps_ns - round(self.offset.used_s * NS_PER_S), times[0], times[-1])
-        after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
-        share = (wanted - times[after - 1]) / (times[after] - times[after - 1])
-        return interpolate(poses[after - 1], poses[after], share)
-
-    def _estimated(self, experiences: ExperienceMap, *, wide: bool = False) -> ClockOffset:
-        times, poses = self._track()
-        if len(times) < 2:
-            return ClockOffset()
-        way = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-        stamps_s = (times - times[0]) / NS_PER_S
-        headings = Headings(stamps_s, np.unwrap(poses[:, 2]), np.concatenate([[0.0], np.cumsum(way)]))
-        travel_m = float(headings.travel_m[-1])
-        found = offset_of(headings, _turns(experiences, int(times[0])), wide=wide) if travel_m >= FIRST_M else ClockOffset()
-        return replace(found, travel_m=travel_m)
-
-    def _track(self) -> tuple[NDArray[np.int64], Array]:
-        times = np.array(self._stamps_ns, dtype=np.int64)
-        return times, np.array(self._poses, dtype=np.float64).reshape(-1, 3)
-
-
-def _turns(experiences: ExperienceMap, start_ns: int) -> Turns:
-    """The accepted registrations of consecutive nodes; times since `start_ns`."""
-    rows = []
-    for edge in experiences.edges:
-        registered = edge.kind is EdgeKind.REGISTRATION and edge.status is Status.ACCEPTED and edge.target == edge.source + 1
-        if registered and edge.relative is not None:
-            ends_ns = [experiences.node(end).stamp_ns - start_ns for end in (edge.source, edge.target)]
-            rows.append([*ends_ns, edge.relative.delta[2], edge.relative.covariance[2, 2]])
-    first, last, turn, variance = np.array(rows, dtype=np.float64).reshape(-1, 4).T
-    return Turns(first / NS_PER_S, last / NS_PER_S, turn, np.sqrt(variance))

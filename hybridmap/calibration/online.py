@@ -3,28 +3,36 @@
 from __future__ import annotations
 
 import logging
+import math
+from array import array
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.calibration.clock import SensorClock
+from hybridmap.calibration.clock import ClockOffset, Headings, Turns, offset_of
 from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.legs import Motion
 from hybridmap.calibration.regression import Sighting, regress
 from hybridmap.config import Config
+from hybridmap.config.inputs import SensorsConfig
 from hybridmap.errors import EvaluationError
-from hybridmap.geometry import Array
-from hybridmap.graph.edges import EdgeKind
+from hybridmap.geometry import Array, interpolate
+from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.neural.path_integrator import PathIntegrator
 from hybridmap.odometry_model import Gains
 from hybridmap.streams.synchronise import Ready, Synchroniser
+from hybridmap.trajectory import NS_PER_S
 
 FIRST_M, EVERY_M = 50.0, 25.0
-"""Travel before the first estimate and between two, m: legs between closures are then long enough to tell gains from noise."""
+"""Travel before the first estimate of the gains and between two, m: legs between closures are then long enough to tell gains
+from noise."""
+CLOCK_FIRST_M, CLOCK_AGAIN = 20.0, 1.1
+"""Path length before the first estimate of the clock, m, and the factor from one estimate to the next. On a shorter drive a
+slip in one of few turns looks like an offset. With the factor the cost of all estimates is linear in the drive."""
 _logger = logging.getLogger(__name__)
 
 
@@ -51,6 +59,90 @@ class GainChange:
         named = zip(("gain", "turn gain", "heading bias"), self.gains.to_array(), self.estimate.sigmas, strict=False)
         told = (f"{name} {value:.4f} +- {sigma:.4f}" for name, value, sigma in named if np.isfinite(sigma))
         return "odometry gains changed: " + ", ".join(told)
+
+
+class SensorClock:
+    """Collects the odometry of a drive, and estimates from its registrations how late the views are stamped.
+
+    The estimate is due after `CLOCK_FIRST_M` metres and then whenever the drive has grown by a tenth, until it is known; and
+    once more from the whole drive at its end.
+
+    Attributes:
+        offset: the newest estimate.
+    """
+
+    def __init__(self, sensors: SensorsConfig) -> None:
+        """Start before the drive; an offset that the settings give is taken as it is, and only the rest is estimated."""
+        self.offset = ClockOffset()
+        self._given = sensors.odometry_delay_s is not None
+        self._stamps_ns, self._poses = array("q"), array("d")
+        self._due_m = math.inf if self._given else CLOCK_FIRST_M
+
+    def observe(self, ready: Ready, pose_odom: Array) -> None:
+        """Take note of a step of self-motion and of the pose (3,) in `odom` after it; a view between two steps is ignored."""
+        if ready.odometry_ns is not None and (not self._stamps_ns or ready.odometry_ns > self._stamps_ns[-1]):
+            self._stamps_ns.append(ready.odometry_ns)
+            self._poses.extend(pose_odom.tolist())
+
+    def follow(self, experiences: ExperienceMap) -> float | None:
+        """Take note of a new node; returns the offset to correct from now on, s, at the one node where it becomes known."""
+        travel_m = experiences.node(len(experiences) - 1).travel_m
+        if travel_m < self._due_m:
+            return None
+        self.offset = self._estimated(experiences)
+        self._due_m = math.inf if self.offset.known else CLOCK_AGAIN * travel_m
+        if not self.offset.matters:
+            return None
+        self.offset = replace(self.offset, used_s=self.offset.offset_s)
+        _logger.info("%s", self.offset)
+        return self.offset.used_s
+
+    def finish(self, experiences: ExperienceMap) -> bool:
+        """Estimate the offset from the whole drive; returns whether all its odometry must be computed again with `used_s`."""
+        before, self.offset = self.offset, self._estimated(experiences, wide=True)
+        if not self.offset.known and before.known:
+            self.offset = before
+        corrected = not self._given and (self.offset.matters or before.used_s != 0.0)
+        if corrected:
+            self.offset = replace(self.offset, used_s=self.offset.offset_s)
+        return corrected
+
+    def poses_at(self, stamps_ns: NDArray[np.int64]) -> Array:
+        """Poses (N, 3) in `odom` at stamps (N,) of views, by corrected odometry; held before its first and after its last."""
+        times, poses = self._track()
+        wanted = np.clip(stamps_ns - round(self.offset.used_s * NS_PER_S), times[0], times[-1])
+        after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
+        share = (wanted - times[after - 1]) / (times[after] - times[after - 1])
+        return interpolate(poses[after - 1], poses[after], share)
+
+    def _estimated(self, experiences: ExperienceMap, *, wide: bool = False) -> ClockOffset:
+        times, poses = self._track()
+        if len(times) < 2:
+            return ClockOffset()
+        way = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+        stamps_s = (times - times[0]) / NS_PER_S
+        headings = Headings(stamps_s, np.unwrap(poses[:, 2]), np.concatenate([[0.0], np.cumsum(way)]))
+        travel_m = float(headings.travel_m[-1])
+        found = (
+            offset_of(headings, _turns(experiences, int(times[0])), wide=wide) if travel_m >= CLOCK_FIRST_M else ClockOffset()
+        )
+        return replace(found, travel_m=travel_m)
+
+    def _track(self) -> tuple[NDArray[np.int64], Array]:
+        times = np.array(self._stamps_ns, dtype=np.int64)
+        return times, np.array(self._poses, dtype=np.float64).reshape(-1, 3)
+
+
+def _turns(experiences: ExperienceMap, start_ns: int) -> Turns:
+    """The accepted registrations of consecutive nodes; times since `start_ns`."""
+    rows = []
+    for edge in experiences.edges:
+        registered = edge.kind is EdgeKind.REGISTRATION and edge.status is Status.ACCEPTED and edge.target == edge.source + 1
+        if registered and edge.relative is not None:
+            ends_ns = [experiences.node(end).stamp_ns - start_ns for end in (edge.source, edge.target)]
+            rows.append([*ends_ns, edge.relative.delta[2], edge.relative.covariance[2, 2]])
+    first, last, turn, variance = np.array(rows, dtype=np.float64).reshape(-1, 4).T
+    return Turns(first / NS_PER_S, last / NS_PER_S, turn, np.sqrt(variance))
 
 
 class OnlineCalibration:

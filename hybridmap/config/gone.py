@@ -19,14 +19,14 @@ simulation.camera simulation/sensor_models.py hole_fraction exposure_change colo
 simulation.laser simulation/sensor_models.py forward_m:LASER_FORWARD_M height_m:LASER_HEIGHT_M
 simulation.laser simulation/sensor_models.py range_min_m:LASER_RANGE_MIN_M noise_m:LASER_NOISE_M drop_fraction
 neural neural/grid.py softplus_sharpness fourier_modes kernel_gain_first kernel_gain_zero kernel_widths
-neural neural/band.py band_cells band_width
+neural neural/rings.py band_cells band_width
 neural neural/grid.py decode_box_m
 neural neural/path_integrator.py orientation_deg orientation_step_deg neuron_noise_seed
 neural.place neural/path_integrator.py theta_hz
 neural.place neural/place.py attractor_width_cells
 neural.place neural/place.py grid_inputs_side recruit_threshold inhibition max_cells
 calibration calibration/online.py first_m every_m
-backends.relaxation backends/relaxation/relaxing.py tolerance_m
+backends.relaxation backends/relaxation/ratslam.py tolerance_m
 backends.relaxation backends/relaxation/ratslam.py robust_scale_m robust_scale_rad robust_start
 backends.robust backends/gtsam/factors.py huber_scale dcs_phi geman_mcclure_scale
 backends.robust backends/objective.py odometry_scale
@@ -39,7 +39,7 @@ vision.templates vision/templates.py threshold stable_frames
 vision.relocalising vision/relocalising.py support mismatch_max mismatch_scale wait_m
 vision.relocalising vision/rgbd/closing.py span_m doubt_nodes:UNCERTAIN_NODES unrecognised_nodes known_m known_deg:KNOWN_RAD
 vision.relocalising vision/rgbd/global_search.py separation doubtful_m:UNCERTAIN_M
-vision.laser.scan vision/laser/scene.py range_max_m cell_m
+vision.laser.scan vision/laser/cloud.py range_max_m cell_m
 vision.laser.registration vision/laser/cloud.py reach_m:PARTNER_M field_sigma_m
 vision.laser.registration vision/laser/scan_matching.py cauchy_scale_m:CAUCHY_CELLS inlier_m:INLIER_CELLS
 vision.laser.registration vision/laser/scan_matching.py iterations sigma_m spurious

@@ -12,7 +12,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from hybridmap.errors import ConfigError
 from hybridmap.geometry import Array
-from hybridmap.neural.band import Metric
+from hybridmap.neural.rings import Metric
 
 FOURIER_MODES = 4
 """K, the Fourier modes along each axis of a sheet that its recurrent weights carry; beyond them all gains are below 1e-3."""

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from hybridmap.config.mapping import NeuralConfig
 from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import Array, compose, inverse
-from hybridmap.neural.band import BandRings
 from hybridmap.neural.grid import (
     FOURIER_MODES,
     Decoded,
@@ -24,8 +23,8 @@ from hybridmap.neural.grid import (
     shift_sheets,
     softplus,
 )
-from hybridmap.neural.head_direction import HeadDirectionRing
 from hybridmap.neural.place import PlaceAttractor, PlaceCells, PlaceProjection
+from hybridmap.neural.rings import BandRings, HeadDirectionRing
 from hybridmap.odometry_model import Gains, step_of
 
 log = logging.getLogger(__name__)

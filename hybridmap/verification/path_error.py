@@ -10,7 +10,7 @@ from hybridmap import geometry
 from hybridmap.config.mapping import NeuralConfig
 from hybridmap.geometry import Array
 from hybridmap.neural import PathIntegrator
-from hybridmap.neural.head_direction import HeadDirectionRing
+from hybridmap.neural.rings import HeadDirectionRing
 from hybridmap.verification.drives import ExactDrive, corridor, wander
 
 _NODE_M = 0.5

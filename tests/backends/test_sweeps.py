@@ -14,8 +14,7 @@ from numba import njit
 from hybridmap import backends, compiled
 from hybridmap.backends.base import Outcome, SolveStatus
 from hybridmap.backends.relaxation import ratslam as sweeps
-from hybridmap.backends.relaxation.ratslam import relax_links
-from hybridmap.backends.relaxation.relaxing import TOLERANCE_M, swept
+from hybridmap.backends.relaxation.ratslam import TOLERANCE_M, relax_links, swept
 from hybridmap.config.backends import RelaxationConfig
 from hybridmap.errors import GraphError
 from hybridmap.geometry import compose, wrap_angle

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybridmap.neural.band import BandRings
+from hybridmap.neural.rings import BandRings
 
 SPACINGS = np.geomspace(0.12, 0.52, 4)
 ORIENTATIONS = np.radians([5.0, 17.0, -8.0, 40.0])

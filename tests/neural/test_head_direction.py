@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridmap.geometry import wrap_angle
-from hybridmap.neural.head_direction import HeadDirectionRing
+from hybridmap.neural.rings import HeadDirectionRing
 
 angles = st.floats(-3.0, 3.0)
 

@@ -7,8 +7,8 @@ from hybridmap import geometry
 from hybridmap.config.mapping import NeuralConfig
 from hybridmap.errors import StreamError
 from hybridmap.neural import PathIntegrator
-from hybridmap.neural.band import BandMotion
 from hybridmap.neural.grid import shift_sheets
+from hybridmap.neural.rings import BandMotion
 from hybridmap.verification.shadow import overwrite
 from tests.neural.neural_drives import arc, wander
 

@@ -18,7 +18,7 @@ from scipy.sparse.linalg import eigsh
 
 from hybridmap.backends.base import Outcome, SolveStatus
 from hybridmap.backends.driver import Driver
-from hybridmap.backends.relaxation.relaxing import TOLERANCE_M, relaxing
+from hybridmap.backends.relaxation.ratslam import TOLERANCE_M, relaxing
 from hybridmap.config.backends import BackendsConfig, RelaxationConfig
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph

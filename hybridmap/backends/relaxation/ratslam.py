@@ -6,23 +6,25 @@ iterations. `relaxation-gtsam-lm` combines them: relaxation while driving, least
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.backends.base import Outcome, SolveStatus
+from hybridmap.backends.base import Outcome, Solver, SolveStatus
 from hybridmap.backends.driver import Driver, Works
 from hybridmap.backends.gtsam.initial import best_start
 from hybridmap.backends.objective import chi2, gate_of, truncated_cost
-from hybridmap.backends.relaxation.relaxing import TOLERANCE_M, relaxing, swept
 from hybridmap.compiled import compiled
 from hybridmap.config.backends import BackendsConfig, RelaxationConfig
 from hybridmap.geometry import Array, between, compose, wrap_angle
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
 
+TOLERANCE_M = 1e-6
+"""A sweep that moves no node by more (m; 1 rad counts as 1 m) ends the relaxation: far below the noise of any edge."""
 ROBUST_SCALE_M, ROBUST_SCALE_RAD = 0.3, 0.1
 """`relaxation-robust`: errors of position and heading at which a loop's correction is a quarter of the plain one. A
 false loop that is off by a metre then pulls with less than a hundredth."""
@@ -146,6 +148,31 @@ def _sweep(
 
 _REJECTED = 0.25  # weight of a loop whose residual is the scale itself
 _TOLERANCE = 1e-9  # relative decrease of the cost at which least squares is done: the start must not show in the result
+
+Rule = Callable[[PoseGraph, Array, int], Outcome]
+"""At most so many sweeps over a graph that has edges, from poses (N, 3)."""
+
+
+def swept(rule: Rule, sweeps: int) -> Solver:
+    """Make a solver that runs up to this many sweeps of a relaxation rule; poses that grow without bound are refused."""
+
+    def solve(graph: PoseGraph, start: Array) -> Outcome:
+        if graph.n_edges == 0:
+            return Outcome(start, SolveStatus.CONVERGED, "nothing to relax", 0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            outcome = rule(graph, start, sweeps)
+        if np.isfinite(outcome.poses).all():
+            return outcome
+        return Outcome(start, SolveStatus.DIVERGED, "poses were not finite; kept those before", outcome.iterations)
+
+    return solve
+
+
+def relaxing(name: str, config: BackendsConfig, rule: Rule) -> Driver:
+    """A back-end that runs sweeps of `rule` whenever the graph grows; the end of the drive is one more such update."""
+    follow = swept(rule, config.relaxation.sweeps_per_node)
+    solve = swept(rule, config.relaxation.solve_sweeps)
+    return Driver(name, config, solve, follow=follow, last=follow, works=Works.ON_GROWTH)
 
 
 def plain(name: str, config: BackendsConfig) -> Driver:

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, compose_relative, inverse
 from hybridmap.streams.laser import Laser
-from hybridmap.vision.laser.cloud import Cloud, LikelihoodField, build_field, merged_at
-from hybridmap.vision.laser.scene import CELL_M, Scene
+from hybridmap.vision.laser.cloud import CELL_M, Cloud, LikelihoodField, Scene, build_field, merged_at
 
 SEARCH_M = 4.5
 """Largest distance of starts from the anchor of a submap, m."""

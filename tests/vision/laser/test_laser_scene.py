@@ -9,9 +9,8 @@ from hybridmap.config import Config
 from hybridmap.geometry import between
 from hybridmap.mapper import Mapper
 from hybridmap.simulation import SimulatedStream
-from hybridmap.vision.laser.cloud import build_field, cloud_of_scan, merged, merged_at
+from hybridmap.vision.laser.cloud import INDOORS, SCANS, Scale, Scene, build_field, cloud_of_scan, merged, merged_at
 from hybridmap.vision.laser.front_end import LaserFrontEnd
-from hybridmap.vision.laser.scene import INDOORS, SCANS, Scale, Scene
 from tests.vision.laser.laser_worlds import LASER, box, cast, ring, room
 
 FIELD = np.array(box(-21, -22, 23, 21))
