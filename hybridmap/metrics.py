@@ -58,7 +58,7 @@ FIGURES: dict[str, tuple[str, str]] = {
     "clock_offset": ("s", "{said}"),
     "clock_offset_sigma": ("s", "its standard deviation"),
     "clock_offset_used": ("s", "what of it the map was corrected by"),
-    "largest_correction": ("m", "largest shift of a node at one closure"),
+    "largest_correction": ("m", "largest shift of a node when the map was corrected"),
     "travel": ("m", "path length by odometry"),
     "duration": ("s", "length of the recording"),
     "unobserved": ("m", "{free}"),

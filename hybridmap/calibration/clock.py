@@ -30,7 +30,9 @@ SIGMAS = 3.0
 """Factor on the standard deviation that the fit gives. Over 70 windows of 20 and 30 m of two robots the estimates scatter 1.2
 to 3 times as much: the delay of a serial line is not constant."""
 SIGMA_MAX_S = 0.03
-"""Largest standard deviation (with that factor) of an offset that is said to be known, s."""
+"""Largest standard deviation (with that factor) of an offset that is said to be known, s; of a large one, more."""
+SIGMA_SHARE = 0.25
+"""Largest standard deviation of a large offset, as a share of it: to correct such an offset is far better than to leave it."""
 RIVAL_MIN = 15.0
 """Least cost, in nats, of every offset further than `RIVAL_S` from the best one. A single turn is no evidence."""
 RIVAL_S = 0.1
@@ -59,8 +61,8 @@ class ClockState(StrEnum):
     """Whether the offset is known, or why not."""
 
     KNOWN = "known"
-    OPEN = "too little turning"
-    SPARSE = "too few odometry messages"
+    OPEN = "the drive tells too little (few turns, few registrations, or too short)"
+    SPARSE = "odometry messages are too far apart"
     TIME_BASE = "another time base"
 
 
@@ -184,7 +186,7 @@ def offset_of(headings: Headings, turns: Turns, *, wide: bool = False) -> ClockO
     found = fit.best(_grid(TRANSPORT_S, STEP_S))
     if found is not None:
         sigma_s = hypot(SIGMAS * found.sigma_s, GAP_SHARE * kept_gap_s)
-        if found.rival >= RIVAL_MIN and sigma_s <= SIGMA_MAX_S:
+        if found.rival >= RIVAL_MIN and sigma_s <= max(SIGMA_MAX_S, SIGMA_SHARE * abs(found.offset_s)):
             return ClockOffset(ClockState.KNOWN, found.offset_s, sigma_s)
     far = fit.best(_grid(TIME_BASE_S, COARSE_STEP_S)) if wide else None
     if far is not None and abs(far.offset_s) > TRANSPORT_S and far.rival >= RIVAL_MIN:

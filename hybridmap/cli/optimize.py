@@ -27,7 +27,9 @@ def optimize(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Optimise a pose graph. Shows chi2 before and after, status, iterations, CPU seconds, verdict and proof of optimality.
+    """Optimise a pose graph. Shows chi2 before and after, status, iterations, CPU seconds, proof of optimality, and a verdict.
+
+    The verdict is on the graph alone: what a drive knew beside it, such as lost messages, is in the verdict of `map`.
 
     If the back-end fails, diverges or finds the graph singular, no file is written and the exit code is 1.
     """

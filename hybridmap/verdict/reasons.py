@@ -47,7 +47,11 @@ KINDS = {
     "back-end failed": Kind(Verdict.FAILED, "1", "{name}; the map is dead reckoning"),
     "no map": Kind(Verdict.FAILED, "1", "{name} gave no map: chi2 is {value:.4g} at the poses that it began with"),
     "other way": Kind(Verdict.DOUBTFUL, "1", "{name} could not go on as it should, and its map was made another way"),
-    "dead reckoning": Kind(Verdict.DOUBTFUL, "1", "the map is dead reckoning, which uses no loop; there are {value:.0f}"),
+    "dead reckoning": Kind(
+        Verdict.DOUBTFUL,
+        "1",
+        "the map is dead reckoning: no loop and no registration is in it ({value:.0f} loops were measured)",
+    ),
     "loops refused": Kind(
         Verdict.DOUBTFUL,
         "m",

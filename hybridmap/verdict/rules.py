@@ -15,6 +15,7 @@ from hybridmap.backends.judging.strain import bend_of, largest_bend, optimum
 from hybridmap.backends.objective import SLACK, squared_norms, unit_variance
 from hybridmap.calibration.clock import MATTERS_S, TRANSPORT_S, ClockState
 from hybridmap.graph.agreement import BOUND
+from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.paths import chain_of
 from hybridmap.verdict.facts import Facts
 from hybridmap.verdict.reasons import Reason, Verdict
@@ -59,8 +60,8 @@ def no_map(facts: Facts) -> Iterable[Reason]:
         return [facts.reason("no map", report.chi2, report.chi2_initial, name=f"{facts.primary} ({report.status})")]
     if report.status not in AS_MEANT:
         return [facts.reason("other way", name=f"{facts.primary} ({report.status})")]
-    if facts.primary == ODOMETRY:
-        return [facts.reason("dead reckoning", len(facts.graph.edge_ids[facts.graph.is_loop]), 0, name=facts.primary)]
+    if facts.primary == ODOMETRY or not np.any(facts.in_map & (facts.graph.kinds != EdgeKind.ODOMETRY)):
+        return [facts.reason("dead reckoning", int(np.count_nonzero(facts.graph.is_loop)), 0, name=facts.primary)]
     moved = not np.array_equal(solution.poses, facts.graph.initial)
     if not moved and report.chi2 > facts.graph.n_edges:
         return [facts.reason("no map", report.chi2, facts.graph.n_edges, name=f"{facts.primary} (returned its start)")]
