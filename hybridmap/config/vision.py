@@ -137,7 +137,7 @@ class LaserConfig(Section):
 
 
 class RegistrationConfig(Section):
-    """Registration of the depth of two RGB-D frames."""
+    """Noise of the depth by which two RGB-D frames are registered."""
 
     depth_sigma: float = Field(default=0.003, ge=1e-6, le=10)
     """Noise of depth: standard deviation in m at 1 m; it grows with the square of the distance.

@@ -327,7 +327,7 @@ class Reanchoring:
         return self._activity_at_node[node]
 
     def recalibrate(self, node: int, delta_node_robot: Array) -> None:
-        """Move the cells towards the activity stored at a matched node, shifted by the pose (3,) of the robot in its frame."""
+        """Set the cells by the share `weight` to the activity of a node, moved by the robot's pose (3,) in its frame."""
         if self.weight == 0.0:
             return
         before = self.pose_odom_robot

@@ -55,7 +55,7 @@ def world_of(source: str | Path) -> str | None:
 
 
 def kind_of(path: Path) -> str:
-    """The kind of a source (bag, folder, table), by its name and content.
+    """The kind of a source by its name and content: ROS 1 bag, ROS 2 bag, TUM RGB-D folder or velocity table.
 
     Raises:
         StreamError: the path does not exist, is empty, or is of no readable kind.
