@@ -202,7 +202,7 @@ def _odometry_sigmas(experiences: ExperienceMap) -> dict[int, float]:
     odometry: dict[int, RelativePose] = {}
     out: dict[int, float] = {}
     for edge in experiences.edges:
-        if edge.relative is None or edge.source != edge.target - 1 or _is_break(edge):
+        if edge.relative is None or edge.source != edge.target - 1 or edge.spans_kidnapping:
             continue
         if edge.kind is EdgeKind.ODOMETRY:
             odometry[edge.target] = edge.relative
@@ -211,11 +211,6 @@ def _odometry_sigmas(experiences: ExperienceMap) -> dict[int, float]:
             error = log(between(wheels.delta, edge.relative.delta))
             out[edge.target] = float(np.sqrt(error @ np.linalg.solve(wheels.covariance, error)))
     return out
-
-
-def _is_break(edge: Edge) -> bool:
-    """Whether an edge belongs to a kidnapping that is known."""
-    return edge.kidnapped_m is not None or edge.lack is Lack.KIDNAPPED
 
 
 def _oddest(asked: Mapping[int, Sequence[Check]]) -> set[int]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from hybridmap.config.mapping import EdgesConfig
 from hybridmap.geometry import Array, RelativePose, between, log
+from hybridmap.graph.agreement import BOUND
 from hybridmap.graph.paths import odometry_covariance
 
 WINDOWS_M = (5.0, 10.0, 20.0, 50.0)
@@ -27,8 +28,6 @@ them do, residuals do not show how much they err, and a registration's heading i
 GOOD_M = 0.1
 """So is its translation if the two differ by less than this, m per root metre. Wheels whose scale is wrong by 3 % differ by
 twice that, and a registration knows better."""
-AGREEING = 11.3
-"""Squared distance of registration and wheels, over its covariance, that one in a hundred right pairs exceeds."""
 MISSING_SHARE = 0.1
 """A stretch counts if at most this share of its way has no registration; the two headings are taken to agree there."""
 ROBUST = 1.4826
@@ -111,7 +110,7 @@ class WheelNoise:
             in_all = self.learnt.translation_m < GOOD_M
             covariance = covariance + (wheels.covariance if in_all else np.diag([0.0, 0.0, wheels.covariance[2, 2]]))
         squared = _squared(RelativePose(registration.delta, covariance), wheels)
-        return RelativePose(registration.delta, covariance * max(1.0, squared / AGREEING) ** 2)
+        return RelativePose(registration.delta, covariance * max(1.0, squared / BOUND) ** 2)
 
     def drive(self, travel_m: float, turn_rad: float, delta: Array) -> bool:
         """Add a step between two nodes; returns whether the covariances of earlier edges must change.
@@ -169,7 +168,7 @@ class WheelNoise:
             for step in self._steps
             if step.registration is not None
         ]
-        return float(np.mean(np.array(squared) > AGREEING))
+        return float(np.mean(np.array(squared) > BOUND))
 
 
 @dataclass(slots=True)

@@ -7,8 +7,9 @@ import pytest
 
 from hybridmap.config.mapping import EdgesConfig
 from hybridmap.geometry import RelativePose, between, log
+from hybridmap.graph.agreement import BOUND
 from hybridmap.graph.paths import odometry_covariance
-from hybridmap.wheel_noise import AGREEING, FIRST_M, WheelNoise
+from hybridmap.wheel_noise import FIRST_M, WheelNoise
 from tests.narrowing import known
 
 CONFIG = EdgesConfig(rotation_deg_per_sqrt_m=2.0, rotation_floor_deg=0.3, rotation_per_turn=0.1, translation_per_sqrt_m=0.05)
@@ -86,6 +87,6 @@ def test_a_registration_that_contradicts_good_wheels_hardly_counts():
     for yaw_deg in (5.0, 10.0):
         wrong = noise.beside(RelativePose(TRUE + np.array([0.0, 0.0, np.deg2rad(yaw_deg)]), SURE), wheels)
         error = log(between(wheels.delta, wrong.delta))
-        assert error @ np.linalg.solve(wheels.covariance + wrong.covariance, error) < AGREEING
+        assert error @ np.linalg.solve(wheels.covariance + wrong.covariance, error) < BOUND
         gain = wheels.covariance[2, 2] / (wheels.covariance[2, 2] + wrong.covariance[2, 2])
         assert gain * yaw_deg < 0.1

@@ -95,6 +95,8 @@ def compare(
     if as_json:
         _emit(opened, ways, rows, verdicts, judged.metrics)
     else:
+        for remark in opened.head.get("remarks", ()):
+            typer.echo(f"note: {remark}")
         _show(cells, rows, f"{source}: {opened.graph.n_nodes} nodes, {opened.graph.n_edges} edges; {_done(opened, ways)}")
 
 

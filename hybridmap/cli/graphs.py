@@ -55,8 +55,14 @@ def open_graph(path: Path) -> GraphSource:
     graph = experiences.pose_graph()
     if graph.n_edges == 0:
         raise GraphError(f"{path}: the map has no accepted edge; there is nothing to optimise")
-    head = _head(path, graph) | {"graph_hash": graph_hash(experiences)}
+    head = _head(path, graph) | {"graph_hash": graph_hash(experiences), "remarks": _doubts(SessionFolder(path))}
     return GraphSource(path, graph, is_session=True, start="dead reckoning", head=head, kidnapped=kidnappings(experiences))
+
+
+def _doubts(folder: SessionFolder) -> list[str]:
+    """What a verdict on the graph alone does not know: that the verdict on the drive was a bad one."""
+    verdict = folder.read_metrics().head.get("verdict", "trusted") if folder.metrics_json.is_file() else "trusted"
+    return [] if verdict == "trusted" else [f"the session is {verdict}; a verdict on its graph alone does not know why"]
 
 
 def settings_of(source: GraphSource, config: str | None, setting: list[str] | None) -> BackendsConfig:

@@ -34,7 +34,12 @@ def inspect(
         list[str] | None,
         typer.Option("--set", help="KEY=VALUE, e.g. sensors.sync_tolerance_s=0.05. Keys: docs/configuration.md."),
     ] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit code 3 if messages of the recording were lost.")] = False,
+    strict: Annotated[
+        bool,
+        typer.Option(
+            "--strict", help="Exit code 3 if messages are missing. Damage inside a scan or picture shows only in `map`."
+        ),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
     """Show what a recording holds (topics, rates in Hz, spans in s), what mapping would use, and what is missing or damaged."""
@@ -42,6 +47,7 @@ def inspect(
     from hybridmap.config import Config
     from hybridmap.metrics import to_json
     from hybridmap.streams.inspection import inspect_source
+    from hybridmap.streams.open import world_of
 
     topics = sensor_settings(
         source,
@@ -53,7 +59,7 @@ def inspect(
         odometry_file=odometry_file,
     )
     overrides = {**topics, **parse_settings(setting)}
-    found = inspect_source(source, Config.load(config, overrides))
+    found = inspect_source(source, Config.load(config or world_of(source), overrides))
     clock = _clock(found, config, overrides)
     if as_json:
         sys.stdout.write(to_json(_head(found, clock), _metrics(found, clock)) + "\n")

@@ -279,6 +279,11 @@ class Edge:
         """Make an edge whose status follows from its checks and its lack."""
         return cls(source, target, kind, verdict(checks, lack), relative, checks=tuple(checks), lack=lack, **more)
 
+    @property
+    def spans_kidnapping(self) -> bool:
+        """Whether the robot was kidnapped between the two nodes, as far as was found."""
+        return self.kidnapped_m is not None or self.lack is Lack.KIDNAPPED
+
     def settled(self, *more: Check, lack: Lack | None = None) -> Self:
         """The same edge with the checks `more` added and a new lack; its status follows from these."""
         checks = (*self.checks, *more)

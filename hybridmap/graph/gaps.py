@@ -33,8 +33,9 @@ class Kidnapping:
     search_m: float
 
     def __str__(self) -> str:
-        found = f"found {self.moved_m:.1f} m from where the odometry has it, {self.search_m:.1f} m on, at node {self.found_at}"
-        return f"kidnapped between nodes {self.before} and {self.after}: {found}; no error is taken of the way between"
+        put_down = f"put down {self.moved_m:.1f} m from where the odometry has it"
+        found = f"localised {self.search_m:.1f} m later, at node {self.found_at}"
+        return f"kidnapped between nodes {self.before} and {self.after}: {put_down}; {found}; no error is taken between the two"
 
 
 def kidnappings(experiences: ExperienceMap) -> tuple[Kidnapping, ...]:

@@ -27,6 +27,7 @@ ODOMETRY_RATE_HZ = 30.0
 """Odometry messages a second."""
 _START_NS = 1_700_000_000 * NS_PER_S
 _WHEELS, _CAMERA, _LASER = range(3)
+_CARRIED_SHARE = 0.95  # of the distance that was asked for; a shorter carry is said
 
 
 class SimulatedStream:
@@ -106,6 +107,13 @@ class SimulatedStream:
         """The drive with its kidnapping; None if the robot is not kidnapped."""
         return self._carry
 
+    def _remarks(self) -> list[str]:
+        """What the user asked for and the world cannot give."""
+        wanted_m = self._config.carried_m
+        if self._carry is None or wanted_m is None or self._carry.distance_m >= _CARRIED_SHARE * wanted_m:
+            return []
+        return [f"carried {self._carry.distance_m:.1f} m, not {wanted_m:g} m: no visited place is farther away"]
+
     @property
     def expected_observations(self) -> int:
         """Number of camera frames and laser scans that the stream will yield."""
@@ -118,7 +126,7 @@ class SimulatedStream:
 
     def __iter__(self) -> Iterator[Sample]:
         """Yield odometry, frames and scans by stamp; at equal stamps in this order."""
-        self._report = StreamReport()
+        self._report = StreamReport(remarks=self._remarks())
         observations = self._observations()
         waiting = next(observations, None)
         for stamp, pose in zip(self._odometry.stamps_ns, self._odometry.poses, strict=True):

@@ -98,7 +98,7 @@ class ScanDecoder:
 
     def _bearings(self, message: Any) -> Array:
         step = np.float64(np.float32(message.angle_increment))
-        with np.errstate(invalid="ignore"):  # a step of Inf gives NaN, which no bearing is near
+        with np.errstate(invalid="ignore"):
             bearings = np.float64(np.float32(message.angle_min)) + np.arange(len(message.ranges)) * step
         return -bearings if self._upside_down else bearings
 
@@ -120,6 +120,9 @@ class ScanDecoder:
         self.counts["scans with other beams"] = self.counts.get("scans with other beams", 0) + 1
         out = np.full(len(self.laser.bearings_rad), np.nan, dtype=np.float32)
         bearings = self._bearings(message)
+        if not np.isfinite(bearings).all():
+            steps = f"from {message.angle_min} in steps of {message.angle_increment} rad"
+            raise StreamError(f"{self._what}: a scan has beams {steps}; expected finite angles")
         if len(bearings) < 2:
             return out
         order = np.argsort(bearings)

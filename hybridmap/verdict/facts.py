@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hybridmap.backends.base import Solution
 from hybridmap.calibration.clock import ClockOffset
 from hybridmap.geometry import Array
-from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.gaps import free_lengths, kidnappings
 from hybridmap.graph.pose_graph import PoseGraph
@@ -67,8 +67,18 @@ class Facts:
         return cls(graph=meant, in_map=kept, plausible=~kept, solution=solution, primary=solution.report.backend)
 
     @classmethod
-    def of_drive(cls, experiences: ExperienceMap, solution: Solution | None, primary: str, **more: Any) -> Facts:
-        """The facts of a drive; `more` are attributes that the map does not tell."""
+    def of_drive(
+        cls,
+        experiences: ExperienceMap,
+        solution: Solution | None,
+        primary: str,
+        *,
+        failure: str = "",
+        lost_since: int | None = None,
+        clock: ClockOffset | None = None,
+        lost: Mapping[str, tuple[int, int]] | None = None,
+    ) -> Facts:
+        """The facts of a drive; the arguments beside the map are attributes of the same name."""
         edges = experiences.edges
         chosen = [
             number
@@ -87,11 +97,17 @@ class Facts:
             solution=solution,
             primary=primary,
             stamps_ns=np.array([node.stamp_ns for node in experiences.nodes], dtype=np.int64),
-            wheels=_graph_of(experiences, [number for number, edge in enumerate(edges) if _driven(edge)]),
+            wheels=_graph_of(
+                experiences,
+                [n for n, edge in enumerate(edges) if edge.kind is EdgeKind.ODOMETRY and not edge.spans_kidnapping],
+            ),
             driven=True,
             free_m=free_lengths(experiences),
             breaks=tuple(sorted({edge.target for edge in edges if edge.broken_by} - found)),
-            **more,
+            failure=failure,
+            lost_since=lost_since,
+            clock=clock,
+            lost=lost or {},
         )
 
     @property
@@ -110,11 +126,6 @@ class Facts:
         if node is not None and stamps is not None:
             more |= {"stamp_ns": int(stamps[node]), "start_ns": int(stamps[0])}
         return Reason(kind, float(value), float(limit), **more)
-
-
-def _driven(edge: Edge) -> bool:
-    """Whether an edge is of odometry, and not across a kidnapping."""
-    return edge.kind is EdgeKind.ODOMETRY and edge.lack is not Lack.KIDNAPPED
 
 
 def _may_be_right(edge: Edge) -> bool:

@@ -46,7 +46,7 @@ class Kind:
 KINDS = {
     "back-end failed": Kind(Verdict.FAILED, "1", "{name}; the map is dead reckoning"),
     "no map": Kind(Verdict.FAILED, "1", "{name} gave no map: chi2 is {value:.4g} at the poses that it began with"),
-    "other way": Kind(Verdict.DOUBTFUL, "1", "{name} could not go on as it should, and its map was made another way"),
+    "fell back": Kind(Verdict.DOUBTFUL, "1", "{name} could not go on as it should, and its map was made another way"),
     "dead reckoning": Kind(
         Verdict.DOUBTFUL,
         "1",
@@ -90,8 +90,8 @@ KINDS = {
         "s",
         "views are stamped {value:+.2f} s from the odometry (at most {limit:.2f} s), which was not corrected",
     ),
-    "nodes hang": Kind(Verdict.DOUBTFUL, "1", "{value:.0f} nodes are joined to the rest by edges that have no weight"),
-    "nothing held": Kind(
+    "nodes without weight": Kind(Verdict.DOUBTFUL, "1", "{value:.0f} nodes are joined to the rest by edges without weight"),
+    "motion unobserved": Kind(
         Verdict.DOUBTFUL,
         "m",
         "on {value:.1f} m nothing seen held the motion and no loop spans it: the map rests on odometry",

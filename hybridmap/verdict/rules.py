@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.base import ODOMETRY, SolveStatus
+from hybridmap.backends.judging.breaks import SAME_DEG, SAME_M
 from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.judging.rivals import Rival, rivals, spans
 from hybridmap.backends.judging.strain import bend_of, largest_bend, optimum
@@ -24,9 +25,7 @@ TOGETHER = 4
 """Fewest refused loops that speak against a map, as many as find a lost robot; one more for each doubling of the number of
 groups, since of many false groups some fall where the map has nothing against them."""
 AS_MEANT = (SolveStatus.CONVERGED, SolveStatus.WAITING, SolveStatus.MAX_ITERATIONS)
-"""Ends of a solver that was not disturbed. Whether it is at an optimum is asked apart: a relaxation has a number of sweeps."""
-MOVES_M, MOVES_RAD = 0.1, math.radians(2.0)
-"""A group of refused loops that would move the map by less than both says nothing that matters: a place is found within it."""
+"""Statuses of a solver that ended as it should. Whether it is at an optimum is asked apart, as a relaxation may end before."""
 BENT_MAX = 10.0
 """Standard deviations by which a map may bend a stretch of the chain of motion. Right maps stay below 6; wrong loops, a
 kidnapping or a bent odometry give more than 14."""
@@ -59,7 +58,7 @@ def no_map(facts: Facts) -> Iterable[Reason]:
     if not report.status.has_map:
         return [facts.reason("no map", report.chi2, report.chi2_initial, name=f"{facts.primary} ({report.status})")]
     if report.status not in AS_MEANT:
-        return [facts.reason("other way", name=f"{facts.primary} ({report.status})")]
+        return [facts.reason("fell back", name=f"{facts.primary} ({report.status})")]
     if facts.primary == ODOMETRY or not np.any(facts.in_map & (facts.graph.kinds != EdgeKind.ODOMETRY)):
         return [facts.reason("dead reckoning", int(np.count_nonzero(facts.graph.is_loop)), 0, name=facts.primary)]
     moved = not np.array_equal(solution.poses, facts.graph.initial)
@@ -83,14 +82,14 @@ def refused_together(facts: Facts) -> Iterable[Reason]:
         groups = (tuple(edge for group in groups for edge in group),)
     least = TOGETHER + math.log2(max(len(groups), 1))
     return [
-        facts.reason("loops refused", one.shift_m, MOVES_M, node=one.node, count=one.spanning, against=one.against)
+        facts.reason("loops refused", one.shift_m, SAME_M, node=one.node, count=one.spanning, against=one.against)
         for one in rivals(graph, poses, groups, facts.kept)
         if _moves(one) and one.spanning >= max(least, one.against)
     ]
 
 
 def _moves(rival: Rival) -> bool:
-    return rival.shift_m > MOVES_M or rival.turn_rad > MOVES_RAD
+    return rival.shift_m > SAME_M or rival.turn_rad > math.radians(SAME_DEG)
 
 
 def bent(facts: Facts) -> Iterable[Reason]:
@@ -169,16 +168,16 @@ def clocks_apart(facts: Facts) -> Iterable[Reason]:
 
 
 def not_held(facts: Facts) -> Iterable[Reason]:
-    """Long ways on which odometry alone knows the motion, and which no loop of the map spans; nodes that hang."""
+    """Long ways on which odometry alone knows the motion, and which no loop of the map spans; nodes without weight."""
     report = None if facts.solution is None else facts.solution.report
     if report is not None and report.hanging_nodes:
-        yield facts.reason("nodes hang", report.hanging_nodes, 0)
+        yield facts.reason("nodes without weight", report.hanging_nodes, 0)
     if facts.free_m is None:
         return
     for run in _runs((facts.free_m > 0.0) & (spans(facts.graph, facts.kept) == 0)):
         length_m = float(facts.free_m[run].sum())
         if length_m > FREE_MAX_M:
-            yield facts.reason("nothing held", length_m, FREE_MAX_M, node=int(run[0]) - 1, until=int(run[-1]))
+            yield facts.reason("motion unobserved", length_m, FREE_MAX_M, node=int(run[0]) - 1, until=int(run[-1]))
 
 
 def broken(facts: Facts) -> Iterable[Reason]:

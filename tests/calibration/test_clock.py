@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from hybridmap.calibration import clock
 from hybridmap.calibration.clock import ClockOffset, ClockState, Headings, Turns, offset_of
 from hybridmap.calibration.sessions import read_drive
 from hybridmap.config import Config
@@ -63,6 +64,14 @@ def test_a_drive_without_changes_of_its_turn_rate_tells_nothing(shape):
 
 def test_sparse_odometry_tells_nothing():
     assert told_by(drive(np.random.default_rng(1)), 0.1, every=6) == ClockOffset(ClockState.SPARSE)
+
+
+def test_a_large_offset_may_be_less_certain_than_a_small_one(monkeypatch):
+    monkeypatch.setattr(clock, "SIGMA_MAX_S", 0.0)
+    late = told_by(drive(np.random.default_rng(1)), 0.15)
+    assert late.known
+    assert late.offset_s == pytest.approx(0.15, abs=0.015)
+    assert told_by(drive(np.random.default_rng(1)), 0.0).state is ClockState.OPEN
 
 
 def test_another_time_base_is_told_from_a_delay():

@@ -142,6 +142,13 @@ def test_a_session_is_shown_in_both_ways_with_its_errors(monkeypatch, capsys, se
     assert ">nan<" not in page
 
 
+def test_what_the_verdict_on_a_graph_does_not_know_is_said(tmp_path):
+    folder = write_session(tmp_path / "session", ring_map(2.2))
+    assert open_graph(folder.path).head["remarks"] == []
+    folder.write_metrics({**folder.read_metrics().head, "verdict": "doubtful"}, folder.read_metrics().metrics)
+    assert "doubtful" in open_graph(folder.path).head["remarks"][0]
+
+
 def test_what_only_a_session_has_is_refused_for_a_file(monkeypatch, capsys, square, tmp_path):
     code, printed, error = run(monkeypatch, capsys, "compare", square, "--reference", tmp_path / "truth.tum")
     assert code == 2

@@ -118,6 +118,11 @@ def test_a_velocity_table(tmp_path):
     assert "nothing for 7.00 s, 2.0 s after its beginning" in text
 
 
+@pytest.mark.parametrize("world", ["lab", "campus"])
+def test_a_world_can_be_mapped_with_its_own_sensors(world):
+    assert json.loads(_inspect(world, "--json"))["mappable"]
+
+
 def test_a_world():
     text = _inspect("office")
     assert "simulated world" in text

@@ -34,7 +34,7 @@ def test_a_carry_is_what_was_hung_in_the_place_of_a_broken_edge():
         5.0,
         1.0,
     )
-    assert "between nodes 2 and 3: found 5.0 m from where the odometry has it, 1.0 m on, at node 5" in str(one)
+    assert "between nodes 2 and 3: put down 5.0 m from where the odometry has it; localised 1.0 m later, at node 5" in str(one)
 
 
 def test_what_was_taken_back_or_is_of_another_kind_is_no_carry():

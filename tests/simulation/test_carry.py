@@ -46,7 +46,13 @@ def test_the_wheels_stand_still_and_nothing_is_seen_on_the_way():
 
 
 def test_where_the_world_is_smaller_it_is_carried_as_far_as_there_is_a_known_place():
-    assert 5.0 < stream("lab").carry.distance_m < 10.0
+    carried = stream("lab")
+    assert 5.0 < carried.carry.distance_m < 10.0
+    next(iter(carried))
+    assert any("7.3 m" in remark for remark in carried.report.remarks)
+    enough = stream("office")
+    next(iter(enough))
+    assert enough.report.remarks == []
 
 
 @pytest.mark.parametrize("world", ["lab", "office"])

@@ -435,6 +435,17 @@ def test_a_part_that_no_recording_has(tmp_path, seconds):
             open_stream(path, Config(), **part)
 
 
+def test_a_later_scan_with_beams_at_no_angle_is_damaged(tmp_path):
+    recording = laser_drive()
+    scans = [message for topic, _, message in recording.messages if topic == "/scan"]
+    scans[2].angle_increment = float("nan")
+    path = recording.write(tmp_path / "a.mcap")
+    _refuses(path, "/scan", "steps of nan rad")
+    stream = open_stream(path, Config(), skip_damaged=True)
+    assert sum(isinstance(sample, LaserScan) for sample in stream) == len(scans) - 1
+    assert stream.report.lost["/scan"] == (1, len(scans))
+
+
 @pytest.mark.parametrize(("beams", "step"), [(200_000, 1e-5), (5, float("inf")), (5, float("nan")), (5, 0.0), (1, 0.1)])
 def test_a_scan_that_no_laser_takes(tmp_path, beams, step):
     recording = laser_drive()

@@ -26,14 +26,13 @@ class Bend:
     Attributes:
         first, last: the nodes at its ends.
         sigmas: distance between the map and the chain, in standard deviations of the chain.
-        apart_m, apart_rad: the same in m and rad.
+        apart_m: the same in m.
     """
 
     first: int
     last: int
     sigmas: float
     apart_m: float
-    apart_rad: float
 
 
 def largest_bend(graph: PoseGraph, poses: Array, variance: float = 1.0) -> Bend | None:
@@ -73,8 +72,8 @@ def _most_bent(chain: Chain, poses: Array, first: NDArray[np.int64], last: NDArr
     error = log(between(ways.delta[known], between(poses[first], poses[last])))
     squared = np.einsum("ei,ei->e", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
     worst = int(np.argmax(squared))
-    x, y, turn = error[worst]
-    return Bend(int(first[worst]), int(last[worst]), math.sqrt(squared[worst]), math.hypot(x, y), abs(float(turn)))
+    apart_m = math.hypot(*error[worst, :2])
+    return Bend(int(first[worst]), int(last[worst]), math.sqrt(squared[worst]), apart_m)
 
 
 def optimum(graph: PoseGraph, poses: Array) -> Array:
