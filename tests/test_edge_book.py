@@ -86,6 +86,24 @@ def test_wheels_that_prove_good_get_back_what_a_registration_dropped_and_all_edg
     assert known(wrong.relative).covariance[2, 2] > 100.0 * COVARIANCE[2, 2]
 
 
+class Lenient:
+    """No registration overrules the odometry."""
+
+    def overrules(self, registration: RelativePose, odometry: RelativePose) -> bool:
+        return False
+
+
+def test_odometry_that_nothing_contradicts_any_more_stays_even_if_the_wheels_turn_out_bad():
+    experiences = ExperienceMap()
+    book = EdgeBook(experiences, EdgesConfig())
+    driven(book, experiences, 102)
+    assert book.wheels.trusted
+    bent = np.column_stack([np.arange(102.0), np.zeros(102), np.where(np.arange(102) % 2, 0.2, 0.0).cumsum()])
+    book.retime(bent, Lenient())
+    assert not book.wheels.trusted
+    assert odometry_into(experiences, 5).status is Status.ACCEPTED
+
+
 def test_an_edge_across_a_kidnapping_does_not_come_back():
     experiences = ExperienceMap()
     book = EdgeBook(experiences, EdgesConfig())

@@ -74,6 +74,14 @@ def test_a_large_offset_may_be_less_certain_than_a_small_one(monkeypatch):
     assert told_by(drive(np.random.default_rng(1)), 0.0).state is ClockState.OPEN
 
 
+def test_an_offset_hardly_better_than_another_is_not_known(monkeypatch):
+    one = drive(np.random.default_rng(1))
+    assert told_by(one, 0.15).state is ClockState.KNOWN
+    monkeypatch.setattr(clock, "RIVAL_MIN", 1e9)  # nats: no drive tells so much
+    assert told_by(one, 0.15).state is ClockState.OPEN
+    assert told_by(one, 3.0, wide=True).state is ClockState.OPEN
+
+
 def test_another_time_base_is_told_from_a_delay():
     found = told_by(drive(np.random.default_rng(1)), 3.0, wide=True)
     assert found.state is ClockState.TIME_BASE
@@ -126,9 +134,12 @@ def mapped(late_s: float, **settings: object) -> Mapper:
     return mapper
 
 
-def odometry_errors(mapper: Mapper) -> tuple[float, int]:
-    """Largest heading error of the odometry edges against the registrations, rad, and how many edges were dropped."""
-    edges = mapper.map.edges
+def odometry_errors(mapper: Mapper, first: int = 0, last: int = 10**9) -> tuple[float, int]:
+    """Largest heading error of the odometry edges against the registrations, rad, and how many edges were dropped.
+
+    Only edges into the nodes from `first` to `last` count.
+    """
+    edges = [edge for edge in mapper.map.edges if first <= edge.target <= last]
     own = {edge.target: edge for edge in edges if edge.kind is EdgeKind.ODOMETRY}
     seen = [edge for edge in edges if edge.kind is EdgeKind.REGISTRATION and edge.status is Status.ACCEPTED]
     off = [abs(known(edge.relative).delta[2] - known(own[edge.target].relative).delta[2]) for edge in seen]
@@ -147,6 +158,21 @@ def test_the_mapper_finds_the_offset_and_corrects_the_whole_drive(late_s):
     assert given.calibration.clock.offset.used_s == 0.0
     assert given.calibration.clock.offset.left_s == pytest.approx(late_s, abs=0.015)
     assert odometry_errors(given)[0] > 0.15
+
+
+@pytest.mark.parametrize("late_s", [0.2, -0.2])
+def test_once_the_offset_is_known_odometry_is_corrected_while_driving(late_s):
+    one = LateRoom(laps=3.0, late_s=late_s)
+    mapper = Mapper(Config.load("laser", {"nodes.distance_m": 0.3, "backends.names": ["gtsam-lm"]}), one.rig)
+    known_at = None
+    for sample in one:
+        mapper.add(sample)
+        if known_at is None and mapper.calibration.clock.offset.known:
+            known_at = len(mapper.map) - 1
+    assert known_at is not None
+    assert known_at < len(mapper.map) - 10  # among the nodes after it are turns on the spot
+    assert odometry_errors(mapper, last=known_at)[0] > 0.15
+    assert odometry_errors(mapper, first=known_at + 1) < (0.06, 1)
 
 
 def test_a_delay_that_the_user_gives_is_taken_and_only_the_rest_is_estimated():
