@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from hybridmap.graph.edges import Check, at_least, at_most
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+from hybridmap.graph.edges import Check, Need, at_least, at_most
 
 FIT_MIN = "vision.laser.probes.fit_min"
 """The setting of the limit of `fit`."""
@@ -26,6 +30,8 @@ AMBIGUITY_MAX = 0.9
 """Largest share of the likelihood that is left after a shift along the direction that the walls hold least."""
 VIOLATION_MAX = 0.15
 """Largest share of points of one submap in the free space of the other, either way: people and doors give a few per cent."""
+HAIR_SIGMAS = 1.0
+"""A share misses its limit by a hair if it is so near, in standard errors of the share: it may as well have kept it."""
 RIVAL = 0.75
 """The best rival cluster must score less than this share of the cluster."""
 OFF_MAX_M, OFF_MAX_DEG = 1.0, 10.0
@@ -106,11 +112,30 @@ def of_free_space(violation: float) -> tuple[Check, ...]:
     return (at_most("violation", violation, VIOLATION_MAX),)
 
 
-def of_cluster(probes: int, least: int, span_m: float, least_m: float, rival: float) -> tuple[Check, ...]:
+def loosened(checks: Sequence[Check], pieces: int) -> tuple[Check, ...]:
+    """The same checks, with the limits of shares moved by what a share of so few things can tell.
+
+    Of n independent things that fit with probability p, a share fits whose standard error is sqrt(p (1 - p) / n). Few returns
+    in the open, from trees and poles, tell less than the walls of a room, however many points they have.
+
+    Args:
+        checks: of a registration of two submaps; only the limits of `near`, `fit` and `violation` move.
+        pieces: number of things of which the shares are; with 0 no limit moves.
+    """
+    return tuple(_by_a_hair(check, pieces) if check.figure in ("near", "fit", "violation") else check for check in checks)
+
+
+def _by_a_hair(check: Check, pieces: int) -> Check:
+    hair = HAIR_SIGMAS * math.sqrt(check.limit * (1.0 - check.limit) / pieces) if pieces else 0.0
+    return replace(check, limit=check.limit - hair if check.needs is Need.AT_LEAST else check.limit + hair)
+
+
+def of_cluster(probes: float, least: int, span_m: float, least_m: float, rival: float) -> tuple[Check, ...]:
     """Check a cluster of loop hypotheses that agree with each other.
 
     Args:
-        probes: number of places along the drive from which the cluster's loops were measured.
+        probes: number of places along the drive from which the cluster's loops were measured; a place counts half whose loop
+            missed a limit by a hair.
         least: least number of them that passes.
         span_m: travel between the first and the last of them.
         least_m: least travel that passes.

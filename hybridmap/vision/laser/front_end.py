@@ -131,8 +131,7 @@ class LaserFrontEnd:
         for hypothesis in hypotheses:
             key = self._next_key()
             out.append(hypothesis.proposed(key, Lack.WAITING))
-            if hypothesis.passed:
-                self._commitment.add(key, hypothesis)
+            self._commitment.add(key, hypothesis)
         return out
 
     def finish(self, belief: Belief) -> list[Edge]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, p
 from hybridmap.streams.laser import Laser
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser import checks
+from hybridmap.vision.laser.cloud import CELL_M, Cloud
 from hybridmap.vision.laser.scan_matching import (
     STEP_DEG,
     STEP_M,
@@ -47,6 +48,9 @@ SURE_SIGMA_M = 0.8
 """A gate is narrow below this standard deviation, m: rooms are farther apart."""
 FLOOR_M, FLOOR_DEG = 0.004, 0.04
 """Least standard deviations of the registration of two submaps, m and degrees: submaps bend."""
+PIECE_M = 1.0
+"""Points of a probe nearer to each other than this belong to one thing, m (more where the cells are larger): a tree, a car, a
+piece of wall."""
 REGISTERED_POINTS = 400
 """Points of a probe that are registered."""
 UNKNOWN = 1e8
@@ -70,6 +74,7 @@ class Hypothesis:
         figures: further measured values of the registration, by name.
         fits: whether enough points of the scans fit.
         misfit: share of points that do not fit, plus share of walls in the other's free space.
+        pieces: number of separate things that the probe saw, of which the shares in the checks are; 0 if not counted.
     """
 
     probe: int
@@ -82,11 +87,22 @@ class Hypothesis:
     figures: dict[str, float]
     fits: bool
     misfit: float
+    pieces: int = 0
 
     @property
     def passed(self) -> bool:
         """Whether all checks passed."""
         return passed(self.checks)
+
+    @property
+    def by_a_hair(self) -> bool:
+        """Whether checks failed, but by no more than what the shares of so few things can tell."""
+        return not self.passed and self.within_a_hair.passed
+
+    @property
+    def within_a_hair(self) -> Hypothesis:
+        """The same hypothesis; if checks failed, with their limits moved by what the shares of so few things can tell."""
+        return self if self.passed else replace(self, checks=checks.loosened(self.checks, self.pieces))
 
     def proposed(self, key: int, lack: Lack | None = None) -> Edge:
         """The hypothesis as an edge, under a key; `lack` says why it is not accepted although all checks passed."""
@@ -243,13 +259,30 @@ class Prober:
             off_deg = float(np.rad2deg(abs(wrap_angle(pose[2] - gate.expected[2]))))
             asked += checks.of_gate(off_m, off_deg, gate.radius_m, np.rad2deg(gate.heading_rad))
         asked += checks.of_place(loosest_m, ambiguity_of(field, cloud, alignment))
-        if passed(asked):
+        pieces = _pieces(cloud) if search is Search.GATE else 0
+        if passed(checks.loosened(asked, pieces)):
             seen = violation_both_ways(probe, mode.target, pose, self._atlas.ranges, self._laser)
             asked += checks.of_free_space(seen)
         relative = invert_relative(self._atlas.joining(gate.anchor, pose, covariance, probe.anchor))
         return Hypothesis(
-            probe.anchor, gate.anchor, relative, near * fit, gate.sigma_m, search, asked, figures, fits, 1.0 - fit + seen
+            probe.anchor,
+            gate.anchor,
+            relative,
+            near * fit,
+            gate.sigma_m,
+            search,
+            asked,
+            figures,
+            fits,
+            1.0 - fit + seen,
+            pieces,
         )
+
+
+def _pieces(cloud: Cloud) -> int:
+    """Number of separate things in a cloud: of squares in which it has points."""
+    squares = np.floor(cloud.points / (PIECE_M * cloud.cell_m / CELL_M)).astype(np.int64)
+    return len(np.unique(squares, axis=0))
 
 
 def _distinct(found: list[Hypothesis]) -> list[Hypothesis]:

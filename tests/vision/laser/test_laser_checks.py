@@ -46,3 +46,12 @@ def test_a_figure_just_beyond_its_limit_fails_by_name(rule, figure):
 
 def test_a_good_registration_may_lie_far_from_the_odometry():
     assert [check.figure for check in checks.of_step(checks.INLIERS_MIN, 9.0)] == ["inliers"]
+
+
+def test_a_limit_of_a_share_moves_by_the_standard_error_of_so_few_things():
+    asked = checks.of_fit(0.45, 0.65, 0.7) + checks.of_free_space(0.19) + checks.of_place(0.02, 0.3)
+    few, many = checks.loosened(asked, 60), checks.loosened(asked, 6000)
+    assert all(check.passed for check in few)
+    assert [check.figure for check in many if not check.passed] == ["near", "fit", "violation"]
+    assert [check.limit for check in few[3:]] == [checks.LOOSEST_MAX_M, checks.AMBIGUITY_MAX]
+    assert checks.loosened(asked, 0) == asked

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from hybridmap.geometry import RelativePose, between, compose
-from hybridmap.graph.edges import Lack, Search
+from hybridmap.graph.edges import Lack, Search, Status
 from hybridmap.vision.base import Belief
+from hybridmap.vision.laser import checks
 from hybridmap.vision.laser.commitment import Commitment
 from hybridmap.vision.laser.hypotheses import Hypothesis
 
@@ -23,11 +24,16 @@ def covariance_from(node):
 BELIEF = Belief(CHAIN, np.arange(N, dtype=float), TRAVEL, covariance_from)
 
 
-def hypothesis(probe, anchor, where=(2.0, 5.0, 0.3), quality=0.7, sigma_m=5.0):
+THINGS = 60
+"""Things in sight in the open: the standard error of a share near one half is 0.065."""
+
+
+def hypothesis(probe, anchor, where=(2.0, 5.0, 0.3), quality=0.7, sigma_m=5.0, near=None):
     """A probe that lies at `CHAIN[anchor] * where + way since node 200` in the old map: all with one `where` agree."""
     at = compose(compose(CHAIN[20], np.array(where)), between(CHAIN[200], CHAIN[probe]))
     relative = RelativePose(between(at, CHAIN[anchor]), np.diag([0.03, 0.03, 0.01]) ** 2)
-    return Hypothesis(probe, anchor, relative, quality, sigma_m, Search.GATE, (), {}, True, 0.0)
+    asked = () if near is None else checks.of_fit(near, 0.9, 0.7)
+    return Hypothesis(probe, anchor, relative, quality, sigma_m, Search.GATE, asked, {}, True, 0.0, THINGS)
 
 
 @pytest.fixture
@@ -103,3 +109,59 @@ def test_several_hypotheses_of_one_probe_count_once(commitment):
     for key in range(6):
         commitment.add(key, hypothesis(200 + key // 3, 20 + key))
     assert commitment.settle(TRAVEL[202], BELIEF) == []
+
+
+def driven(commitment, probes, **given):
+    """Settle one hypothesis after the other, and then the rest of the group's wait; returns what was settled."""
+    out = []
+    for probe in probes:
+        commitment.add(probe, hypothesis(probe, 20, **given))
+        out += commitment.settle(TRAVEL[probe], BELIEF)
+    return out
+
+
+def test_six_that_miss_a_limit_by_a_hair_close_a_loop_together(commitment):
+    assert driven(commitment, range(200, 232, 4), near=0.45) == []
+    settled = driven(commitment, [232], near=0.45)
+    assert [s.key for s in settled] == list(range(200, 236, 4))
+    edges = [s.proposed() for s in settled]
+    assert all(edge.status is Status.ACCEPTED for edge in edges)
+    near = next(check for check in edges[0].checks if check.figure == "near")
+    assert near.limit == pytest.approx(0.5 - np.sqrt(0.25 / THINGS))
+    assert near.passed
+    assert [check.value for check in edges[0].checks if check.figure == "probes"] == [4.5]
+
+
+def test_five_are_too_few_and_one_that_kept_the_limits_counts_for_two(commitment):
+    five = list(range(200, 240, 8))
+    assert driven(commitment, five, near=0.45) == []
+    assert commitment.flush(BELIEF) == []
+    commitment = Commitment(TRAVEL.__getitem__)
+    commitment.add(0, hypothesis(198, 20))
+    assert [s.key for s in driven(commitment, five, near=0.45) if s.accepted] == [0, *five]
+
+
+def test_what_misses_by_more_than_a_hair_counts_nothing(commitment):
+    assert driven(commitment, range(200, 260, 4), near=0.43) == []
+    assert commitment.flush(BELIEF) == []
+
+
+def test_a_loop_that_was_closed_needs_no_group(commitment):
+    assert driven(commitment, range(200, 216, 4), near=0.45) == []
+    full = driven(commitment, (216, 222, 226))
+    assert [s.key for s in full if s.accepted] == [216, 222, 226]
+    assert driven(commitment, range(228, 250, 8), near=0.45) == []
+    assert commitment.flush(BELIEF) == []
+
+
+def test_an_equal_rival_blocks_a_group(commitment):
+    for probe in range(200, 240, 4):
+        commitment.add(probe, hypothesis(probe, 20, near=0.45))
+        commitment.add(1000 + probe, hypothesis(probe, 20, where=(6.0, 5.0, 0.3), near=0.45))
+        assert commitment.settle(TRAVEL[probe], BELIEF) == []
+    assert commitment.flush(BELIEF) == []
+
+
+def test_at_the_end_a_group_waits_no_longer(commitment):
+    assert driven(commitment, range(200, 212, 2), near=0.45) == []
+    assert [s.key for s in commitment.flush(BELIEF) if s.accepted] == list(range(200, 212, 2))
