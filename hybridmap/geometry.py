@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 _ROUNDED = 1e-3  # a unit quaternion with four decimals has a squared length this far from 1 at most
 
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
 IDENTITY: Array = np.zeros(3)
 IDENTITY.setflags(write=False)
 
@@ -30,6 +32,11 @@ class RelativePose:
 
     delta: Array
     covariance: Array
+
+
+def robust_sigma(errors: Array) -> Array:
+    """Standard deviation (...) of errors (N, ...) about zero by their median absolute value; half of them may be outliers."""
+    return np.asarray(MAD_TO_SIGMA * np.median(np.abs(errors), axis=0))
 
 
 def wrap_angle(angle_rad: ArrayLike) -> Array:

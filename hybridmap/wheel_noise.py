@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybridmap.config.mapping import EdgesConfig
-from hybridmap.geometry import Array, RelativePose, between, log
+from hybridmap.geometry import Array, RelativePose, between, log, robust_sigma
 from hybridmap.graph.agreement import BOUND
 from hybridmap.graph.paths import odometry_covariance
 
@@ -30,8 +30,6 @@ GOOD_M = 0.1
 twice that, and a registration knows better."""
 MISSING_SHARE = 0.1
 """A stretch counts if at most this share of its way has no registration; the two headings are taken to agree there."""
-ROBUST = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
 FEWEST = 20
 """Least number of stretches of one length that count."""
 UNSEEN: Array = np.full(3, np.nan)
@@ -220,5 +218,4 @@ def _over(length_m: float, travel: Array, summed: Array, unseen: Array) -> Array
     seen = unseen[end] - unseen[start] <= MISSING_SHARE * driven
     if np.count_nonzero(seen) < FEWEST:
         return UNSEEN
-    apart = np.abs(summed[end] - summed[start])[seen] / np.sqrt(driven[seen])[:, None]
-    return np.asarray(ROBUST * np.median(apart, axis=0))
+    return robust_sigma((summed[end] - summed[start])[seen] / np.sqrt(driven[seen])[:, None])

@@ -209,8 +209,8 @@ def test_contradicted_odometry_is_counted():
         (ClockOffset(ClockState.TIME_BASE, 4.0), 4.0),
     ],
 )
-def test_clocks_that_are_apart_are_a_reason_unless_that_was_corrected(clock, left_s):
-    found = judged(mapped(drive()), clock=clock).get("clocks apart")
+def test_an_offset_of_the_clocks_is_a_reason_unless_it_was_corrected(clock, left_s):
+    found = judged(mapped(drive()), clock=clock).get("clock offset")
     assert left_s == (found and found.value)
 
 

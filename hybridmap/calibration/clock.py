@@ -18,7 +18,7 @@ from math import hypot, inf, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.geometry import Array, wrap_angle
+from hybridmap.geometry import Array, robust_sigma, wrap_angle
 
 TRANSPORT_S = 0.5
 """Largest offset that the transport of messages explains, s. A larger one is another time base, and is not corrected."""
@@ -222,7 +222,7 @@ class _Fit:
             at = int(np.argmin(self._costs(offsets_s)))
             self._sigma = self._sigmas(float(offsets_s[at]))
             residuals = self._solve(float(offsets_s[at]))[1]
-            self._scale = max(1.4826 * float(np.median(np.abs(residuals))), _SCALE_MIN)
+            self._scale = max(float(robust_sigma(residuals)), _SCALE_MIN)
         costs = self._costs(offsets_s)
         at = int(np.argmin(costs))
         if at in (0, len(offsets_s) - 1):

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from hybridmap.calibration.estimate import SIGNIFICANT_SIGMAS, Estimate
 from hybridmap.calibration.legs import Legs, Motion
 from hybridmap.errors import EvaluationError
-from hybridmap.geometry import Array, between, wrap_angle
+from hybridmap.geometry import Array, between, robust_sigma, wrap_angle
 from hybridmap.odometry_model import NEUTRAL, Gains
 
 LEG_M = (1.0, 16.0)
@@ -278,7 +278,7 @@ def _weigh(residual: Array, slope: Array, overlap: float) -> _Fit:
 
 
 def _weights(residual: Array) -> Array:
-    scale = max(float(np.median(np.abs(residual))) * 1.4826, 1e-9)
+    scale = max(float(robust_sigma(residual)), 1e-9)
     return np.asarray(1.0 / (1.0 + (residual / (CAUCHY * scale)) ** 2))
 
 

@@ -34,11 +34,16 @@ def inspect(
         list[str] | None,
         typer.Option("--set", help="KEY=VALUE, e.g. sensors.sync_tolerance_s=0.05. Keys: docs/configuration.md."),
     ] = None,
-    strict: Annotated[
+    skip_damaged: Annotated[
         bool,
         typer.Option(
-            "--strict", help="Exit code 3 if messages are missing. Damage inside a scan or picture shows only in `map`."
+            "--skip-damaged",
+            help="Read every scan and picture, and count the damaged ones, which `map --skip-damaged` skips. Without it, damage"
+            " inside a scan or picture shows only in `map`.",
         ),
+    ] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Exit code 3 if messages are missing, or damaged ones were counted.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
@@ -59,8 +64,8 @@ def inspect(
         odometry_file=odometry_file,
     )
     overrides = {**topics, **parse_settings(setting)}
-    found = inspect_source(source, Config.load(config or world_of(source), overrides))
-    clock = _clock(found, config, overrides)
+    found = inspect_source(source, Config.load(config or world_of(source), overrides), skip_damaged=skip_damaged)
+    clock = _clock(found, config, overrides, skip_damaged=skip_damaged)
     if as_json:
         sys.stdout.write(to_json(_head(found, clock), _metrics(found, clock)) + "\n")
     else:
@@ -69,7 +74,7 @@ def inspect(
         raise typer.Exit(LOST)
 
 
-def _clock(found: Inspection, config: str | None, overrides: Mapping[str, Any]) -> ClockOffset | None:
+def _clock(found: Inspection, config: str | None, overrides: Mapping[str, Any], *, skip_damaged: bool) -> ClockOffset | None:
     """The offset between views and odometry by the first metres of a recording; None if there is nothing to look at."""
     if not found.mappable or not found.parts or not found.rig.sensors:
         return None
@@ -78,7 +83,7 @@ def _clock(found: Inspection, config: str | None, overrides: Mapping[str, Any]) 
     from hybridmap.session import first_look
 
     try:
-        opened = choose(found.source, config, overrides)
+        opened = choose(found.source, config, overrides, skip_damaged=skip_damaged)
         return first_look(opened.stream, opened.config)
     except HybridMapError as error:
         found.problems.append(str(error))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.root import Config
 from hybridmap.errors import HybridMapError, StreamError
-from hybridmap.streams.base import Rig
+from hybridmap.streams.base import Rig, Stream
 from hybridmap.streams.open import kind_of, open_stream, world_of
 from hybridmap.trajectory import NS_PER_S, read_tum
 
@@ -89,12 +89,13 @@ class Inspection:
         return self.reason is None
 
 
-def inspect_source(source: str | Path, config: Config) -> Inspection:
+def inspect_source(source: str | Path, config: Config, *, skip_damaged: bool = False) -> Inspection:
     """Inspect a source without mapping it.
 
     Args:
         source: a path, or the name of a simulated world.
         config: topic names, mounting, sensor.
+        skip_damaged: read every scan and picture of a recording, and count the damaged ones among the lost messages.
 
     Raises:
         StreamError: the source cannot be opened at all.
@@ -107,18 +108,19 @@ def inspect_source(source: str | Path, config: Config) -> Inspection:
     path = Path(source)
     found = Inspection(str(path), kind_of(path))
     found.parts = _PARTS[found.kind](path, found.problems)
-    _try_to_open(found, source, config)
+    _try_to_open(found, source, config, skip_damaged=skip_damaged)
     found.problems += [line for part in found.parts if part.name in found.uses.values() for line in _gaps(part)]
     if found.kind == "velocity table":
         found.remarks.append("a velocity table: dead reckoning and the neural part only")
     return found
 
 
-def _try_to_open(found: Inspection, source: str | Path, config: Config) -> None:
+def _try_to_open(found: Inspection, source: str | Path, config: Config, *, skip_damaged: bool = False) -> None:
     """Open as mapping would; note what it would use, or why it cannot."""
     try:
-        stream = open_stream(source, config)
+        stream = open_stream(source, config, skip_damaged=skip_damaged)
         truth = stream.groundtruth
+        lost: dict[str, tuple[int, int]] = _lost_in_all(stream) if skip_damaged else getattr(stream, "lost", {})
     except HybridMapError as error:
         found.reason = str(error)
         found.problems.append(str(error))
@@ -126,12 +128,19 @@ def _try_to_open(found: Inspection, source: str | Path, config: Config) -> None:
     found.rig = stream.rig
     found.uses |= getattr(stream, "uses", {})
     found.remarks += getattr(stream, "remarks", [])
-    found.lost |= getattr(stream, "lost", {})
+    found.lost |= lost
     losses: dict[str, int] = getattr(stream, "losses", {})
     found.problems += [f"{count} {name}" for name, count in losses.items() if count]
     found.problems += [f"{name}: {gone} messages of {stated} cannot be read" for name, (gone, stated) in found.lost.items()]
     if truth is not None:
         found.remarks.append(f"ground truth: {len(truth)} poses")
+
+
+def _lost_in_all(stream: Stream) -> dict[str, tuple[int, int]]:
+    """Read a whole stream; returns what of it was lost (`StreamReport.lost`)."""
+    for _ in stream:
+        pass
+    return stream.report.lost
 
 
 def _gaps(part: Part) -> list[str]:

@@ -85,10 +85,11 @@ KINDS = {
         "registrations contradict {count} odometry edges, {value:.0f} % of them (at most {limit:.0f} %): the wheels slip, or"
         " the clock of the sensor is not theirs",
     ),
-    "clocks apart": Kind(
+    "clock offset": Kind(
         Verdict.DOUBTFUL,
         "s",
-        "views are stamped {value:+.2f} s from the odometry (at most {limit:.2f} s), which was not corrected",
+        "scans or frames are stamped {value:+.2f} s off odometry of the same moment (+: later; at most {limit:.2f} s), and the"
+        " map was not corrected for it",
     ),
     "nodes without weight": Kind(Verdict.DOUBTFUL, "1", "{value:.0f} nodes are joined to the rest by edges without weight"),
     "motion unobserved": Kind(

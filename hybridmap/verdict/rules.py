@@ -156,15 +156,15 @@ def contradicted_odometry(facts: Facts) -> Iterable[Reason]:
     return [facts.reason("odometry dropped", 100.0 * share, 100.0 * DROPPED_MAX, count=dropped)] if share > DROPPED_MAX else []
 
 
-def clocks_apart(facts: Facts) -> Iterable[Reason]:
-    """The clocks of views and odometry are apart, and the map was not corrected by it."""
+def clock_offset(facts: Facts) -> Iterable[Reason]:
+    """Scans or frames are stamped later or earlier than odometry of the same moment, and the map was not corrected for it."""
     clock = facts.clock
     if clock is None:
         return []
     if clock.state is ClockState.TIME_BASE:
-        return [facts.reason("clocks apart", clock.offset_s, TRANSPORT_S)]
+        return [facts.reason("clock offset", clock.offset_s, TRANSPORT_S)]
     least_s = max(MATTERS_S, 2.0 * clock.sigma_s)
-    return [facts.reason("clocks apart", clock.left_s, least_s)] if clock.known and abs(clock.left_s) > least_s else []
+    return [facts.reason("clock offset", clock.left_s, least_s)] if clock.known and abs(clock.left_s) > least_s else []
 
 
 def not_held(facts: Facts) -> Iterable[Reason]:
@@ -213,7 +213,7 @@ RULES: tuple[Callable[[Facts], Iterable[Reason]], ...] = (
     at_odds,
     against_wheels,
     contradicted_odometry,
-    clocks_apart,
+    clock_offset,
     not_held,
     broken,
     lost,

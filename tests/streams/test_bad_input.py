@@ -22,6 +22,7 @@ from hybridmap.errors import StreamError
 from hybridmap.store import SessionFolder
 from hybridmap.streams import open_stream
 from hybridmap.streams.cameras import Calibration, DepthRegistration, decode_color
+from hybridmap.streams.inspection import inspect_source
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rosbag import BagStream
 from tests.narrowing import as_a
@@ -414,6 +415,16 @@ def test_damaged_scans_are_skipped_and_counted_on_request(tmp_path, damaged):
     scans = [sample for sample in stream if isinstance(sample, LaserScan)]
     assert len(scans) == 6 - len(damaged)
     assert stream.report.lost == {"/scan": (len(damaged), 6)}
+
+
+def test_inspect_counts_damaged_scans_on_request(tmp_path):
+    path = laser_drive().write(tmp_path / "a.mcap")
+    _damage_some(path, {"/scan": [2, 4]})
+    seen = inspect_source(path, Config(), skip_damaged=True)
+    assert seen.mappable
+    assert seen.lost == {"/scan": (2, 6)}
+    assert inspect_source(path, Config()).lost == {}
+    assert CliRunner().invoke(app, ["inspect", str(path), "--skip-damaged", "--strict"]).exit_code == LOST
 
 
 def test_a_topic_of_damaged_scans_alone_counts_as_lost(tmp_path):
