@@ -9,7 +9,7 @@ from hybridmap.graph.edges import Edge, EdgeKind, Status, at_least
 from hybridmap.streams.laser import LaserScan
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.cloud import cloud_of_scan
-from hybridmap.vision.laser.kidnapping import Continuity
+from hybridmap.vision.laser.kidnapping import ChainBreak, Continuity
 from hybridmap.vision.laser.submap import Atlas
 from hybridmap.vision.laser.tracking import Step, Tracker
 from tests.vision.laser.laser_worlds import LASER, box, cast, ring, ring_drive, room
@@ -87,6 +87,33 @@ def test_people_who_step_into_view_while_the_wheels_drop_out_are_no_carry():
 def test_it_can_be_switched_off():
     config = VisionConfig(relocalising=RelocalisingConfig(enabled=False))
     assert stepped([OTHER_ROOM], STRAIGHT, STRAIGHT, measured=False, config=config) == ()
+
+
+SEEN_BEFORE = np.array([(4.0, -3.0, 4.0, 3.0), (4.0, -1.0, 3.1, -1.0), *box(-1.0, 2.4, 0.7, 3.0)])
+"""Of the room, what gave returns before the break: two fifths of the points of a scan of all of it fit there."""
+BREAK = 12
+
+
+def after_a_false_break(beside_m):
+    """What six scans in a row after a break say, of a robot that is so far beside where the wheels have it."""
+    rng, way = np.random.default_rng(4), np.array([[-1.5 + 0.1 * k, 0.0, 0.0] for k in range(BREAK + 7)])
+    chain = Chain(way[:BREAK], way[:BREAK], SEEN_BEFORE)
+    for pose in way[BREAK:]:
+        chain.add(cast(room(), compose(pose, np.array([0.0, beside_m, 0.0])), rng), pose)
+    chain.atlas.part(BREAK)
+    refused = Edge(BREAK - 1, BREAK, EdgeKind.REGISTRATION, Status.REJECTED, None)
+    broken = ChainBreak(BREAK, refused, between(way[BREAK - 1], way[BREAK]), None)
+    return [chain.continuity.drove_on([broken], node) for node in range(BREAK + 1, len(way))]
+
+
+def test_four_faint_fits_where_the_wheels_have_the_robot_mend_the_chain():
+    """Among trees a scan shares few points with those before it, and no single one tells."""
+    assert after_a_false_break(beside_m=0.0) == [None, None, None, True, True, True]
+
+
+@pytest.mark.parametrize("beside_m", [0.35, 1.0])
+def test_faint_fits_elsewhere_mend_nothing(beside_m):
+    assert set(after_a_false_break(beside_m)) == {None}
 
 
 LAP, DOWN, PER_LAP, AFTER = ring_drive(2.1)[::5], 124, 108, 12
