@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
@@ -19,8 +18,9 @@ from numpy.typing import NDArray
 
 from hybridmap.errors import ConfigError
 from hybridmap.geometry import IDENTITY, Array, between, compose, wrap_angle
-from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion
+from hybridmap.streams.base import Motion, Observation, Rig, Sample, SelfMotion
 from hybridmap.streams.laser import LaserScan
+from hybridmap.streams.order import ReorderBuffer
 from hybridmap.streams.rgbd import RgbdFrame
 from hybridmap.trajectory import NS_PER_S
 
@@ -206,16 +206,15 @@ def views_lost(samples: Samples, share: float, _rng: np.random.Generator, _rig: 
 
 
 def views_late_s(samples: Samples, late_s: float, _rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
-    """Make the stamps of scans and frames later by `late_s`."""
-    held: deque[Observation] = deque()
+    """Make scans and frames late by `late_s` against odometry: odometry is stamped that much earlier (later if negative).
+
+    The stamps of the views stay, so that a map is compared with the same truth.
+    """
+    order, early_ns = ReorderBuffer(abs(late_s)), round(late_s * NS_PER_S)
     for sample in samples:
-        while held and held[0].stamp_ns < sample.stamp_ns:
-            yield held.popleft()
-        if isinstance(sample, Observation):
-            held.append(replace(sample, stamp_ns=sample.stamp_ns + round(late_s * NS_PER_S)))
-        else:
-            yield sample
-    yield from held
+        moved = isinstance(sample, Motion)
+        yield from order.push(replace(sample, stamp_ns=sample.stamp_ns - early_ns) if moved else sample)
+    yield from order.flush()
 
 
 def kidnapped_s(

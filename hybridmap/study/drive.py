@@ -32,7 +32,7 @@ from hybridmap.study.disturb import KIDNAPPED, disturbed
 from hybridmap.study.frozen import Figures, Frozen, Mapped
 from hybridmap.study.measures import KEPT, WRONG_DEG, WRONG_M
 from hybridmap.trajectory import NS_PER_S, Trajectory, known_at, read_tum
-from hybridmap.verdict import reasons_of, verdict_of
+from hybridmap.verdict import Verdict, reasons_of, verdict_of
 
 LIMITS = ClosureLimits(right_m=WRONG_M, right_deg=WRONG_DEG)
 
@@ -94,7 +94,7 @@ class MappedDrive:
         verdict = verdict_of(reasons_of(facts_of(mapper, stream.report)))
         mapped = Mapped(
             mapper.backends.primary,
-            _figures(mapper, track, truth, relations, {**watch.figures(), "verdict": float(verdict.grade)}),
+            _figures(mapper, track, truth, relations, {**watch.figures(), **_of_session(mapper, verdict)}),
             _timings(clock.cpu_s["mapping"], float(track.stamps_ns[-1] - track.stamps_ns[0]) / NS_PER_S, views),
         )
         return Frozen(graph, reference, of_truth=truth is not None, mapped=mapped)
@@ -153,6 +153,12 @@ def _been_before(nodes: Array, down: int) -> NDArray[np.bool_]:
     apart = between(nodes[down:, None], nodes[None, :down])
     near = (np.hypot(apart[..., 0], apart[..., 1]) < _KNOWN_M) & (np.abs(apart[..., 2]) < _KNOWN_RAD)
     return np.asarray(near.any(axis=1))
+
+
+def _of_session(mapper: Mapper, verdict: Verdict) -> Figures:
+    """The verdict on the map, and the offset between the clocks of its sensors."""
+    offset = mapper.calibration.clock.offset
+    return {"verdict": float(verdict.grade), "clock_offset_s": offset.offset_s if offset.known else None}
 
 
 def _figures(

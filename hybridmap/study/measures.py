@@ -39,6 +39,7 @@ MAPPED = {
     "relation_deg": ("deg", "mean rotational error of the verified relations"),
     "relation_loop_m": ("m", "mean translational error of the relations over more than 60 s"),
     "verdict": VERDICT,
+    "clock_offset_s": ("s", "how much later views were found to be stamped than odometry; nothing where it is not known"),
     "nodes": ("1", "nodes of the map"),
     "loops": ("1", "loops in the graph"),
     "loops_rejected": ("1", "of those, the ones rejected as outliers by the back-end"),

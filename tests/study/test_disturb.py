@@ -135,11 +135,14 @@ def test_views_are_lost_regularly_and_come_late_in_order(drive):
     kept = [s.stamp_ns for s in worse(drive, "views_lost", 0.75) if isinstance(s, LaserScan | RgbdFrame)]
     every = [s.stamp_ns for s in drive if isinstance(s, LaserScan | RgbdFrame)]
     assert kept == every[::4]
-    late = worse(drive, "views_late_s", 0.15)
-    assert [s.stamp_ns for s in late] == sorted(s.stamp_ns for s in late)
-    assert [s.stamp_ns for s in late if isinstance(s, LaserScan)] == [
-        s.stamp_ns + 150_000_000 for s in drive if isinstance(s, LaserScan)
-    ]
+    for late_s in (0.15, -0.15):
+        late = worse(drive, "views_late_s", late_s)
+        assert [s.stamp_ns for s in late] == sorted(s.stamp_ns for s in late)
+        apart_ns = round(1e9 * late_s)
+        for kind, shift_ns in ((SelfMotion, apart_ns), (LaserScan, 0)):
+            assert [s.stamp_ns + shift_ns for s in late if isinstance(s, kind)] == [
+                s.stamp_ns for s in drive if isinstance(s, kind)
+            ]
     together = worse(drive, "views_late_s", 0.1)  # onto the stamp of the next odometry: motion comes first
     for before, after in pairwise(together):
         assert not (before.stamp_ns == after.stamp_ns and isinstance(before, Observation) and isinstance(after, SelfMotion))
