@@ -185,7 +185,7 @@ class Mapper:
         if not (clock := self.calibration.clock).finish(self.map):
             return []
         poses = clock.poses_at(np.array([*(node.stamp_ns for node in self.map.nodes), self._position.stamp_ns]))
-        edges = self.book.retime(poses[:-1], self.vision)
+        edges = self.book.motion.retime(poses[:-1], self.vision)
         self._position.retime(poses[-2], poses[-1])
         self._correct()
         return [self._position.update(str(clock.offset), None, edges)]
@@ -211,7 +211,7 @@ class Mapper:
         )
         self._novelty.remember(code)
         self.cells.remember(node)
-        edges = self.book.join(at.at_node, node, at.moved, at.driven) if node > 0 else []
+        edges = self.book.motion.join(at.at_node, node, at.moved, at.driven) if node > 0 else []
         at.attach(node, at.pose_odom)
         return node, edges
 

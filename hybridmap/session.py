@@ -289,7 +289,7 @@ def _measured_again(mapper: Mapper) -> list[Metric]:
 
 
 def _learnt_noise(mapper: Mapper) -> list[Metric]:
-    learnt = mapper.book.wheels.learnt
+    learnt = mapper.book.motion.wheels.learnt
     if learnt is None:
         return []
     heading = figure("wheels_heading_noise", learnt.heading_deg)

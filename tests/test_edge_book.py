@@ -59,7 +59,7 @@ def driven(book: EdgeBook, experiences: ExperienceMap, nodes: int, wheel_yaw_rad
     for k in range(first, nodes):
         experiences.add_node(Node(k, IDENTITY, np.zeros(1, np.float32), -1, float(k)), IDENTITY)
         if k:
-            changed = book.join(k - 1, k, np.array([1.0, 0.0, wheel_yaw_rad]), (1.0, 0.0))
+            changed = book.motion.join(k - 1, k, np.array([1.0, 0.0, wheel_yaw_rad]), (1.0, 0.0))
             seen = RelativePose(np.array([1.0, 0.0, 0.1 if k == 5 else 0.0]), COVARIANCE)
             edge = Edge(k - 1, k, EdgeKind.REGISTRATION, Status.ACCEPTED, seen, key=k, contradicts_odometry=k == 5)
             book.enter([edge])
@@ -97,10 +97,10 @@ def test_odometry_that_nothing_contradicts_any_more_stays_even_if_the_wheels_tur
     experiences = ExperienceMap()
     book = EdgeBook(experiences, EdgesConfig())
     driven(book, experiences, 102)
-    assert book.wheels.trusted
+    assert book.motion.wheels.trusted
     bent = np.column_stack([np.arange(102.0), np.zeros(102), np.where(np.arange(102) % 2, 0.2, 0.0).cumsum()])
-    book.retime(bent, Lenient())
-    assert not book.wheels.trusted
+    book.motion.retime(bent, Lenient())
+    assert not book.motion.wheels.trusted
     assert odometry_into(experiences, 5).status is Status.ACCEPTED
 
 
@@ -111,7 +111,7 @@ def test_an_edge_across_a_kidnapping_does_not_come_back():
     number = experiences.edges.index(odometry_into(experiences, 5))
     experiences.update_edge(number, experiences.edge(number).settled(lack=Lack.KIDNAPPED))
     driven(book, experiences, 102, first=90)
-    assert known(book.wheels.learnt).good
+    assert known(book.motion.wheels.learnt).good
     assert experiences.edge(number).lack is Lack.KIDNAPPED
 
 
@@ -119,7 +119,7 @@ def test_wheels_that_do_not_prove_good_change_nothing():
     experiences = ExperienceMap()
     book = EdgeBook(experiences, EdgesConfig())
     assert len(driven(book, experiences, 102, wheel_yaw_rad=0.1)) == 1
-    assert known(book.wheels.learnt).good is False
+    assert known(book.motion.wheels.learnt).good is False
     assert odometry_into(experiences, 5).status is Status.RETRACTED
 
 
@@ -171,13 +171,13 @@ def test_odometry_that_is_measured_again_counts_again_if_nothing_contradicts_it_
     for k in range(3):
         experiences.add_node(Node(k, np.array([1.5 * k, 0, 0]), np.zeros(1, np.float32), -1, 1.5 * k), IDENTITY)
         if k:
-            book.join(k - 1, k, np.array([1.5, 0, 0]), (1.5, 0.0))
+            book.motion.join(k - 1, k, np.array([1.5, 0, 0]), (1.5, 0.0))
             registration = RelativePose(np.array([1.0, 0, 0]), COVARIANCE)
             book.enter([Edge(k - 1, k, EdgeKind.REGISTRATION, Status.ACCEPTED, registration, key=k, contradicts_odometry=True)])
     dropped = [n for n, edge in enumerate(experiences.edges) if edge.kind is EdgeKind.ODOMETRY]
     assert {experiences.edge(n).status for n in dropped} == {Status.RETRACTED}
     poses = np.array([[step_m * k, 0.0, 0.0] for k in range(3)])
-    assert set(dropped) <= set(book.retime(poses, Strict()))
+    assert set(dropped) <= set(book.motion.retime(poses, Strict()))
     assert {experiences.edge(n).status for n in dropped} == {status}
     assert all(known(experiences.edge(n).relative).delta[0] == pytest.approx(step_m) for n in dropped)
     assert [node.pose_odom[0] for node in experiences.nodes] == poses[:, 0].tolist()
