@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from hybridmap.cli.options import AsJson
+
+_Leg = Annotated[
+    float | None,
+    typer.Option(help="Pieces of the drive of this length, m, are compared; not with `joint`. Default: 1/16 of it, 1 to 16 m."),
+]
+
+_Reference = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="GT.tum", help="Ground truth of base_link (TUM format), one per session, in the same order."),
+]
 
 
 def calibrate(
@@ -14,24 +27,16 @@ def calibrate(
         list[Path],
         typer.Argument(metavar="DIR...", help="Session folder. Several sessions of one robot give one joint estimate."),
     ],
-    reference: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="GT.tum", help="Ground truth of base_link (TUM format), one per session, in the same order."),
-    ] = None,
+    reference: _Reference = None,
     estimator: Annotated[
         str | None, typer.Option(metavar="NAME", help="Method if no reference is given: `alternating` (default) or `joint`.")
     ] = None,
-    leg: Annotated[
-        float | None,
-        typer.Option(
-            help="Pieces of the drive of this length, m, are compared; not with `joint`. Default: 1/16 of it, 1 to 16 m."
-        ),
-    ] = None,
+    leg: _Leg = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE.yaml", help="Write the session's configuration, corrected, to this file.")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Estimate the systematic errors of wheel odometry: gain, turn gain, heading bias (rad/m), with standard deviations.
 
@@ -43,22 +48,18 @@ def calibrate(
     from hybridmap.calibration.sessions import common_tree, estimate_of, read_drive, require_options
     from hybridmap.cli.show import emit
     from hybridmap.odometry_model import Gains
-    from hybridmap.output import staged, write_text
-    from hybridmap.store import SessionFolder
+    from hybridmap.output import write_text
     from hybridmap.trajectory import read_tum
 
     require_options(len(folders), len(reference or []), estimator, leg)
-    if out is not None:
-        for folder in folders:
-            SessionFolder(folder).require_foreign(out)
-    with nullcontext() if out is None else staged(out, overwrite=overwrite) as work:
+    with _place(folders, out, overwrite=overwrite) as place:
         drives = [read_drive(folder) for folder in folders]
         truths = [read_tum(path) for path in reference or []]
         tree = {} if out is None else common_tree(drives)
         estimate = estimate_of(drives, truths, estimator, leg)
         in_use = Gains.of(drives[0].config.neural)
-        if out is not None and work is not None:
-            write_text(work / out.name, calibrated(tree, estimate, in_use, drives[0].delay_s))
+        if place is not None:
+            write_text(place, calibrated(tree, estimate, in_use, drives[0].delay_s))
     how = "reference" if truths else estimator or "alternating"
     head = {
         "sessions": [str(folder) for folder in folders],
@@ -69,3 +70,18 @@ def calibrate(
     emit(head, metrics_of(estimate, in_use, drives[0].delay_s), as_json=as_json, title=f"{', '.join(map(str, folders))}: {how}")
     if not as_json:
         typer.echo(head["message"])
+
+
+@contextmanager
+def _place(folders: list[Path], out: Path | None, *, overwrite: bool) -> Iterator[Path | None]:
+    """Where to write the configuration while it is staged; None if none is wanted."""
+    from hybridmap.output import staged
+    from hybridmap.store import SessionFolder
+
+    if out is None:
+        yield None
+        return
+    for folder in folders:
+        SessionFolder(folder).require_foreign(out)
+    with staged(out, overwrite=overwrite) as work:
+        yield work / out.name

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hybridmap.cli.options import AsJson, SolverConfig, SolverSetting
+
 if TYPE_CHECKING:
     from hybridmap.backends.comparison import Row, Way
     from hybridmap.cli.graphs import GraphSource
@@ -55,13 +57,9 @@ def compare(
     incremental: _Incremental = False,
     reference: _Reference = None,
     relations: _Relations = None,
-    config: Annotated[
-        str | None, typer.Option(help="Configuration of the back-ends: a name (an unknown one gives the list) or a YAML file.")
-    ] = None,
-    setting: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch. Keys: docs/configuration.md.")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+    config: SolverConfig = None,
+    setting: SolverSetting = None,
+    as_json: AsJson = False,
 ) -> None:
     """Compare back-ends on one graph: chi2, status, iterations, CPU seconds, rejected loops, and proof of optimality if found.
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from hybridmap.cli.options import AsJson
 from hybridmap.cli.show import emit
 
 _SHOWN = ("nodes", "loops_accepted", "travel", "duration", "largest_correction", "ate_rmse", "ate_rmse_online", "drift", "chi2")
@@ -17,7 +18,7 @@ def demo(
     world: Annotated[str, typer.Option(help="World to simulate: lab, office, corridor, corridor-landmarks or campus.")] = "lab",
     seed: Annotated[int, typer.Option(help="Random seed of the drive and its noise.", min=0)] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Simulate a drive, map it with relaxation and GTSAM on the same graph, and write a session folder. Needs no data."""
     from hybridmap.cli.choose import choose

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from hybridmap.cli.options import AsJson
+
 log = logging.getLogger(__name__)
 
 
@@ -28,7 +30,7 @@ def evaluate(
         bool,
         typer.Option("--loops", help="Also evaluate how well the stored views tell places apart (needs ground truth)."),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Evaluate a session: ATE (m), RPE (m, deg), drift (%), relation errors (m, deg), precision and recall of loop closures.
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hybridmap.cli.options import AsJson
 from hybridmap.errors import ConfigError
 from hybridmap.trajectory import format_motion, format_stamp
 
@@ -27,7 +28,7 @@ def explain(
             metavar="T", help="Explain the decisions at this time: seconds from the start of the recording, or a stamp, s."
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Explain the decisions at a node or a frame: why a node was made or not, and why each loop was closed or not.
 

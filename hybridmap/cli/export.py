@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from hybridmap.cli.options import AsJson
 from hybridmap.export import FORMATS
 
 _FORMATS = ", ".join(f"{name} ({entry.description})" for name, entry in FORMATS.items())
@@ -30,7 +31,7 @@ def export(
         float, typer.Option(min=0.1, help="Point clouds and grid: larger depth of a camera is left out, m.")
     ] = 5.0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Export trajectory, pose graph, point cloud or occupancy grid, in the map frame of one back-end; m and rad."""
     from hybridmap.cli.show import emit

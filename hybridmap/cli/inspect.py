@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hybridmap.cli.map import LOST
-from hybridmap.cli.options import OdometryFile, Source, Topic, sensor_settings
+from hybridmap.cli.options import AsJson, OdometryFile, SensorSetting, Source, Topic, sensor_settings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -17,6 +17,15 @@ if TYPE_CHECKING:
     from hybridmap.calibration.clock import ClockOffset
     from hybridmap.metrics import Metric
     from hybridmap.streams.inspection import Inspection
+
+_SkipDamaged = Annotated[
+    bool,
+    typer.Option(
+        "--skip-damaged",
+        help="Read every scan and picture, and count the damaged ones, which `map --skip-damaged` skips. Without it, damage"
+        " inside a scan or picture shows only in `map`.",
+    ),
+]
 
 
 def inspect(
@@ -30,22 +39,12 @@ def inspect(
     depth_topic: Topic = None,
     camera_info_topic: Topic = None,
     odometry_file: OdometryFile = None,
-    setting: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="KEY=VALUE, e.g. sensors.sync_tolerance_s=0.05. Keys: docs/configuration.md."),
-    ] = None,
-    skip_damaged: Annotated[
-        bool,
-        typer.Option(
-            "--skip-damaged",
-            help="Read every scan and picture, and count the damaged ones, which `map --skip-damaged` skips. Without it, damage"
-            " inside a scan or picture shows only in `map`.",
-        ),
-    ] = False,
+    setting: SensorSetting = None,
+    skip_damaged: _SkipDamaged = False,
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit code 3 if messages are missing, or damaged ones were counted.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Show what a recording holds (topics, rates in Hz, spans in s), what mapping would use, and what is missing or damaged."""
     from hybridmap.cli.choose import parse_settings

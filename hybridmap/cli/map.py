@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hybridmap.cli.options import OdometryFile, Source, Topic, sensor_settings
+from hybridmap.cli.options import AsJson, OdometryFile, SensorSetting, Source, Topic, sensor_settings
 from hybridmap.cli.show import emit, progress
 from hybridmap.errors import EvaluationError
 
@@ -17,23 +17,26 @@ log = logging.getLogger(__name__)
 LOST = 3
 """Exit code of a recording that lost messages, where that matters."""
 
+_Configuration = Annotated[
+    str | None,
+    typer.Option(
+        help="Configuration: a name (an unknown one gives the list) or a YAML file. Default: chosen by the sensors found."
+    ),
+]
+_Backends = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Back-end; may be given several times, the first sets the robot's pose (map -> odom)."
+        " An unknown name gives the list."
+    ),
+]
+
 
 def map_source(
     source: Source,
     out: Annotated[Path, typer.Option(help="Session folder to write.")],
-    config: Annotated[
-        str | None,
-        typer.Option(
-            help="Configuration: a name (an unknown one gives the list) or a YAML file. Default: chosen by the sensors found."
-        ),
-    ] = None,
-    backend: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Back-end; may be given several times, the first sets the robot's pose (map -> odom)."
-            " An unknown name gives the list."
-        ),
-    ] = None,
+    config: _Configuration = None,
+    backend: _Backends = None,
     start: Annotated[float | None, typer.Option(help="Start this many seconds after the first stamp.")] = None,
     end: Annotated[float | None, typer.Option(help="End this many seconds after the first stamp.")] = None,
     odometry_topic: Topic = None,
@@ -43,15 +46,13 @@ def map_source(
     camera_info_topic: Topic = None,
     odometry_file: OdometryFile = None,
     seed: Annotated[int | None, typer.Option(help="Random seed of the simulated sensors and of RANSAC.", min=0)] = None,
-    setting: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. nodes.distance_m=0.3. Keys: docs/configuration.md.")
-    ] = None,
+    setting: SensorSetting = None,
     skip_damaged: Annotated[
         bool, typer.Option("--skip-damaged", help="Skip damaged scans and pictures, and count them, instead of ending there.")
     ] = False,
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 3 if messages of the recording were lost.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Map a recording or a simulated world. Writes the map, the trajectories and a page into one session folder.
 

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from hybridmap.cli.options import AsJson, SolverConfig, SolverSetting
+
+if TYPE_CHECKING:
+    from hybridmap.backends.base import Backend, Solution
+    from hybridmap.cli.graphs import GraphSource
 
 
 def optimize(
@@ -16,16 +22,9 @@ def optimize(
     ] = "gtsam-lm",
     out: Annotated[Path | None, typer.Option(metavar="FILE.g2o", help="File for the optimised graph (m, rad).")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
-    config: Annotated[
-        str | None,
-        typer.Option(
-            help="Configuration with the settings of the back-end: a name (an unknown one gives the list) or a YAML file."
-        ),
-    ] = None,
-    setting: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch. Keys: docs/configuration.md.")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+    config: SolverConfig = None,
+    setting: SolverSetting = None,
+    as_json: AsJson = False,
 ) -> None:
     """Optimise a pose graph. Shows chi2 before and after, status, iterations, CPU seconds, proof of optimality, and a verdict.
 
@@ -38,21 +37,11 @@ def optimize(
     from hybridmap.backends.judging.certificate import certify
     from hybridmap.cli.graphs import open_graph, settings_of
     from hybridmap.cli.show import emit
-    from hybridmap.graph.io import held, write_g2o
-    from hybridmap.output import staged
-    from hybridmap.store import SessionFolder
     from hybridmap.verdict import Facts, reasons_of, said_of
 
     source = open_graph(graph)
-    chosen = create(backend, settings_of(source, config, setting))
-    if source.is_session and out is not None:
-        SessionFolder(graph).require_foreign(out)
-    with nullcontext() if out is None else staged(out, overwrite=overwrite) as work:
-        solution = chosen.solve(source.graph)
-        report = solution.report
-        solved = report.status.has_map
-        if out is not None and work is not None and solved:
-            write_g2o(work / out.name, source.graph, held(source.graph, solution.poses))
+    solution = _solved(source, create(backend, settings_of(source, config, setting)), out, overwrite=overwrite)
+    report = solution.report
     proof = certify(source.graph, solution.poses, report.rejected_edge_ids)
     head = source.head | {
         "backend": backend,
@@ -67,5 +56,20 @@ def optimize(
     emit(head, figures, as_json=as_json, title=f"{graph}: {backend}: {report.status}")
     if not as_json:
         typer.echo(f"{report.summary}\ncertificate: {proof.message}")
-    if not solved:
+    if not report.status.has_map:
         raise typer.Exit(1)
+
+
+def _solved(source: GraphSource, backend: Backend, out: Path | None, *, overwrite: bool) -> Solution:
+    """Solve the graph, and write the optimised one if there is a place for it and the back-end has a map."""
+    from hybridmap.graph.io import held, write_g2o
+    from hybridmap.output import staged
+    from hybridmap.store import SessionFolder
+
+    if source.is_session and out is not None:
+        SessionFolder(source.path).require_foreign(out)
+    with nullcontext() if out is None else staged(out, overwrite=overwrite) as work:
+        solution = backend.solve(source.graph)
+        if out is not None and work is not None and solution.report.status.has_map:
+            write_g2o(work / out.name, source.graph, held(source.graph, solution.poses))
+    return solution

@@ -22,6 +22,19 @@ Topic = Annotated[
     ),
 ]
 OdometryFile = Annotated[str | None, typer.Option(help="TUM folders only: file with the odometry, instead of odometry.txt.")]
+SensorSetting = Annotated[
+    list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. nodes.distance_m=0.3. Keys: docs/configuration.md.")
+]
+SolverConfig = Annotated[
+    str | None,
+    typer.Option(
+        help="Configuration with the settings of the back-ends: a name (an unknown one gives the list) or a YAML file."
+    ),
+]
+SolverSetting = Annotated[
+    list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch. Keys: docs/configuration.md.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 
 
 def sensor_settings(source: str, **given: str | None) -> dict[str, str]:

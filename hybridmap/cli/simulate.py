@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from hybridmap.cli.options import AsJson
 from hybridmap.cli.show import Advance, emit, progress
 from hybridmap.errors import ConfigError
 
@@ -17,6 +18,13 @@ if TYPE_CHECKING:
 Format = Literal["rosbag1", "mcap", "db3", "tum"]
 CARRIED_M = 20.0
 _FORMAT_OF_SUFFIX: dict[str, Format] = {".bag": "rosbag1", ".mcap": "mcap", ".db3": "db3"}
+
+_Kidnap = Annotated[
+    bool,
+    typer.Option(
+        "--kidnap", help="Kidnap the robot: carry it 20 m (simulation.carried_m) to a visited place while its sensors are off."
+    ),
+]
 
 
 def simulate(
@@ -36,13 +44,7 @@ def simulate(
         int | None, typer.Option(help="Random seed of the sensor errors, and of the layout of campus.", min=0)
     ] = None,
     duration: Annotated[float | None, typer.Option(help="Stop the drive after this many seconds.")] = None,
-    kidnap: Annotated[
-        bool,
-        typer.Option(
-            "--kidnap",
-            help="Kidnap the robot: carry it 20 m (simulation.carried_m) to a visited place while its sensors are off.",
-        ),
-    ] = False,
+    kidnap: _Kidnap = False,
     clock_offset: Annotated[
         float | None,
         typer.Option(help="Seconds by which scans and frames are stamped later than odometry (simulation.clock_offset_s)."),
@@ -51,7 +53,7 @@ def simulate(
         list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. simulation.sensors=laser. Keys: docs/configuration.md.")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing recording.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Simulate a drive with wheel odometry and an RGB-D camera or a laser. Writes a bag or TUM folder with ground truth."""
     from hybridmap.cli.choose import parse_settings

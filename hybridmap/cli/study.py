@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hybridmap.cli.options import AsJson
+
 if TYPE_CHECKING:
     from hybridmap.study.pools import Pool
     from hybridmap.study.statistics import Summary
@@ -40,7 +42,7 @@ def study(
     setting: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE of the study, e.g. seeds=3. Keys: docs/studies.md.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Run a study: map or solve every combination of source, setting, back-end, false loops and seed; compare the back-ends.
 

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from hybridmap.cli.options import AsJson
+
 
 def verify(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for verify.html and metrics.json.")],
@@ -16,7 +18,7 @@ def verify(
         typer.Option("--set", help="KEY=VALUE of the cells, e.g. neural.spacing_max_m=0.6. Keys: docs/configuration.md."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing verification.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Verify the head-direction, band, grid and place cells against stated limits (m, rad, deg, %). Writes a page.
 

@@ -89,6 +89,19 @@ def relax_links(graph: PoseGraph, start: Array, sweeps: int, config: RelaxationC
     return Relaxed(poses, done, settled)
 
 
+@compiled("float64(float64[:, ::1], float64[:, ::1])")
+def _most_moved(poses: Array, before: Array) -> float:
+    """Largest change of a coordinate, m or rad; infinite if one is infinite or no number."""
+    most = 0.0
+    for node in range(len(poses)):
+        for k in range(3):
+            moved = abs(poses[node, k] - before[node, k])
+            if not moved < np.inf:
+                return np.inf
+            most = max(most, moved)
+    return most
+
+
 @compiled(_SIGNATURE)
 def _sweep(
     poses: Array,
@@ -134,13 +147,9 @@ def _sweep(
             poses[target, 0] -= rate * dx
             poses[target, 1] -= rate * dy
             poses[target, 2] -= rate * turn
-        settled, finite = scale == 1.0, True
-        for node in range(len(poses)):
-            for k in range(3):
-                moved = abs(poses[node, k] - before[node, k])
-                settled = settled and moved <= tolerance
-                finite = finite and moved < np.inf
-        if settled or not finite:
+        moved = _most_moved(poses, before)
+        settled = scale == 1.0 and moved <= tolerance
+        if settled or not moved < np.inf:
             return done, settled
         theta *= theta_decay
     return sweeps, False
