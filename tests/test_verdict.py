@@ -120,15 +120,41 @@ def test_a_map_that_false_loops_bend_is_doubted():
     assert "bent" in kinds
 
 
-def test_a_calibrated_bend_is_none():
+@pytest.fixture(scope="module")
+def clean() -> PoseGraph:
     graph = laps(SyntheticConfig(nodes=240, per_lap=60), 0).graph
     assert graph is not None
-    pulled = with_drift(graph, DriftConfig(heading_bias_deg_per_m=3.0), 0)
-    plain, calibrated = (
-        reasons_of(Facts.of_graph(pulled, backends.create(name).solve(pulled))) for name in ("gtsam-lm", "gtsam-calibrated")
-    )
-    assert {reason.kind for reason in plain} == {"bent", "edges contradict"}
-    assert calibrated == ()
+    return graph
+
+
+def kinds_of(graph: PoseGraph, backend: str = "gtsam-lm") -> set[str]:
+    return {reason.kind for reason in reasons_of(Facts.of_graph(graph, backends.create(backend).solve(graph)))}
+
+
+PULLED = DriftConfig(heading_bias_deg_per_m=3.0)
+
+
+@pytest.mark.parametrize("backend", ["gtsam-lm", "gtsam-calibrated"])
+def test_odometry_that_pulls_alike_everywhere_is_no_reason_where_loops_of_either_half_say_so(clean, backend):
+    assert kinds_of(with_drift(clean, PULLED, 0), backend) == set()
+
+
+def test_odometry_that_pulls_is_a_reason_where_one_place_alone_says_so(clean):
+    graph = with_drift(clean, PULLED, 0)
+    few = np.flatnonzero(graph.is_loop)[-8:]
+    assert "bent" in kinds_of(graph.with_edges(np.union1d(np.flatnonzero(graph.is_motion), few)))
+
+
+def test_odometry_that_errs_by_chance_is_a_reason(clean):
+    assert {"bent", "edges contradict"} <= kinds_of(with_drift(clean, DriftConfig(noise=4.0), 0))
+
+
+@pytest.mark.parametrize("kind", [EdgeKind.ODOMETRY, EdgeKind.LOOP])
+def test_odometry_that_pulls_hides_no_wrong_edge(clean, kind):
+    graph = with_drift(clean, PULLED, 0)
+    deltas, edge = graph.deltas.copy(), np.flatnonzero(graph.kinds == kind)[100]
+    deltas[edge] = compose(deltas[edge], np.array([0.0, 3.0, 0.0]))
+    assert "bent" in kinds_of(replace(graph, deltas=deltas))
 
 
 def test_a_back_end_that_gave_nothing_has_failed():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,13 @@ from hybridmap.backends.base import ODOMETRY, SolveStatus
 from hybridmap.backends.judging.breaks import SAME_DEG, SAME_M
 from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.judging.rivals import Rival, rivals, spans
-from hybridmap.backends.judging.strain import bend_of, largest_bend, optimum
+from hybridmap.backends.judging.strain import bend_of, largest_bend, optimum, straightened
 from hybridmap.backends.objective import SLACK, squared_norms, unit_variance
 from hybridmap.calibration.clock import MATTERS_S, TRANSPORT_S, ClockState
 from hybridmap.graph.agreement import BOUND
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.paths import chain_of
+from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.verdict.facts import Facts
 from hybridmap.verdict.reasons import Reason, Verdict
 
@@ -92,22 +93,39 @@ def _moves(rival: Rival) -> bool:
     return rival.shift_m > SAME_M or rival.turn_rad > math.radians(SAME_DEG)
 
 
-def bent(facts: Facts) -> Iterable[Reason]:
-    """The map bends the chain of motion more than the noise of its edges allows."""
+def strained(facts: Facts) -> Iterable[Reason]:
+    """The map bends the chain of motion, is not where its own edges are met best, or they contradict each other even there.
+
+    Odometry that errs alike on every metre bends the chain too. Such a map is judged by its calibrated odometry, if the
+    loops of either half of the drive find a calibration that straightens the whole chain.
+    """
     if facts.solution is None or facts.poses is None:
         return []
+    graph = facts.graph.with_edges(facts.in_map)
+    straight, bends = graph, _bent(facts, graph)
+    for straight in straightened(graph, facts.poses, TOGETHER) if bends else ():
+        if _bent(facts, straight):
+            return [*bends, *_at_odds(facts, graph)]
+    return [*(bends if straight is graph else ()), *_at_odds(facts, straight)]
+
+
+def _bent(facts: Facts, graph: PoseGraph) -> list[Reason]:
+    """The map bends the chain of motion more than the noise of its edges allows."""
+    assert facts.solution is not None
+    assert facts.poses is not None
     variance = facts.solution.report.unit_variance
-    bend = largest_bend(facts.graph.with_edges(facts.in_map), facts.poses, min(variance or 1.0, 1.0))
+    bend = largest_bend(graph, facts.poses, min(variance or 1.0, 1.0))
     if bend is None or bend.sigmas <= BENT_MAX:
         return []
     return [facts.reason("bent", bend.sigmas, BENT_MAX, node=bend.first, until=bend.last, apart_m=bend.apart_m)]
 
 
-def at_odds(facts: Facts) -> Iterable[Reason]:
+def _at_odds(facts: Facts, graph: PoseGraph) -> Iterator[Reason]:
     """The map is not where its own edges are met best, or they contradict each other even there."""
-    if facts.solution is None or facts.poses is None or facts.solution.report.weak_edges:
+    assert facts.solution is not None
+    assert facts.poses is not None
+    if facts.solution.report.weak_edges:
         return
-    graph = facts.graph.with_edges(facts.in_map)
     best = optimum(graph, facts.poses)
     apart_m = float(np.hypot(*(best - facts.poses)[:, :2].T).max())
     if apart_m > UNSETTLED_MAX_M:
@@ -209,8 +227,7 @@ RULES: tuple[Callable[[Facts], Iterable[Reason]], ...] = (
     no_map,
     refused_together,
     none_kept,
-    bent,
-    at_odds,
+    strained,
     against_wheels,
     contradicted_odometry,
     clock_offset,

@@ -95,7 +95,7 @@ def _from(graph: PoseGraph, config: BackendsConfig, gains: Array, driven: Array 
     outcome = gnc.best(straight, config, driven)
     for _ in range(3):
         before = outcome.rejected
-        gains, poses = _calibrate(graph, gains, outcome, config)
+        gains, poses = calibrate(graph.with_edges(~np.isin(graph.edge_ids, before)), gains, outcome.poses, config)
         straight = with_calibrated_odometry(graph, Gains.from_array(gains))
         outcome = gnc.best(straight, config, poses)
         if outcome.rejected == before:
@@ -104,15 +104,24 @@ def _from(graph: PoseGraph, config: BackendsConfig, gains: Array, driven: Array 
     return _Found(straight, outcome, gains, cost)
 
 
-def _calibrate(graph: PoseGraph, gains: Array, outcome: Outcome, config: BackendsConfig) -> tuple[Array, Array]:
-    """Gauss-Newton on the three gains, with the optimal poses at each step; returns both."""
-    kept, models = ~np.isin(graph.edge_ids, outcome.rejected), noise_models(config.robust)
-    poses = outcome.poses
+def calibrate(graph: PoseGraph, gains: Array, poses: Array, config: BackendsConfig) -> tuple[Array, Array]:
+    """Gauss-Newton on the three gains, with the optimal poses at each step.
+
+    Args:
+        graph: uncalibrated odometry, and the edges that are held for right.
+        gains: (3,) gain, turn gain and heading bias to begin with.
+        poses: (N, 3) poses to begin with, m and rad.
+        config: settings of the robust kernels, and the most iterations for the poses.
+
+    Returns:
+        The gains (3,) and the poses (N, 3) that belong to them.
+    """
+    models = noise_models(config.robust)
     for _ in range(_ROUNDS):
-        straight = with_calibrated_odometry(graph, Gains.from_array(gains)).with_edges(kept)
+        straight = with_calibrated_odometry(graph, Gains.from_array(gains))
         poses = run("lm", factor_graph(straight, models), poses, config.max_iterations).poses
         try:
-            step = _gain_step(graph.with_edges(kept), softened(straight, poses, config.robust), poses, gains)
+            step = _gain_step(graph, softened(straight, poses, config.robust), poses, gains)
         except (BackendError, np.linalg.LinAlgError):  # singular: nothing tells the gains from the poses
             break
         if not np.isfinite(step).all():

@@ -1,21 +1,33 @@
-"""How far a map is from what its own edges say: where it bends the chain of motion, and how far it is from their optimum."""
+"""How far a map is from what its own edges say: where it bends the chain of motion, and how far it is from their optimum.
+
+A bent chain means wrong loops or wrong motion. One kind of wrong motion does no harm where loops hold the map: wheels that
+err alike on every metre. `straightened` tells it from the others.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.gtsam.batch import run
+from hybridmap.backends.gtsam.calibrated import calibrate, with_calibrated_odometry
 from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph
+from hybridmap.config.backends import BackendsConfig
+from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array, between, log
-from hybridmap.graph.paths import Chain, chain_of
+from hybridmap.graph.paths import Chain, chain_of, own_odometry
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.odometry_model import NEUTRAL, Gains
 
 WINDOWS_M = (5.0, 10.0, 20.0)
 """Stretches on which map and chain are compared: shorter ones judge single edges, longer ones the drift of good odometry."""
+APART_M = 10.0
+"""Way between the middles of two sets of loops from which on they say different things about the chain of motion."""
 _ITERATIONS, _TOLERANCE = 30, 1e-9
 
 
@@ -47,8 +59,7 @@ def largest_bend(graph: PoseGraph, poses: Array, variance: float = 1.0) -> Bend 
         None if the drive is too short.
     """
     chain = chain_of(graph)
-    steps = np.hypot(*np.diff(chain.poses[:, :2], axis=0).T)
-    travel, worst = np.concatenate([[0.0], steps.cumsum()]), None
+    travel, worst = _travel(chain), None
     for window_m in WINDOWS_M:
         last = np.searchsorted(travel, travel + window_m)
         first = np.flatnonzero(last < graph.n_nodes)
@@ -79,3 +90,47 @@ def _most_bent(chain: Chain, poses: Array, first: NDArray[np.int64], last: NDArr
 def optimum(graph: PoseGraph, poses: Array) -> Array:
     """Poses (N, 3) where the edges of a graph are met best in least squares, searched from poses (N, 3); m and rad."""
     return run("lm", factor_graph(graph, NoiseModels()), poses, _ITERATIONS, tolerance=_TOLERANCE).poses
+
+
+def straightened(graph: PoseGraph, poses: Array, least: int) -> Iterator[PoseGraph]:
+    """The graph with its odometry calibrated to a map, in several ways that must all straighten its chain.
+
+    Gain, turn gain and heading bias are three numbers for the whole drive. If loops of one half of the drive find numbers
+    that straighten the other half too, the odometry errs alike everywhere. Wrong loops, a slip or a kidnapping bend the
+    chain at one place, which no such numbers straighten.
+
+    Args:
+        graph: the edges of the map.
+        poses: (N, 3) poses of the map, m and rad.
+        least: fewest loops of a half.
+
+    Yields:
+        The graph calibrated by the steps of the map, which is quick, by the loops of the earlier half, by those of the later
+        half, and by all. Nothing if the loops cannot be halved; no more from numbers on that no robot has.
+    """
+    loops, travel = np.flatnonzero(graph.is_loop), _travel(chain_of(graph))
+    newer = np.maximum(graph.sources, graph.targets)[loops]
+    order = np.argsort(newer, kind="stable")
+    earlier, later = order[: len(order) // 2], order[len(order) // 2 :]
+    if len(earlier) < least or travel[int(np.median(newer[later]))] - travel[int(np.median(newer[earlier]))] < APART_M:
+        return
+    with suppress(EvaluationError):
+        yield with_calibrated_odometry(graph, _gains_of(graph, poses))
+        for left_out in (later, earlier, order[:0]):
+            kept = graph.with_edges(np.setdiff1d(np.arange(graph.n_edges), loops[left_out]))
+            gains, _ = calibrate(kept, NEUTRAL.to_array(), poses, BackendsConfig())
+            yield with_calibrated_odometry(graph, Gains.from_array(gains).checked("odometry"))
+
+
+def _gains_of(graph: PoseGraph, poses: Array) -> Gains:
+    """The calibration with which the odometry edges fit the steps of a map best, in least squares."""
+    own = own_odometry(graph)
+    raw, seen = log(graph.deltas[own]), log(between(poses[graph.sources[own]], poses[graph.targets[own]]))
+    more = np.sum(raw[:, :2] * (seen - raw)[:, :2]) / max(float(np.sum(raw[:, :2] ** 2)), 1e-12)
+    turn, bias = np.linalg.lstsq(raw[:, [2, 0]], seen[:, 2] - raw[:, 2])[0]
+    return Gains(1.0 + more, 1.0 + turn, bias).checked("odometry")
+
+
+def _travel(chain: Chain) -> Array:
+    """Path length (N,) along a chain, m."""
+    return np.concatenate([[0.0], np.hypot(*np.diff(chain.poses[:, :2], axis=0).T).cumsum()])
