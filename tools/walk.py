@@ -14,9 +14,8 @@ import os
 import statistics
 import sys
 from collections import Counter
-from collections.abc import Mapping
 from pathlib import Path
-from types import FrameType, MappingProxyType
+from types import FrameType
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -38,7 +37,7 @@ def main() -> None:
         print(f"{times / len(counts):6.0%}  {file}")
 
 
-def walk(source: str, end_s: float, package: Path, overrides: Mapping[str, Any] = MappingProxyType({})) -> list[set[str]]:
+def walk(source: str, end_s: float, package: Path) -> list[set[str]]:
     """Return one set of files for each node: those whose functions were called in the step that made it."""
     from hybridmap.cli.choose import choose
     from hybridmap.mapper import Mapper
@@ -66,7 +65,7 @@ def walk(source: str, end_s: float, package: Path, overrides: Mapping[str, Any] 
                 visited.append({str(path.relative_to(package)) for path in inside})
             return update
 
-    chosen = choose(source, None, overrides, end_s=end_s)
+    chosen = choose(source, None, {}, end_s=end_s)
     mapper = Watched(chosen.config, chosen.stream.rig)
     for sample in chosen.stream:
         mapper.add(sample)

@@ -147,18 +147,13 @@ def what_became_of(key: str, value: Any = None) -> str | None:
     return f"{key} is no longer a section of settings; {what_became_of(first)}"
 
 
-def without_gone(tree: Mapping[str, Any], at: str = "") -> dict[str, Any]:
-    """Copy a stored configuration: removed settings are left out, renamed ones get their new names.
-
-    Args:
-        tree: nested mapping of sections.
-        at: dotted name of the section that `tree` is; empty for the whole configuration.
-    """
+def without_gone(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Copy a stored configuration, a mapping of sections: removed settings are left out, renamed ones get their new names."""
     kept: dict[str, Any] = {}
-    for dotted, value in _leaves(tree, at):
+    for dotted, value in _leaves(tree, ""):
         if _is_gone(dotted):
             continue
-        *sections, last = RENAMED.get(dotted, dotted).removeprefix(f"{at}." if at else "").split(".")
+        *sections, last = RENAMED.get(dotted, dotted).split(".")
         place = kept
         for section in sections:
             place = place.setdefault(section, {})

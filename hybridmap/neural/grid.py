@@ -244,17 +244,12 @@ class PhaseDecoder:
     start selects the repetition and has no other effect: the result is the same for every start in its basin.
     """
 
-    def __init__(self, wave_vectors: NDArray[np.float64], box_m: float = DECODE_BOX_M) -> None:
-        """Set up the decoder.
-
-        Args:
-            wave_vectors: (M, 3, 2) of the bands, cycles per metre.
-            box_m: half side of the box that is searched if the modules do not agree at a start, m.
-        """
+    def __init__(self, wave_vectors: NDArray[np.float64]) -> None:
+        """Set up the decoder for bands with wave vectors (M, 3, 2), cycles per metre."""
         self._waves = wave_vectors.reshape(-1, 2)
         self._solve = np.linalg.pinv(self._waves)
         tick = 1.0 / (6.0 * float(np.linalg.norm(self._waves, axis=1).max()))
-        half = int(np.ceil(box_m / tick))
+        half = int(np.ceil(DECODE_BOX_M / tick))
         self._ticks = np.arange(-half, half + 1) * tick
 
     def decode(self, phases_cycles: NDArray[np.float64], last_m: Array, starts_m: Callable[[], Array]) -> Decoded:

@@ -13,6 +13,8 @@ BAND_CELLS = 32
 """Cells of a band ring (three rings a module): a stripe is then some three cells wide."""
 BAND_WIDTH = 0.1
 """Stripe width r as a share of the period; the rate is exp(-(s - l/2)^2 / (2 r^2))."""
+MODULATION_S = 0.1
+"""Gain of the head-direction rates per turn rate, s: real cells fire more while the head turns."""
 ORIENTATIONS_DEG = (0.0, 60.0, 120.0)
 SQUARE_ORIENTATIONS_DEG = (0.0, 45.0, 90.0)
 
@@ -74,9 +76,9 @@ class HeadDirectionRing:
         self.activity = self._vector.dot(self._tuning)
         return middle_c, middle_s
 
-    def rates(self, turn_rate_rad_s: float = 0.0, modulation_s: float = 0.1) -> NDArray[np.floating]:
-        """Return the rates (m,) with the turn-rate modulation of real cells, gain 1 + modulation |omega|; no state changes."""
-        return self.activity * (1.0 + modulation_s * abs(turn_rate_rad_s))
+    def rates(self, turn_rate_rad_s: float = 0.0) -> NDArray[np.floating]:
+        """Rates (m,) with the turn-rate modulation of real cells, gain 1 + `MODULATION_S` |omega|; no state changes."""
+        return self.activity * (1.0 + MODULATION_S * abs(turn_rate_rad_s))
 
 
 class BandMotion(NamedTuple):

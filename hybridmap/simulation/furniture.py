@@ -18,11 +18,9 @@ def _beside(at: Spot, yaw_deg: float, forward_m: float, left_m: float) -> Spot:
     return float(at[0] + cos * forward_m - sin * left_m), float(at[1] + sin * forward_m + cos * left_m)
 
 
-def table(
-    at: Spot, yaw_deg: float, size: tuple[float, float], height_m: float = 0.74, color: Color = (168, 126, 84)
-) -> list[Facet]:
+def table(at: Spot, yaw_deg: float, size: tuple[float, float], height_m: float = 0.74) -> list[Facet]:
     """Surfaces of a table at (x, y), m: `size` is its depth and width, and it stands on four legs."""
-    out = box(at, (*size, 0.04), paints.wood(color), bottom_m=height_m - 0.04, yaw_deg=yaw_deg)
+    out = box(at, (*size, 0.04), paints.wood((168, 126, 84)), bottom_m=height_m - 0.04, yaw_deg=yaw_deg)
     leg = paints.metal((88, 90, 96))
     for forward in (-0.5 * size[0] + 0.05, 0.5 * size[0] - 0.05):
         for left in (-0.5 * size[1] + 0.05, 0.5 * size[1] - 0.05):
@@ -93,9 +91,9 @@ def plant(at: Spot, height_m: float = 1.3) -> list[Facet]:
     return out + box(at, (0.34, 0.34, crown * 0.4), pictures.leaves(), bottom_m=middle + 0.6 * crown, yaw_deg=70, px_per_m=140)
 
 
-def sofa(at: Spot, yaw_deg: float, width_m: float = 1.8, color: Color = (146, 62, 52)) -> list[Facet]:
+def sofa(at: Spot, yaw_deg: float) -> list[Facet]:
     """Surfaces of a sofa at (x, y), m, whose front faces `yaw_deg`."""
-    cloth = paints.fabric(color)
+    width_m, cloth = 1.8, paints.fabric((146, 62, 52))
     out = box(at, (0.8, width_m, 0.42), cloth, yaw_deg=yaw_deg)
     out += box(_beside(at, yaw_deg, -0.32, 0.0), (0.18, width_m, 0.4), cloth, bottom_m=0.42, yaw_deg=yaw_deg)
     for left in (-0.5 * width_m + 0.09, 0.5 * width_m - 0.09):

@@ -65,28 +65,26 @@ def plain(_rng: Rng, shape: Shape, _px_per_m: float, color: Color) -> Image:
 
 
 @material
-def plaster(
-    rng: Rng, shape: Shape, px_per_m: float, color: Color, *, skirting: Color | None = (92, 84, 76), scuffs: float = 0.5
-) -> Image:
-    """Texture of a painted wall: faint clouds, `scuffs` marks a metre, and a skirting board of the colour `skirting`."""
+def plaster(rng: Rng, shape: Shape, px_per_m: float, color: Color) -> Image:
+    """Texture of a painted wall: faint clouds, a mark every two metres, and a skirting board."""
     tone = 1.0 + 0.012 * smooth_noise(rng, shape, 0.6 * px_per_m) + 0.012 * smooth_noise(rng, shape, 0.03 * px_per_m)
     image = tint(color, tone)
-    for _ in range(rng.poisson(scuffs * shape[1] / px_per_m)):
+    for _ in range(rng.poisson(0.5 * shape[1] / px_per_m)):
         x, y = int(rng.integers(shape[1])), int(shape[0] * (1.0 - rng.beta(1.3, 4.0)))
         end = (x + int(rng.normal(0, 0.08) * px_per_m), y + int(rng.normal(0, 0.03) * px_per_m))
         shade = vary(rng, tuple(int(0.72 * channel) for channel in color), 25)  # type: ignore[arg-type]
         cv2.line(image, (x, y), end, shade, int(rng.integers(1, 3)), cv2.LINE_AA)
-    if skirting is not None and shape[0] > 1.5 * px_per_m:
-        image[shape[0] - round(0.09 * px_per_m) :] = skirting
+    if shape[0] > 1.5 * px_per_m:
+        image[shape[0] - round(0.09 * px_per_m) :] = (92, 84, 76)
     return image
 
 
 @material
-def carpet(rng: Rng, shape: Shape, px_per_m: float, color: Color, *, tile_m: float = 0.5, contrast: float = 0.05) -> Image:
-    """Texture of carpet tiles with the side `tile_m`: each has its own tone, and there are a few stains."""
-    tile_px = max(2, round(tile_m * px_per_m))
+def carpet(rng: Rng, shape: Shape, px_per_m: float, color: Color) -> Image:
+    """Texture of carpet tiles of half a metre: each has its own tone, and there are a few stains."""
+    tile_px = max(2, round(0.5 * px_per_m))
     rows, columns = -(-shape[0] // tile_px), -(-shape[1] // tile_px)
-    tones = 1.0 + contrast * rng.standard_normal((rows, columns), dtype=np.float32)
+    tones = 1.0 + 0.05 * rng.standard_normal((rows, columns), dtype=np.float32)
     tone = np.repeat(np.repeat(tones, tile_px, axis=0), tile_px, axis=1)[: shape[0], : shape[1]].copy()
     tone += 0.06 * smooth_noise(rng, shape, 0.04 * px_per_m) + 0.05 * smooth_noise(rng, shape, 0.15 * px_per_m)
     tone += 0.05 * rng.standard_normal(shape, dtype=np.float32)
@@ -117,21 +115,21 @@ def wood(rng: Rng, shape: Shape, px_per_m: float, color: Color = (150, 108, 70),
 
 
 @material
-def bricks(rng: Rng, shape: Shape, px_per_m: float, color: Color = (156, 82, 62), mortar: Color = (178, 170, 160)) -> Image:
+def bricks(rng: Rng, shape: Shape, px_per_m: float) -> Image:
     """Texture of a brick wall; every brick has its own tone."""
-    image = np.full((*shape, 3), mortar, dtype=np.uint8)
+    image = np.full((*shape, 3), (178, 170, 160), dtype=np.uint8)
     height, width = max(3, round(0.077 * px_per_m)), max(6, round(0.25 * px_per_m))
     gap = max(1, round(0.012 * px_per_m))
     for row, top in enumerate(range(0, shape[0], height)):
         for left in range(-(row % 2) * width // 2, shape[1], width):
-            shade = tuple(int(c * rng.uniform(0.72, 1.15)) for c in color)
+            shade = tuple(int(c * rng.uniform(0.72, 1.15)) for c in (156, 82, 62))
             cv2.rectangle(image, (left, top), (left + width - gap - 1, top + height - gap - 1), shade, -1)
     tone = 1.0 + 0.05 * rng.standard_normal(shape, dtype=np.float32)
     return np.clip(image * tone[..., None], 0, 255).astype(np.uint8)
 
 
 @material
-def ceiling_tiles(rng: Rng, shape: Shape, px_per_m: float, color: Color = (226, 224, 216)) -> Image:
+def ceiling_tiles(rng: Rng, shape: Shape, px_per_m: float) -> Image:
     """Texture of a suspended ceiling: tiles of 60 cm with seams and pinholes."""
     tone = 1.0 - 0.10 * (rng.random(shape, dtype=np.float32) > 0.985)
     tile_px = max(2, round(0.6 * px_per_m))
@@ -139,7 +137,7 @@ def ceiling_tiles(rng: Rng, shape: Shape, px_per_m: float, color: Color = (226, 
     tone = tone * np.repeat(np.repeat(tones, tile_px, axis=0), tile_px, axis=1)[: shape[0], : shape[1]]
     tone[::tile_px] *= 0.8
     tone[:, ::tile_px] *= 0.8
-    return tint(color, tone.astype(np.float32))
+    return tint((226, 224, 216), tone.astype(np.float32))
 
 
 @material

@@ -208,10 +208,10 @@ def screen(rng: Rng, shape: Shape, px_per_m: float) -> Image:
 
 
 @material
-def parcel(rng: Rng, shape: Shape, px_per_m: float, color: Color = (176, 136, 92)) -> Image:
+def parcel(rng: Rng, shape: Shape, px_per_m: float) -> Image:
     """Texture of the side of a cardboard box: tape, label, print."""
     height, width = shape
-    image = np.ascontiguousarray(tint(vary(rng, color, 14), 1.0 + 0.04 * smooth_noise(rng, shape, 0.05 * px_per_m)))
+    image = np.ascontiguousarray(tint(vary(rng, (176, 136, 92), 14), 1.0 + 0.04 * smooth_noise(rng, shape, 0.05 * px_per_m)))
     tape = max(2, round(0.05 * px_per_m))
     cv2.rectangle(image, (width // 2 - tape // 2, 0), (width // 2 + tape // 2, height // 3), (206, 184, 140), -1)
     left, top = int(rng.uniform(0.05, 0.5) * width), int(rng.uniform(0.35, 0.6) * height)

@@ -193,16 +193,14 @@ def partition(
     *,
     openings: Sequence[tuple[float, float]] = (),
     height_m: float = 2.6,
-    thickness_m: float = 0.12,
 ) -> list[Facet]:
-    """Surfaces of a straight wall with door openings; above an opening the wall continues.
+    """Surfaces of a straight wall, 12 cm thick, with door openings; above an opening the wall continues.
 
     Args:
         start, end: (2,) end points of the wall, m.
         paint: paint of its faces.
         openings: (start, end) of each opening, metres from `start`, in ascending order.
         height_m: height of the wall.
-        thickness_m: thickness of the wall.
     """
     first, last = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     length = float(np.linalg.norm(last - first))
@@ -215,5 +213,5 @@ def partition(
             continue
         bottom = DOOR_HEIGHT_M if index % 2 else 0.0
         middle = first + 0.5 * (a + b) * direction
-        out += box(middle, (b - a, thickness_m, height_m - bottom), paint, bottom_m=bottom, yaw_deg=yaw_deg)
+        out += box(middle, (b - a, 0.12, height_m - bottom), paint, bottom_m=bottom, yaw_deg=yaw_deg)
     return out

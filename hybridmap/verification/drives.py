@@ -52,9 +52,9 @@ def wander(rng: np.random.Generator, distance_m: float, hz: float) -> ExactDrive
     return _along(np.array(motions), hz)
 
 
-def corridor(rng: np.random.Generator, hz: float, length_m: float = 16.8) -> ExactDrive:
-    """A drive down a corridor at 0.5 m/s, swaying a little."""
-    steps = round(length_m / 0.5 * hz)
+def corridor(rng: np.random.Generator, hz: float) -> ExactDrive:
+    """A drive of 16.8 m down a corridor at 0.5 m/s, swaying a little."""
+    steps = round(16.8 / 0.5 * hz)
     sway = 0.05 * np.sin(np.arange(steps + 1) / hz * 2.0 * np.pi / 6.0 + rng.uniform(0.0, 2.0 * np.pi))
     return _along(np.stack([np.full(steps, 0.5 / hz), np.diff(sway)], axis=1), hz)
 

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from hybridmap.geometry import Array, compose, wrap_angle
 from hybridmap.vision.laser.cloud import Cloud, LikelihoodField
 
+OTHER_M, REACH_M = 0.4, 3.0
+"""Smallest shift along a wall that is another position, and the largest one that is tried, m."""
+
 
 def score_poses(field: LikelihoodField, points: Array, poses: Array) -> Array:
     """Mean likelihood (N,) in [0, 1] of points (P, 2) in a moving frame at each of N poses (N, 3)."""
@@ -21,17 +24,15 @@ def score_poses(field: LikelihoodField, points: Array, poses: Array) -> Array:
     return np.asarray(hits / (255.0 * max(len(points), 1)))
 
 
-def ambiguity(field: LikelihoodField, points: Array, direction: Array, apart_m: float = 0.4, reach_m: float = 3.0) -> float:
+def ambiguity(field: LikelihoodField, points: Array, direction: Array) -> float:
     """Likelihood of the second-best position along a direction, as a share of that of the registered pose.
 
     Args:
         field: likelihood field of the target.
         points: (P, 2) registered points, in the target's frame.
         direction: (2,) unit vector along which the points are shifted.
-        apart_m: smallest shift that counts as another position.
-        reach_m: largest shift tried.
     """
-    side = np.arange(apart_m, reach_m, 0.1)
+    side = np.arange(OTHER_M, REACH_M, 0.1)
     shifts = np.concatenate([[0.0, -0.1, 0.1, -0.2, 0.2], -side, side])
     x = points[:, 0] + shifts[:, None] * direction[0]
     y = points[:, 1] + shifts[:, None] * direction[1]
@@ -228,10 +229,9 @@ class Alignment:
         return np.asarray(out)
 
 
-def ambiguity_of(field: LikelihoodField, cloud: Cloud, alignment: Alignment, k: int = 0) -> float:
-    """Ambiguity of registration k along its least certain direction; see `ambiguity`."""
-    pose = alignment.poses[k]
-    weakest = alignment.weakest_direction(k)
+def ambiguity_of(field: LikelihoodField, cloud: Cloud, alignment: Alignment) -> float:
+    """Ambiguity of the first registration along its least certain direction; see `ambiguity`."""
+    pose, weakest = alignment.poses[0], alignment.weakest_direction(0)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     direction = np.array([cos * weakest[0] - sin * weakest[1], sin * weakest[0] + cos * weakest[1]])
     return ambiguity(field, cloud.moved(pose).points, direction)
