@@ -35,7 +35,7 @@ def register(name: str, factory: Factory) -> None:
     """Add a front-end under a name, so that the setting `vision.sensor` can choose it.
 
     Installed packages can offer one by an entry point of the group `hybridmap.front_ends`. A new kind of sensor brings its
-    front-end with it, see `streams.sensors.register`.
+    front-end with it, see `streams.sensors.register`. `factory` gets the arguments of `create_front_end`; it may return None.
 
     Raises:
         ConfigError: a front-end of this name exists.
@@ -44,7 +44,7 @@ def register(name: str, factory: Factory) -> None:
 
 
 def create_front_end(config: VisionConfig, rig: Rig, seed: int, clock: StageClock | None = None) -> FrontEnd | None:
-    """Make the front-end for a source. `auto` chooses that of the first kind of sensor of the source.
+    """Make the front-end that the setting `vision.sensor` names; `auto` chooses that of the source's first kind of sensor.
 
     Args:
         config: settings of the visual side.

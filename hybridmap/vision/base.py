@@ -26,10 +26,10 @@ class Belief:
     Attributes:
         poses_map_node: (N, 3) current estimate of every node by the primary back-end (or the integrator's own poses where
             the configuration says `gate: odometry`), m and rad.
-        stamps_s: (N,) creation time of each node.
-        travel_m: (N,) path length at each node.
-        covariance_from: node -> (N, 3, 3) covariance of every node's pose relative to that node, propagated along the
-            shortest graph path (accepted edges only).
+        stamps_s: (N,) stamp of each node, s.
+        travel_m: (N,) path length from node 0 to each node, m.
+        covariance_from: node -> (N, 3, 3) covariance of every node's pose relative to that node, m^2 and rad^2, in each node's
+            own frame. It is propagated along the shortest path of accepted edges; infinite on the diagonal where there is none.
     """
 
     poses_map_node: Array
@@ -38,7 +38,7 @@ class Belief:
     covariance_from: Callable[[int], Array]
 
     def ways(self, first: Indices, second: Indices) -> RelativePose:
-        """Return the poses of nodes `second` (P,) in the frames of nodes `first` (P,), with covariances.
+        """Return the poses of nodes `second` (P,) in the frames of nodes `first` (P,), with covariances (0 for a node itself).
 
         Costs a shortest-path search of the graph for each distinct node in `first` that is not seen from itself alone.
         """
@@ -55,7 +55,7 @@ class View:
     Attributes:
         stamp_ns: time of the frame.
         profile: (bands, width) float32, normalised as configured.
-        template: number of the view template that the frame matched, or of the new one made from it.
+        template: number of the most similar view template, or of the new one made from this frame; -1 if there are none.
         new_template: whether a new view template was made from this frame.
     """
 
@@ -73,19 +73,30 @@ class FrontEnd(Protocol):
     """
 
     def observe(self, frame: Observation, delta_node_robot: Array) -> View:
-        """Take in one frame; `delta_node_robot` (3,) is the integrator's motion since the last node (identity at first)."""
+        """Take in one frame; it becomes a node only by `add_node`.
+
+        `delta_node_robot` (3,) is the robot's pose in the frame of the node from which it is seen, usually the last one, by
+        the path integrator, m and rad (identity before the first node).
+        """
 
     def add_node(self, node: int, view: View) -> None:
-        """Make a node of the frame that was observed last. Nodes are numbered from 0 without gaps."""
+        """Make a node of the frame that was observed last; `view` is what `observe` returned for it.
+
+        Nodes are numbered from 0 without gaps.
+        """
 
     def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
-        """Register the new node to the nodes before it; returns the registrations as proposed edges.
+        """Register the new node to the nodes before it.
 
         `odometry` is the pose of the new node in the frame of node - 1 (None for the first node).
+        Returns the registrations as edges from these nodes to the new one, rejected ones too, and earlier edges that changed.
         """
 
     def close(self, node: int, belief: Belief) -> list[Edge]:
-        """Look for loop closures of the new node; returns new edges, and earlier ones whose status changed."""
+        """Look for loop closures of the new node; returns new edges, rejected ones too, and earlier ones that changed.
+
+        The newer node is the source of a loop. `belief` contains the new node.
+        """
 
     def finish(self, belief: Belief) -> list[Edge]:
         """At the end of the drive, decide pending edges and propose loops between nodes near each other on the optimised map.
@@ -95,10 +106,16 @@ class FrontEnd(Protocol):
 
     @property
     def lost_since(self) -> int | None:
-        """First node after the robot was kidnapped or lost track of its motion; None while it is localised on the map."""
+        """Node from which on the robot's place on the map is unknown, as its motion broke before it (e.g. a kidnapping).
+
+        None if there is no such node. It is also None for a robot that only fails to recognise known places.
+        """
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
-        """Arrays of a node's frame for the map file: `profile`, and `ranges_m` (laser) or `color` and `depth_mm` (RGB-D)."""
+        """Arrays of a node's frame for the map file: `profile`, and `ranges_m` (laser) or `color` and `depth_mm` (RGB-D).
+
+        Ask soon after the node was made: a camera keeps the images of the newest nodes only.
+        """
 
 
 @runtime_checkable
@@ -106,9 +123,10 @@ class VerifyingFrontEnd(FrontEnd, Protocol):
     """A front-end that can measure again those loops that a back-end down-weighted as outliers."""
 
     def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
-        """Measure outlier loops again, starting from the poses of the map.
+        """Measure outlier loops again, starting from the poses of `belief`, the map without them.
 
-        Returns the loops that changed, each with its key of before; a loop that is not returned stays as it is.
+        Returns the loops that changed, each with its key of before, rejected where it does not fit. A loop that is not returned
+        stays as it is.
         """
 
 
@@ -118,13 +136,13 @@ class PartingFrontEnd(FrontEnd, Protocol):
 
     @property
     def reach_m(self) -> float:
-        """Travel from a node within which the views of others take part in its loops, m."""
+        """Travel from a node within which the views of others take part in its loops, m; 0: only its own view does."""
 
     def way(self, node: int) -> tuple[Check, ...]:
-        """Checks of whether what was seen allows that the robot drove to a node from the one before."""
+        """Checks of whether what was seen allows that the robot drove to a node from the one before; empty if nothing tells."""
 
     def part(self, node: int) -> None:
-        """Note that the robot was kidnapped before a node: from now on nothing joins the views on either side."""
+        """Note that the robot was kidnapped between a node and the one before: from now on nothing joins views across it."""
 
 
 @runtime_checkable
@@ -132,7 +150,10 @@ class Overruling(Protocol):
     """A front-end that can judge again whether its registrations contradict the odometry."""
 
     def overrules(self, registration: RelativePose, odometry: RelativePose) -> bool:
-        """Whether a good registration of two consecutive nodes says that the odometry between them is wrong."""
+        """Whether a good registration of two consecutive nodes says that the odometry between them is wrong.
+
+        Both are the pose of the newer node in the frame of the older one. That the registration is good is taken for granted.
+        """
 
 
 @runtime_checkable
@@ -140,4 +161,4 @@ class DenseFrontEnd(FrontEnd, Protocol):
     """A front-end that can register the frames between nodes to the final map."""
 
     def dense_trajectory(self, belief: Belief) -> Anchors:
-        """Anchors of the dense trajectory: every frame registered to the final map. Called once, after the last `finish`."""
+        """Register every frame to `belief`, the final map; returns those that fit. Called once, after the last `finish`."""

@@ -19,7 +19,8 @@ class Gate:
     """Which older nodes a new node was compared with.
 
     Attributes:
-        radius_m, heading_deg: largest difference of position and heading from the new node.
+        radius_m, heading_deg: largest difference of position and heading from the new node; the largest radius, if each older
+            node has its own.
         older: number of nodes that were old enough to be compared.
         inside: number of those that lay within the radius and heading.
         whole_map: whether nodes outside were compared too, because the robot was lost.
@@ -32,7 +33,7 @@ class Gate:
     whole_map: bool = False
 
     def to_array(self) -> Array:
-        """The five attributes as an array (5,), as a map file stores them."""
+        """The five attributes in their order as an array (5,), as a map file stores them."""
         return np.array(astuple(self), dtype=np.float64)
 
     @classmethod

@@ -102,7 +102,7 @@ def _cell_means(image: NDArray[np.generic], width: int, bands: int) -> NDArray[n
 
 
 def sees_all_around(rig: Rig) -> bool:
-    """Whether the source has a laser whose field of view is a full circle."""
+    """Whether the source has a laser whose field of view is a full circle (at least 355 degrees)."""
     laser = rig.sensors.get(LASER.sensor_name)
     if laser is None:
         return False

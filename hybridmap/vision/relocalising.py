@@ -36,7 +36,10 @@ KEPT_STEPS = 1000
 
 
 class ChainState(Enum):
-    """How certain the motion to a new node is."""
+    """How certain the motion to a new node is.
+
+    It holds; or it is uncertain: the view fits those before, but may slide along a wall; or it is broken: the view fits none.
+    """
 
     HOLDS = "holds"
     UNCERTAIN = "uncertain"
@@ -68,22 +71,28 @@ class Whereabouts:
 
     @property
     def first_break(self) -> int | None:
-        """First node after broken or uncertain motion since the last loop closure; None if there is none."""
+        """First node after broken or uncertain motion since the last loop closure; None if there is none.
+
+        Uncertain motion that is forgotten and breaks that were mended do not count.
+        """
         return min(self._breaks, default=None)
 
     @property
     def lost_since(self) -> int | None:
-        """First node after broken motion since the last loop closure; None if there is none."""
+        """First node after broken motion (not uncertain motion) since the last loop closure; None if there is none."""
         return min((at for at, how in self._breaks.items() if how is ChainState.BROKEN), default=None)
 
     def break_before(self, node: int) -> int | None:
-        """First node after the last broken motion up to `node`, else after the last uncertain one; None if neither exists."""
+        """Node at which the last broken motion since the last loop closure ends, `node` included.
+
+        If none is broken, the node at which the last uncertain motion ends that is not forgotten; else None.
+        """
         before = [at for at in self._breaks if at <= node]
         certain = [at for at in before if self._breaks[at] is ChainState.BROKEN]
         return max(certain or before, default=None)
 
     def tracked(self, node: int, chain: ChainState) -> None:
-        """Note how certain the motion to a new node is."""
+        """Note how certain the motion to a new node is, and forget uncertain motion that is too old."""
         uncertain = [at for at, how in self._breaks.items() if how is ChainState.UNCERTAIN]
         for at in uncertain:
             if node - at > self._uncertain_nodes:
@@ -92,22 +101,26 @@ class Whereabouts:
             self._breaks[node] = chain
 
     def recognised(self) -> None:
-        """Record that a loop closure has localised the robot: it no longer counts as lost."""
+        """Record that a loop closure has localised the robot: it no longer counts as lost, and all evidence is cleared."""
         self._breaks.clear()
         self._unrecognised = 0
 
     def mended(self, node: int) -> None:
-        """Record that the robot drove to a node before which the chain was broken."""
+        """Forget the break before a node: the robot drove there after all."""
         self._breaks.pop(node, None)
 
     def unrecognised(self) -> None:
-        """Record that the robot failed to recognise a known place; several times in a row make it count as lost."""
+        """Record that the robot failed to recognise a known place; several times without `recognised` make it count as lost."""
         self._unrecognised += 1
 
 
 @dataclass(frozen=True, slots=True)
 class GlobalMatch:
-    """The edge between two nodes that were compared while the robot was lost, and its mismatch: 0 for a perfect fit."""
+    """Two nodes that were compared while the robot was lost: their edge, and how badly they match (`mismatch`).
+
+    The edge is pending if the views match, else rejected. The mismatch grows with the share of the views that does not fit: 0
+    for a perfect fit.
+    """
 
     edge: Edge
     mismatch: float = 0.0
@@ -119,7 +132,7 @@ class Settlement:
 
     Attributes:
         proposals: every edge that the map must add or replace: accepted, pending and rejected ones.
-        accepted: those of the proposals that now constrain the map; empty while the robot is not localised.
+        accepted: the matches among the proposals that now enter the map; empty while the robot is not localised.
         kidnapped_to: the first node after the kidnapping; None while the robot is not localised, or if it was not kidnapped.
     """
 
@@ -147,12 +160,14 @@ class Relocaliser:
         self._steps: deque[Edge] = deque(maxlen=KEPT_STEPS)
 
     def tracked(self, node: int, chain: ChainState, steps: list[Edge]) -> None:
-        """Note the registrations (`steps`) of a new node to the ones before it, and how certain the motion is."""
+        """Note the registrations (`steps`) of a new node to the ones before it, and how certain the motion is (`chain`)."""
         self.whereabouts.tracked(node, chain)
         self._steps += [step for step in steps if step.status is Status.ACCEPTED]
 
     def settle(self, found: Sequence[GlobalMatch], belief: Belief) -> Settlement:
         """Add matches; accept the largest set that agrees with each other and with the motion between, if it is good enough.
+
+        Then the robot counts as localised, and all other matches are rejected. Those that waited too long are rejected anyway.
 
         Args:
             found: nodes that were compared; those with pending edges are matches.
@@ -187,7 +202,7 @@ class Relocaliser:
         return out
 
     def reattach(self, broken_at: int, accepted: tuple[Edge, ...], belief: Belief) -> list[Edge]:
-        """Retract registrations across a kidnapping, and place the node after it where its matches say.
+        """Retract registrations across a kidnapping, and place the node after it where its matches say; keeps no state.
 
         Args:
             broken_at: the first node after the kidnapping.
@@ -271,7 +286,13 @@ class Relocaliser:
 
 
 def placed_by(matches: Sequence[Edge], at: int, poses: Array) -> Array:
-    """Pose (3,) on the map of the node `at`: each match gives one, and the medoid of these is returned."""
+    """Pose (3,) on the map of the node `at`: each match gives one, and the medoid (nearest to all others) is returned.
+
+    Args:
+        matches: measured edges from nodes joined to `at` by motion (sources) to nodes of the map (targets).
+        at: the node.
+        poses: (N, 3) of all nodes, m and rad. Only the way from the sources to `at`, and the targets, are used.
+    """
     placed = np.array([_placed(s, at, poses) for s in matches])
     return np.asarray(placed[int(np.argmin(np.abs(placed[:, None, :2] - placed[None, :, :2]).sum(axis=(1, 2))))])
 

@@ -68,12 +68,12 @@ class Blocks:
         self._count += 1
 
     def filled(self) -> list[NDArray[np.generic]]:
-        """All rows so far, as views of the blocks (at most BLOCK, row_length), in order."""
+        """All rows so far in order, as views (n, row_length), n <= BLOCK, of the memory: to be read only."""
         full, rest = divmod(self._count, BLOCK)
         return self._blocks[:full] + ([self._blocks[full][:rest]] if rest else [])
 
     def take(self, numbers: Indices) -> NDArray[np.generic]:
-        """A copy of the rows of the given numbers, (n, row_length)."""
+        """A copy of the rows of the given numbers (n,) in their order, (n, row_length)."""
         if len(self._blocks) == 1:
             return self._blocks[0][numbers]
         out = np.empty((len(numbers), self._row_length), dtype=self._dtype)
@@ -110,12 +110,15 @@ class ProfileIndex:
         return len(self._rows)
 
     def add(self, profile: Profile) -> int:
-        """Store a (bands, width) profile and return its number."""
+        """Store a (bands, width) profile and return its number, counted from 0."""
         self._rows.append(self.quantised(profile))
         return len(self._rows) - 1
 
     def quantised(self, profile: Profile) -> Bytes:
-        """The bytes of a profile, (width * bands,), column by column."""
+        """The bytes of a profile (bands, width), column by column: (width * n,) for the n bands of positive weight.
+
+        Values are clipped to +-4.
+        """
         steps = np.asarray(profile)[self._bands].T * self._steps
         return np.asarray(np.clip(np.rint(steps) + 128.0, 1.0, 255.0).astype(np.uint8).ravel())
 

@@ -32,7 +32,7 @@ class Match:
 
     Attributes:
         indices: (n,) numbers of the stored profiles.
-        score: (n,) G of eq. 13; smaller is better, except for the mode `literal` (see `combine`), where larger is.
+        score: (n,) G of eq. 13; smaller is better, but the mode `literal` is inverted (see `combine`).
         shift: (n,) best shift c_m, columns; positive when things lie farther right in the query.
     """
 
@@ -68,7 +68,7 @@ class ProfileStore:
         return self._shifts
 
     def add(self, profile: Profile) -> int:
-        """Store a (bands, width) profile and return its number."""
+        """Store a (bands, width) profile and return its number, counted from 0; all must have the shape of the first."""
         if not len(self):
             self._shape = (profile.shape[0], profile.shape[1])
             self._rows = Blocks(profile.size, np.float32)
@@ -141,7 +141,10 @@ def _overlaps(width: int, shifts: tuple[int, ...], circular: bool) -> _Overlaps:
 
 
 def band_weights(bands: int, mu_r: float, mu_d: float) -> Floats:
-    """Weight of each band (mu_R over the intensity bands, mu_D over the depth bands); one lone band has all the weight."""
+    """Weight (bands,) of each band of a profile: mu_R over the first half (intensity), mu_D over the second half (depth).
+
+    One lone band has all the weight.
+    """
     if bands == 1:
         return np.ones(1)
     half = bands // 2
@@ -195,6 +198,9 @@ class Matcher:
         g_bar: see `combine`.
         sequence: number of views in a row that are compared (as in SeqSLAM); 1: single views.
         circular: the profiles go full circle, see `ProfileStore`.
+
+    Attributes:
+        store: the profiles.
     """
 
     def __init__(
@@ -217,7 +223,7 @@ class Matcher:
         self._sequence = sequence
 
     def add(self, profile: Profile) -> int:
-        """Store a profile and return its number."""
+        """Store a (bands, width) profile and return its number, counted from 0."""
         if self._index is None:
             weights = band_weights(len(profile), *self._mu)
             self._index = ProfileIndex(weights, profile.shape[1], self._max_shift, self._circular)
@@ -236,7 +242,7 @@ class Matcher:
         return Match(np.asarray(indices, dtype=np.int64), score, shift)
 
     def best(self, query: Profile, count: int, among: Indices | None = None, ending_at: int | None = None) -> Match:
-        """Find the stored profiles with the best scores, the best first.
+        """Find the stored profiles with the smallest scores G, the smallest first: in the mode `literal` too, as printed.
 
         In the modes `plain` and `four-band` this is an exact search over 8-bit profiles, then a full score of the nearest. The
         other modes need the score of every profile and compute them all.
@@ -244,7 +250,7 @@ class Matcher:
         Args:
             query: (bands, width).
             count: number of profiles to return at most.
-            among: numbers of the stored profiles to be compared, ascending; all by default.
+            among: numbers of the stored profiles to be compared, ascending; by default all, the query too if it is stored.
             ending_at: number under which the query itself is stored, to compare sequences; None: compare single views.
         """
         numbers = np.arange(len(self.store)) if among is None else among
@@ -316,9 +322,9 @@ class Recognition:
     """The view template that a frame was recognised as.
 
     Attributes:
-        template: number of the template.
+        template: number of the template: the nearest one, even where it does not match yet, or the new one.
         founded: whether a new template was made from this frame.
-        difference: mean absolute difference to the best older template; inf for the first one.
+        difference: mean absolute difference to the nearest older template, a match up to `THRESHOLD`; inf for the first one.
     """
 
     template: int
@@ -334,7 +340,12 @@ STABLE_FRAMES = 3
 
 
 class ViewTemplates:
-    """View templates: profiles of distinct views. A new one is made once several consecutive frames match none."""
+    """View templates: profiles of distinct views. A new one is made once several consecutive frames match none.
+
+    Args:
+        max_shift: largest shift tried, columns.
+        mu_r, mu_d: weights of intensity and depth.
+    """
 
     def __init__(self, max_shift: int, mu_r: float, mu_d: float) -> None:
         self._matcher = Matcher("plain", mu_r, mu_d, max_shift)
@@ -344,7 +355,7 @@ class ViewTemplates:
         return len(self._matcher.store)
 
     def recognise(self, profile: Profile) -> Recognition:
-        """Recognise a profile as one of the view templates.
+        """Recognise the profile of the next frame as one of the view templates.
 
         A new template is made from it if it and the frames just before match none; until then the nearest template is returned.
         """
