@@ -39,7 +39,12 @@ OFF_MAX_M, OFF_MAX_DEG = 1.0, 10.0
 
 
 def of_step(inliers: float, off_m: float) -> tuple[Check, ...]:
-    """Check the registration of a new node: share of inliers; if they are few, also the distance from the odometry."""
+    """Check the registration of a new node: share of inliers; below `INLIERS_MIN`, also the distance from the odometry.
+
+    Args:
+        inliers: measured share of the scan's points that fit, 0..1.
+        off_m: distance of the registered position from that by the odometry, m.
+    """
     checks: tuple[Check, ...] = (at_least("inliers", inliers, INLIERS_WEAK),)
     if inliers < INLIERS_MIN:
         checks += (at_most("off_odometry_m", off_m, TRANSLATION_MAX_M),)
@@ -50,8 +55,9 @@ def of_way(odometry_sigma: float | None, violation: float) -> tuple[Check, ...]:
     """Check whether the robot can have driven from one node to the next.
 
     Args:
-        odometry_sigma: distance between registration and odometry, standard deviations; None if the scan fits nowhere nearby.
-        violation: share of the walls of the two scans that lie in each other's free space.
+        odometry_sigma: distance between registration and odometry, standard deviations; None if the scan fits nowhere nearby,
+            and then it is not checked.
+        violation: measured share of the walls of the two scans in each other's free space, 0..1; the limit is `WAY_VIOLATION`.
     """
     seen = at_most("violation", violation, WAY_VIOLATION)
     if odometry_sigma is None:
@@ -63,10 +69,10 @@ def of_resumption(inliers: float, inliers_min: float, loosest_m: float, violatio
     """Check whether scans after a break of the chain fit the scans before it so well that they tell where the robot is.
 
     Args:
-        inliers: share of their points that fit the submap before the break.
+        inliers: measured share of their points that fit the submap before the break, 0..1.
         inliers_min: least share that passes.
-        loosest_m: largest standard deviation of the position in any direction.
-        violation: share of the walls of both that lie in each other's free space.
+        loosest_m: largest standard deviation of the position in any direction, m.
+        violation: measured share of the walls of both in each other's free space, 0..1; the limit is `RESUMED_VIOLATION`.
     """
     return (
         at_least("inliers", inliers, inliers_min),
@@ -79,8 +85,8 @@ def of_fit(near: float, fit: float, fit_min: float) -> tuple[Check, ...]:
     """Check the registration of two submaps.
 
     Args:
-        near: share of the points that have a partner.
-        fit: share of inliers among the points that have a partner.
+        near: measured share of the points that have a partner in the other submap, 0..1.
+        fit: measured share of inliers among the points that have a partner, 0..1.
         fit_min: least `fit` that passes.
     """
     return (
@@ -90,7 +96,12 @@ def of_fit(near: float, fit: float, fit_min: float) -> tuple[Check, ...]:
 
 
 def of_gate(off_m: float, off_deg: float, radius_m: float, heading_deg: float) -> tuple[Check, ...]:
-    """Check that a registered pose is near the expected one: at most `radius_m` and `heading_deg` away."""
+    """Check that a registered pose is near the expected one.
+
+    Args:
+        off_m, off_deg: measured distance from the expected position and heading.
+        radius_m, heading_deg: largest distances that pass.
+    """
     return (at_most("off_m", off_m, radius_m), at_most("off_deg", off_deg, heading_deg))
 
 
@@ -98,7 +109,7 @@ def of_place(loosest_m: float, ambiguity: float) -> tuple[Check, ...]:
     """Check that a registration is certain and unique; in a bare corridor it is neither.
 
     Args:
-        loosest_m: largest standard deviation of the position in any direction.
+        loosest_m: largest standard deviation of the position in any direction, m.
         ambiguity: likelihood of the second-best position as a share of the best one's.
     """
     return (
@@ -108,19 +119,22 @@ def of_place(loosest_m: float, ambiguity: float) -> tuple[Check, ...]:
 
 
 def of_free_space(violation: float) -> tuple[Check, ...]:
-    """Check that at most a small share (`violation`) of the walls of one submap lies in the free space of the other."""
+    """Check that hardly any walls of one submap lie in the free space of the other.
+
+    `violation` is the measured share, 0..1; the limit is `VIOLATION_MAX`.
+    """
     return (at_most("violation", violation, VIOLATION_MAX),)
 
 
 def loosened(checks: Sequence[Check], pieces: int) -> tuple[Check, ...]:
-    """The same checks, with the limits of shares moved by what a share of so few things can tell.
+    """The same checks, with the limits of shares made easier by one standard error of the share.
 
     Of n independent things that fit with probability p, a share fits whose standard error is sqrt(p (1 - p) / n). Few returns
     in the open, from trees and poles, tell less than the walls of a room, however many points they have.
 
     Args:
         checks: of a registration of two submaps; only the limits of `near`, `fit` and `violation` move.
-        pieces: number of things of which the shares are; with 0 no limit moves.
+        pieces: n, the number of separate things that were seen; with 0 no limit moves.
     """
     return tuple(_by_a_hair(check, pieces) if check.figure in ("near", "fit", "violation") else check for check in checks)
 
@@ -137,9 +151,9 @@ def of_cluster(probes: float, least: int, span_m: float, least_m: float, rival: 
         probes: number of places along the drive from which the cluster's loops were measured; a place counts half whose loop
             missed a limit by a hair.
         least: least number of them that passes.
-        span_m: travel between the first and the last of them.
-        least_m: least travel that passes.
-        rival: score of the best contradicting cluster as a share of this cluster's score.
+        span_m: travel between the first and the last of them, m.
+        least_m: least travel that passes, m.
+        rival: score of the best contradicting cluster as a share of this cluster's score; 0 if there is none.
     """
     return (
         at_least("probes", probes, least),

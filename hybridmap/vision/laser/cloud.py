@@ -64,7 +64,11 @@ INDOORS = Scale()
 
 
 class Scene:
-    """Follows the scale of the scene, scan by scan, at a constant cost."""
+    """Follows the scale of the scene, scan by scan, at a constant cost.
+
+    Attributes:
+        scale: the scale now.
+    """
 
     def __init__(self) -> None:
         """Start without a scan, at the scale of a room."""
@@ -72,9 +76,10 @@ class Scene:
         self.scale = INDOORS
 
     def observe(self, ranges_m: NDArray[np.float32]) -> Scale:
-        """Take in one scan (B,), m, NaN where there is no return; returns the scale of the scene now.
+        """Take in one scan (B,), m, NaN where there is no return; returns the scale now.
 
-        The scale changes only when the scene's typical range has gone a whole step on, so it does not flicker between two.
+        The scale changes only when the scene's typical range has gone a whole step on, so it does not flicker between two. A
+        scan without returns changes nothing.
         """
         returns = ranges_m[np.isfinite(ranges_m)]
         if len(returns):
@@ -105,9 +110,9 @@ class Cloud:
     """Points of walls, with normals towards the robot.
 
     Attributes:
-        points: (P, 2) m.
+        points: (P, 2) m, in `base_link` at the scan, or in the frame to which they were moved.
         normals: (P, 2) unit vectors; (0, 0) where the neighbours of a point are no line.
-        cell_m: side of the cells whose points were merged.
+        cell_m: side of the cells whose points were merged, m.
     """
 
     points: Array
@@ -118,13 +123,13 @@ class Cloud:
         return len(self.points)
 
     def moved(self, pose_a_b: Array) -> Cloud:
-        """The same cloud in frame a, where this one is given in frame b."""
+        """The same cloud in frame a, where this one is given in frame b; `pose_a_b` is (3,), m and rad."""
         cos, sin = np.cos(pose_a_b[2]), np.sin(pose_a_b[2])
         turn = np.array([[cos, sin], [-sin, cos]])
         return Cloud(self.points @ turn + pose_a_b[:2], self.normals @ turn, self.cell_m)
 
     def thinned(self, count: int) -> Cloud:
-        """At most `count` points, evenly picked in their order."""
+        """The cloud with at most `count` of its points, evenly picked in their order."""
         if len(self) <= count:
             return self
         pick = (np.arange(count) * (len(self) / count)).astype(np.int64)
@@ -137,16 +142,18 @@ EMPTY = Cloud(np.zeros((0, 2)), np.zeros((0, 2)))
 def cloud_of_scan(ranges_m: NDArray[np.float32], laser: Laser, scale: Scale = INDOORS) -> Cloud:
     """Points of one scan in `base_link`; points that fall into one grid cell are averaged.
 
+    Ranges outside the limits of laser and scale are left out. With fewer than seven others the cloud is empty.
+
     Args:
         ranges_m: (B,) ranges, NaN where invalid.
-        laser: bearings and mounting.
+        laser: bearings, limits and mounting.
         scale: of the scene; it gives the largest range and the cells.
     """
     return clouds_of_scans([ranges_m], laser, scale)[0]
 
 
 def clouds_of_scans(ranges_m: Sequence[NDArray[np.float32]], laser: Laser, scale: Scale = INDOORS) -> list[Cloud]:
-    """Clouds of many scans, as `cloud_of_scan` gives them one by one, but faster."""
+    """Clouds of many scans of (B,) ranges, one for each in their order: as `cloud_of_scan` gives them, but faster."""
     ranges = np.array(ranges_m, dtype=np.float64).reshape(len(ranges_m), -1)
     valid = (ranges >= laser.range_min_m) & (ranges <= min(laser.range_max_m, scale.range_max_m))
     valid &= valid.sum(axis=1, keepdims=True) >= 2 * NEIGHBOURS + 1
@@ -176,9 +183,9 @@ def merged(clouds: Iterable[Cloud], cell_m: float | None = None) -> Cloud:
 
 
 def merged_at(clouds: Sequence[Cloud], poses: Array) -> Cloud:
-    """Merge clouds that were taken from poses (N, 3) into one, in the frame in which the poses are given.
+    """Merge N clouds, each in the frame of one of the poses (N, 3), into one, in the frame in which the poses are given.
 
-    The coarsest cloud gives the side of the cells.
+    Points that fall into one grid cell are averaged. The coarsest cloud gives the side of the cells.
     """
     counts = [len(c) for c in clouds]
     if sum(counts) == 0:
@@ -245,14 +252,14 @@ class LikelihoodField:
     """A grid around a cloud that tells the nearest point and the likelihood of any position.
 
     Attributes:
-        low: (2,) corner of cell (0, 0), m.
-        cell_m: side of a cell.
+        low: (2,) corner of cell (0, 0) in the cloud's frame, m.
+        cell_m: side of a cell, m.
         shape: number of cells in x and y.
         margin: number of empty cells at each border, to which look-ups are clipped.
-        labels: (cells,) int32, 1 + index of the nearest point of the cloud within reach, 0 for none.
+        labels: (cells,) int32, column of `lines` with the nearest point within reach, 0 for none.
         likelihood: (cells,) uint8, 255 exp(-d^2 / 2 sigma^2) of the distance d to that point.
-        lines: (3, 1 + P) the line through each point: its unit normal, and its distance from the origin along the normal;
-            column 0 is zero and stands for no point.
+        lines: (3, 1 + P) the line through each of the P points with a normal: its unit normal, and its distance from the origin
+            along the normal, m; column 0 is zero and stands for no point.
     """
 
     low: Array
@@ -264,7 +271,7 @@ class LikelihoodField:
     lines: Array
 
     def cells(self, x: Array, y: Array) -> NDArray[np.int64]:
-        """Flat cell numbers of coordinates of any shape; those outside fall on the empty border."""
+        """Flat cell numbers of coordinates (m, cloud's frame) of any shape; those outside fall on the empty border."""
         nx, ny = self.shape
         column = _bounded((x - self.low[0]) * (1.0 / self.cell_m), self.margin, nx - 1 - self.margin)
         row = _bounded((y - self.low[1]) * (1.0 / self.cell_m), self.margin, ny - 1 - self.margin)
@@ -288,10 +295,10 @@ def build_field(
 
     Args:
         cloud: P points with normals.
-        cell_m: side of a cell; None: that of the cloud.
-        reach_m: largest distance from a point at which it has a likelihood.
-        sigma_m: standard deviation of the likelihood.
-        search_m: largest translation of the poses that will be scored on this field.
+        cell_m: side of a cell, m; None: that of the cloud.
+        reach_m: largest distance from a point at which it has a likelihood, m.
+        sigma_m: standard deviation of the likelihood, m.
+        search_m: largest offset that `score_starts` will be given on this field, m.
     """
     cell_m = cell_m or cloud.cell_m
     usable = np.flatnonzero(cloud.normals[:, 0] ** 2 + cloud.normals[:, 1] ** 2 > 0.5)

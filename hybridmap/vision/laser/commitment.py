@@ -42,13 +42,13 @@ class Waiting:
 
     @property
     def weight(self) -> float:
-        """What the hypothesis counts in a cluster."""
+        """What the hypothesis counts in a cluster: 1, or half if it missed a limit by a hair (see `Hypothesis.by_a_hair`)."""
         return 1.0 if self.hypothesis.passed else HAIR_WEIGHT
 
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """A decided loop hypothesis: the checks of its cluster if it is accepted, else what it lacked."""
+    """A decided loop hypothesis with the key of its edge: the checks of its cluster if it is accepted, else what it lacked."""
 
     key: int
     hypothesis: Hypothesis
@@ -61,7 +61,7 @@ class Settled:
         return self.lack is None
 
     def proposed(self) -> Edge:
-        """The edge with its new status; a hypothesis that missed a limit by a hair is accepted by the moved limits."""
+        """The edge with its new status; if its hypothesis missed a limit by a hair and is accepted, with the easier limits."""
         chosen = self.hypothesis.within_a_hair if self.accepted else self.hypothesis
         return chosen.proposed(self.key).settled(*self.checks, lack=self.lack)
 
@@ -71,11 +71,11 @@ class Cluster:
     """Loop hypotheses that agree with each other, at most one for each place from which loops were measured (probe).
 
     Attributes:
-        members: positions of the hypotheses in the pool.
-        score: sum of the quality of the members, each times its weight.
+        members: indices into `Pool.waiting`, ascending.
+        score: sum of `Hypothesis.quality` of the members, each times its weight.
         probes: sum of the weights of the members, each from a probe of its own.
-        span_m: travel between the first and the last probe.
-        sigma_m: median uncertainty of the expected position, over the members.
+        span_m: travel between the first and the last probe, m.
+        sigma_m: standard deviation of the position expected before the registration, m: the median over the members.
     """
 
     members: tuple[int, ...]
@@ -94,7 +94,7 @@ class AcceptedCluster:
 
 
 class Pool:
-    """Pending loop hypotheses, and which of them agree through the chain."""
+    """Pending loop hypotheses (`waiting`), and which of them agree through the chain."""
 
     def __init__(self, travel_of: Callable[[int], float], waiting: Sequence[Waiting] = ()) -> None:
         """Start with some hypotheses; `travel_of` returns the path length (m) up to a node."""
@@ -103,14 +103,22 @@ class Pool:
         self._consistent: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
 
     def commit(self, belief: Belief, span_per_efold_m: float) -> list[Settled]:
-        """Accept the best cluster if good enough, with all that agree with it, then the next; returns what was decided."""
+        """Accept the best cluster if good enough, with all that agree with it, then the next.
+
+        Args:
+            belief: the map.
+            span_per_efold_m: additional travel that a cluster must cover for each factor e by which its gate is wider, m.
+
+        Returns:
+            The accepted hypotheses, and the rejected ones, which contradict an accepted cluster. They leave the pool.
+        """
         out: list[Settled] = []
         while (best := self._best_cluster(belief, span_per_efold_m)) is not None:
             out += self._commit(best)
         return out
 
     def keep(self, positions: list[int]) -> None:
-        """Keep the hypotheses at some positions alone."""
+        """Keep only the hypotheses at these positions (indices into `waiting`, ascending)."""
         known = [p for p in positions if p < len(self._consistent)]
         self._consistent = self._consistent[np.ix_(known, known)]
         self.waiting = [self.waiting[p] for p in positions]
@@ -188,16 +196,20 @@ class Commitment:
         self._hairs: list[Waiting] = []
 
     def add(self, key: int, hypothesis: Hypothesis) -> None:
-        """Add a hypothesis, with the key of its proposed edge; one that failed by more than a hair is left out."""
+        """Add a hypothesis, with the key of its proposed edge.
+
+        One that failed by a hair is kept aside, at most two of one probe node. One that failed by more is left out.
+        """
         if hypothesis.passed:
             self._queue.waiting.append(Waiting(key, hypothesis))
         elif hypothesis.by_a_hair and sum(w.hypothesis.probe == hypothesis.probe for w in self._hairs) < HAIRS:
             self._hairs.append(Waiting(key, hypothesis))
 
     def settle(self, travel_m: float, belief: Belief) -> list[Settled]:
-        """Give up hypotheses pending for too long; accept the best cluster if good enough, with all that agree with it.
+        """Give up hypotheses pending for too long; accept clusters that are good enough, with all that agree with them.
 
-        `travel_m` is the path length so far. Returns the hypotheses that were decided.
+        Where none is, clusters with hypotheses that missed a limit by a hair may be accepted (see the module).
+        `travel_m` is the path length so far, m. Returns the hypotheses that were decided: accepted, rejected or given up.
         """
         out = [Settled(w.key, w.hypothesis, lack=Lack.UNSUPPORTED) for w in self._expire(travel_m)]
         out += self._queue.commit(belief, SPAN_PER_EFOLD_M)
@@ -206,7 +218,8 @@ class Commitment:
     def flush(self, belief: Belief) -> list[Settled]:
         """At the end of the drive, decide all hypotheses that found no cluster, those given up before included.
 
-        May be called again after the map has changed. Returns the hypotheses that were decided.
+        May be called again after the map has changed: those without a cluster are tried again. Returns the accepted ones, and
+        those rejected that were still pending.
         """
         fresh = {w.key for w in self._queue.waiting}
         again = sorted(self._given_up + self._queue.waiting, key=lambda w: (self._travel(w.hypothesis.probe), w.key))

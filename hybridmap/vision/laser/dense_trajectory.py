@@ -33,7 +33,7 @@ NOWHERE_M = 1e6
 
 @dataclass(frozen=True, slots=True)
 class ObservedScan:
-    """A scan, the number of the last node before it, and the path integrator's motion (3,) since that node."""
+    """A scan, the last node before it (-1 before the first), and the robot's pose (3,) in that node's frame by odometry."""
 
     scan: LaserScan
     node: int
@@ -48,14 +48,15 @@ class DenseTrajectory:
         self._laser = laser
 
     def dense_trajectory(self, scans: Sequence[ObservedScan], steps: Array, poses: Array) -> Anchors:
-        """Pose of the robot at every registered scan, seen from the last node before it.
+        """Poses of the robot at the scans, those of the nodes among them, tied to the nodes before and after.
 
-        Scans around a kidnapping are left out: odometry does not show on which side of it they were taken.
+        Scans that do not fit the map are left out, and those around a kidnapping: odometry does not show on which side of it
+        they were taken.
 
         Args:
-            scans: every scan since the first node, in order; the scan of a node itself has zero motion.
-            steps: (N - 1, 3) the path integrator's motion from each node to the next.
-            poses: (N, 3) of the nodes in the final map.
+            scans: every scan since the first node, in order of time; the scan of a node itself has zero motion.
+            steps: (N - 1, 3) pose of the next node in the frame of each, by the path integrator, m and rad.
+            poses: (N, 3) of the nodes in the final map, m and rad.
         """
         nodes = np.array([s.node for s in scans], dtype=np.int64)
         motions = np.array([s.motion for s in scans]).reshape(-1, 3)

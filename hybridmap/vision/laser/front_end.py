@@ -76,7 +76,8 @@ class LaserFrontEnd:
         if not isinstance(frame, LaserScan):
             raise StreamError(f"laser: expected a LaserScan, found {type(frame).__name__}")
         if frame.ranges_m.shape != self._laser.bearings_rad.shape:
-            raise StreamError(f"laser: expected {len(self._laser.bearings_rad)} ranges, found {frame.ranges_m.shape}")
+            beams = len(self._laser.bearings_rad)
+            raise StreamError(f"laser: scan at {frame.stamp_ns} ns: expected {beams} ranges, found {frame.ranges_m.shape}")
         self.atlas.scene.observe(frame.ranges_m)
         self._scans.append(ObservedScan(frame, len(self._profiles) - 1, np.array(delta_node_robot, dtype=np.float64)))
         profile = laser_profile(frame.ranges_m, self._laser.bearings_rad, self._profile_width)
@@ -86,7 +87,7 @@ class LaserFrontEnd:
         return View(frame.stamp_ns, profile, seen.template, seen.founded)
 
     def add_node(self, node: int, view: View) -> None:
-        """Make a node of the scan that was observed last."""
+        """Make a node of the scan that was observed last; see `FrontEnd.add_node`."""
         seen = self._scans.pop()
         self._between = [s for s in self._scans[-MOST_BETWEEN:] if s.node == node - 1 and node > 0]
         if node > 0:
@@ -96,7 +97,10 @@ class LaserFrontEnd:
         self._node = (node, self._cloud(seen.scan), seen.scan)
 
     def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
-        """Register the new node to the submap of the nodes just before it."""
+        """Register the new node to the submap of the nodes just before it; see `FrontEnd.track`.
+
+        Returns no edges for the first node, nor where `vision.tracking.enabled` is false.
+        """
         assert self._node is not None
         number, cloud, scan = self._node
         assert number == node
@@ -112,7 +116,7 @@ class LaserFrontEnd:
         return self.localisation.tracked(self._registration(node, step), broken, odometry.delta)
 
     def close(self, node: int, belief: Belief) -> list[Edge]:
-        """Look for loops of the new node, and decide pending ones.
+        """Look for loops of the new node, and decide pending ones; see `FrontEnd.close`.
 
         A lost robot is compared with the whole map; else the last metres are compared with older submaps every few metres.
         """
@@ -135,7 +139,10 @@ class LaserFrontEnd:
         return out
 
     def finish(self, belief: Belief) -> list[Edge]:
-        """At the end of the drive, decide all pending loops; then register nodes that are near each other on the map."""
+        """At the end of the drive, decide all pending loops; if none is accepted, register nodes near each other on the map.
+
+        See `FrontEnd.finish`.
+        """
         last, out = len(self.atlas) - 1, []
         if last >= 0 and self.atlas.travel_m[last] - self._last_probe_m > LAST_PROBE_M:
             out = self._probe(last, belief)
@@ -147,7 +154,7 @@ class LaserFrontEnd:
         return out + [hypothesis.proposed(self._next_key()) for hypothesis in near]
 
     def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
-        """Measure again, from the poses of the map, loops that a back-end down-weighted as outliers."""
+        """Measure again, from the poses of the map, loops that a back-end down-weighted as outliers; returns all of them."""
         poses = belief.poses_map_node
         return [self._reviser.register(edge.source, edge.target, poses, Search.AGAIN).proposed(edge.key) for edge in outliers]
 
@@ -157,7 +164,7 @@ class LaserFrontEnd:
         return LENGTH_M
 
     def way(self, node: int) -> tuple[Check, ...]:
-        """Check whether the scan of a node and the one before look through each other's walls."""
+        """Check whether the scan of a node (not the first) and that of the node before look through each other's walls."""
         motion = between(self.atlas.chain[node - 1], self.atlas.chain[node])
         return checks.of_way(None, violation_of_step(node, motion, self.atlas, self._laser))
 
@@ -166,21 +173,21 @@ class LaserFrontEnd:
         self.atlas.part(node)
 
     def overrules(self, registration: RelativePose, odometry: RelativePose) -> bool:
-        """Whether a good registration says that the odometry is wrong."""
+        """Whether a good registration says that the odometry is wrong; see `Overruling.overrules`."""
         return contradicts(registration.delta, odometry.delta)
 
     def dense_trajectory(self, belief: Belief) -> Anchors:
-        """Register every scan to the final map; returns the poses between nodes."""
+        """Register every scan to the final map; empty where `vision.laser.dense_trajectory` is false."""
         scans = [s for s in self._scans if s.node >= 0] if self._config.dense_trajectory else []
         return self._dense_trajectory.dense_trajectory(scans, np.array(self._steps), belief.poses_map_node)
 
     @property
     def lost_since(self) -> int | None:
-        """First node after the robot was kidnapped or lost track of its motion; None while it is localised on the map."""
+        """Node before which the robot was kidnapped last, if it has not been found on the map since; else None."""
         return self.localisation.lost_since
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
-        """`profile` and `ranges_m` of a node's scan."""
+        """`profile` (1, width) and `ranges_m` (B,) of a node's scan, float32."""
         return {"profile": self._profiles[node], **LASER.compact(LaserScan(0, self.atlas.ranges[node]))}
 
     def _next_key(self) -> int:

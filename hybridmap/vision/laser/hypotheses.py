@@ -68,13 +68,13 @@ class Hypothesis:
         anchor: older node, whose frame is that of the old submap.
         relative: pose of the anchor in the frame of the probe.
         quality: share of the points that have a partner, times the share of inliers among those.
-        sigma_m: standard deviation of the expected position before the registration.
+        sigma_m: standard deviation of the expected position before the registration, m; 1e8 on the whole map.
         search: why the two submaps were compared.
         checks: checks of the registration, in their order; the loop is rejected if one failed.
         figures: further measured values of the registration, by name.
-        fits: whether enough points of the scans fit.
+        fits: whether enough points of the scans fit, whatever the other checks say.
         misfit: share of points that do not fit, plus share of walls in the other's free space.
-        pieces: number of separate things that the probe saw, of which the shares in the checks are; 0 if not counted.
+        pieces: number of separate things that the probe saw; 0 if not counted.
     """
 
     probe: int
@@ -96,12 +96,12 @@ class Hypothesis:
 
     @property
     def by_a_hair(self) -> bool:
-        """Whether checks failed, but by no more than what the shares of so few things can tell."""
+        """Whether checks failed, but only shares, each by no more than its standard error (see `checks.loosened`)."""
         return not self.passed and self.within_a_hair.passed
 
     @property
     def within_a_hair(self) -> Hypothesis:
-        """The same hypothesis; if checks failed, with their limits moved by what the shares of so few things can tell."""
+        """The same hypothesis; if checks failed, with the easier limits of `checks.loosened`. It may fail these too."""
         return self if self.passed else replace(self, checks=checks.loosened(self.checks, self.pieces))
 
     def proposed(self, key: int, lack: Lack | None = None) -> Edge:
@@ -160,12 +160,15 @@ class Prober:
         self._anchors: list[int] = []
 
     def probe(self, node: int, belief: Belief, since: int = 0) -> list[Hypothesis]:
-        """Register the last metres before a node to the old submaps that may be nearby; failed registrations are returned too.
+        """Register the last metres before a node to the old submaps that may be nearby.
 
         Args:
             node: the newest node of the probe.
             belief: the map, which tells what may be nearby.
             since: old submaps around earlier nodes than this one are left out.
+
+        Returns:
+            The most promising few, failed ones too, those whose start was likeliest first.
         """
         atlas = self._atlas
         recent = atlas.along(node, LENGTH_M, 0.0)
@@ -178,13 +181,13 @@ class Prober:
         return _distinct([self._verify(mode, probe, Search.GATE) for mode in modes[: MODES_SURE if sure else MODES]])
 
     def probe_anywhere(self, probe: Submap, anchors: Sequence[int]) -> list[Hypothesis]:
-        """Register a submap to the old submaps around the nodes `anchors`, without an expected pose."""
+        """Register a submap to the old submaps around the nodes `anchors`, without an expected pose; returns as `probe`."""
         gates = [_Gate(anchor, IDENTITY, UNKNOWN, np.pi, UNKNOWN) for anchor in anchors]
         modes = self._search(gates, probe)[:MODES_ANYWHERE]
         return _distinct([self._verify(mode, probe, Search.WHOLE_MAP) for mode in modes])
 
     def anchors_before(self, node: int) -> list[int]:
-        """Nodes around which there are submaps that lie wholly before a node."""
+        """Nodes, ascending and some metres apart, around which there are submaps that lie wholly before a node."""
         self._extend_anchors()
         atlas, half_m = self._atlas, TARGET_HALF_M
         limit = atlas.travel_m[node] - half_m

@@ -53,8 +53,8 @@ class ChainBreak:
 
     Attributes:
         node: the first node after it.
-        registration: the registration across it.
-        odometry: (3,) the same motion by the wheels.
+        registration: the registration of that node to the one before.
+        odometry: (3,) its pose in the frame of the one before, by the wheels, m and rad.
         lost_since: first node after an earlier break from which the robot was not localised yet; None if there is none.
     """
 
@@ -81,13 +81,13 @@ class Continuity:
 
         The robot counts as kidnapped where three things hold: the registration does not fit, or contradicts the odometry;
         the walls of the two scans lie in each other's free space; and a scan between the nodes does not fit the one before.
-        Wheel slip, people and doors cause the first two, but not the third.
+        Wheel slip, people and doors cause the first two, but not the third. Without `vision.relocalising.enabled` none fails.
 
         Args:
-            node: the newest node.
-            step: the motion to it by scan matching.
+            node: the newest node of the atlas.
+            step: the motion to it from the node before, by scan matching.
             odometry: the same motion by the wheels.
-            on_the_way: the scans between the two nodes in order, each with the motion (3,) since the first node.
+            on_the_way: the scans between these two in order, each with the robot's pose (3,) in the frame of the node before.
         """
         if not self._may_be_lost:
             return ()
@@ -103,7 +103,8 @@ class Continuity:
     def drove_on(self, breaks: Sequence[ChainBreak], node: int) -> bool | None:
         """Whether a scan after a break of the chain shows that the robot drove on: a bad scan or a crowd broke the chain.
 
-        The scans since the break are registered to the submap before it, and expected where the wheels have them.
+        The scans since the break are registered to the submap before it, and expected where the wheels have them. Call it once
+        for each new node: faint fits are counted.
 
         Args:
             breaks: the breaks in a row, the first one first; nodes between them are joined by registrations.
@@ -268,12 +269,12 @@ class GlobalLocalisation:
 
     @property
     def lost_since(self) -> int | None:
-        """First node after the kidnapping; None while the robot is localised."""
+        """Node before which the robot was kidnapped last, if it has not been found on the map since; else None."""
         return self._broken_at
 
     @property
     def since(self) -> int:
-        """First node that is joined to the newest one by registrations: 0, or the first after the last kidnapping."""
+        """First node whose place relative to the newest one is known: `lost_since`, or 0 if that is None."""
         return self._broken_at or 0
 
     def tracked(self, registration: Edge, broken_by: tuple[Check, ...], odometry: Array) -> list[Edge]:
@@ -282,10 +283,10 @@ class GlobalLocalisation:
         Args:
             registration: edge from the node before to the newest node.
             broken_by: failed checks of `Continuity.broken`; empty if the robot was not kidnapped.
-            odometry: (3,) the same motion by the wheels.
+            odometry: (3,) the same motion by the wheels, m and rad.
 
         Returns:
-            The registration with these checks, and those of earlier breaks that this node has mended.
+            The registration with these checks, and the edges that changed as this node has mended earlier breaks.
         """
         node = registration.target
         if broken_by:
@@ -318,7 +319,7 @@ class GlobalLocalisation:
         return [*(replace(b.registration, broken_by=()) for b in breaks), *dismissed]
 
     def probed(self, node: int, hypotheses: Sequence[Hypothesis], belief: Belief) -> None:
-        """Note from the loop hypotheses of a node whether it recognised its place; an ambiguous fit counts neither way."""
+        """Note from a node's loop hypotheses whether it recognised its place; not after a break, nor by an ambiguous fit."""
         if self._broken_at is not None:
             return
         if any(h.passed for h in hypotheses):
@@ -331,7 +332,7 @@ class GlobalLocalisation:
             self._whereabouts.unrecognised()
 
     def closed(self) -> list[Edge]:
-        """Note that loops were accepted: the robot is localised, unless it was kidnapped. Returns the edges that changed."""
+        """Note that loops were accepted: the robot is localised, unless it was kidnapped. Returns the matches now rejected."""
         if self._broken_at is not None:
             return []
         self._whereabouts.recognised()
@@ -342,9 +343,9 @@ class GlobalLocalisation:
         return self._relocaliser.dismiss()
 
     def search(self, node: int, belief: Belief) -> Settlement:
-        """While the robot is lost, register its last metres to the whole map: just after the loss at every call, later not.
+        """While the robot is lost, register its last metres to the whole map, and accept the matches that agree.
 
-        Call it at each node. The settlement is empty if the robot is not lost, or if this node is skipped.
+        Call it at each node: some are skipped, later more. The settlement is empty then, and if the robot is not lost.
         """
         if not self._whereabouts.lost or not self._due(node):
             return Settlement([])
@@ -364,7 +365,7 @@ class GlobalLocalisation:
         return travel_m - self._searched_m >= self._every_m
 
     def most_similar(self, node: int, anchors: list[int]) -> list[int]:
-        """Of the nodes `anchors`, those whose profiles are most similar to that of `node`; all if they are few."""
+        """Of the nodes `anchors`, ascending, the 100 with the views most similar to that of `node`, ascending; or all."""
         most = SUBMAPS
         if len(anchors) <= most:
             return anchors

@@ -48,7 +48,9 @@ class Reviser:
         self._done: set[tuple[int, int]] = set()
 
     def round(self, belief: Belief, since: int = 0) -> list[Hypothesis]:
-        """Register every pair of nearby nodes not registered before; an empty list after the configured number of rounds.
+        """Register nodes, one a metre of travel, to the nearest of up to three earlier passes; failed ones are returned too.
+
+        Pairs of earlier rounds are left out. The list is empty after the configured number of rounds.
 
         Args:
             belief: the map, which gives the poses of the nodes.
@@ -87,7 +89,10 @@ class Reviser:
         return [o for o in chosen[:PARTNERS] if (node, o) not in self._done]
 
     def register(self, node: int, other: int, poses: Array, search: Search = Search.NEAR) -> Hypothesis:
-        """Register the scans around a node to those around an older one, starting from the map's poses (N, 3)."""
+        """Register the scans around a node to those around an older one (`other`), starting from the map's poses (N, 3).
+
+        `search` is the reason that the hypothesis records. The hypothesis may have failed its checks.
+        """
         target, probe = self._atlas.around(other, TARGET_HALF_M), self._atlas.around(node, PROBE_HALF_M)
         sharp, fine = self._atlas.scoring_field(target, Field.SHARP), self._atlas.fine_field(target)
         expected = between(poses[other], poses[node])

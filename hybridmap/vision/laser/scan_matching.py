@@ -16,7 +16,7 @@ OTHER_M, REACH_M = 0.4, 3.0
 
 
 def score_poses(field: LikelihoodField, points: Array, poses: Array) -> Array:
-    """Mean likelihood (N,) in [0, 1] of points (P, 2) in a moving frame at each of N poses (N, 3)."""
+    """Mean likelihood (N,) in [0, 1] of points (P, 2) in a moving frame at each of its N poses (N, 3) in the field's frame."""
     cos, sin = np.cos(poses[:, 2])[:, None], np.sin(poses[:, 2])[:, None]
     x = poses[:, :1] + cos * points[:, 0] - sin * points[:, 1]
     y = poses[:, 1:2] + sin * points[:, 0] + cos * points[:, 1]
@@ -30,7 +30,7 @@ def ambiguity(field: LikelihoodField, points: Array, direction: Array) -> float:
     Args:
         field: likelihood field of the target.
         points: (P, 2) registered points, in the target's frame.
-        direction: (2,) unit vector along which the points are shifted.
+        direction: (2,) unit vector in the target's frame, along which the points are shifted both ways.
     """
     side = np.arange(OTHER_M, REACH_M, 0.1)
     shifts = np.concatenate([[0.0, -0.1, 0.1, -0.2, 0.2], -side, side])
@@ -45,10 +45,10 @@ def score_starts(field: LikelihoodField, points: Array, center: Array, headings_
 
     Args:
         field: likelihood field of the target.
-        points: (P, 2) in the moving frame.
+        points: (P, 2) in the moving frame, m.
         center: (2,) middle of the grid in the target's frame, m.
-        headings_rad: (H,) headings of the moving frame.
-        offsets_m: (T, 2) translations from the middle; at most the field's `search_m`.
+        headings_rad: (H,) headings of the moving frame in the target's.
+        offsets_m: (T, 2) translations from the middle, rounded to cells; at most the `search_m` that the field was built for.
 
     Returns:
         (H, T) in [0, 1].
@@ -84,7 +84,7 @@ class Start:
 
 
 def survivors(wide: LikelihoodField, points: Array, offsets_m: Array, headings_rad: Array) -> list[Start]:
-    """The poses of a coarse grid with the largest likelihood, the best first; they may be neighbours.
+    """The poses of a coarse grid with the largest likelihood, at most 24, the best first; they may be neighbours.
 
     Args:
         wide: the target's field with a likelihood as wide as the steps of the grid.
@@ -100,12 +100,12 @@ def survivors(wide: LikelihoodField, points: Array, offsets_m: Array, headings_r
 
 
 def sharpened(sharp: LikelihoodField, points: Array, starts: list[Start], count: int) -> list[Start]:
-    """Refine poses on a field of half the width; returns the best ones that lie apart from each other.
+    """Refine poses on a field of half the width; returns the best ones that lie apart from each other, the best first.
 
     Args:
         sharp: the target's field with half the width of that which found the starts.
         points: (P, 2) in the moving frame.
-        starts: the poses to be refined.
+        starts: the poses to be refined, at least one.
         count: how many poses to return at most.
     """
     poses = (np.array([start.pose for start in starts])[:, None] + _star()[None]).reshape(-1, 3)
@@ -113,7 +113,10 @@ def sharpened(sharp: LikelihoodField, points: Array, starts: list[Start], count:
 
 
 def separated(poses: Array, scores: Array, count: int) -> list[Start]:
-    """The best of scored poses (N, 3), at most `count`; poses close to a better one are left out."""
+    """The best of poses (N, 3) with scores (N,), at most `count`, the best first.
+
+    Poses close to a better one, and those with a score of 0, are left out.
+    """
     left, out = scores.copy(), []
     for _ in range(count):
         i = int(np.argmax(left))
@@ -133,7 +136,7 @@ def spaced(half: float, step: float) -> Array:
 
 
 def square(half_m: float, step_m: float) -> Array:
-    """(T, 2) translations on a square grid."""
+    """(T, 2) translations on a square grid: x and y from -half_m to half_m, at most `step_m` apart."""
     side = spaced(half_m, step_m)
     return np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
 
@@ -186,9 +189,9 @@ class Alignment:
         poses: (K, 3) of the moving frame in the target's.
         hessian: (K, 3, 3) of the points alone (no prior), per squared metre of residual, right perturbation.
         near: (K,) share of points that have a partner.
-        inliers: (K,) share of points whose residual is small.
+        inliers: (K,) share of all points whose residual is small (below two cells of the field).
         fit: (K,) share of inliers among the points that have a partner.
-        rms_m: (K,) root mean square of the inliers' residuals.
+        rms_m: (K,) root mean square of the inliers' residuals, m.
         points: number of points that were registered.
     """
 
@@ -203,7 +206,7 @@ class Alignment:
     def covariance(self, k: int, floor_m: float, floor_rad: float) -> Array:
         """Covariance (3, 3) of registration k in the moving frame: variance of the residuals times the inverse Hessian.
 
-        The least standard deviations `floor_m` and `floor_rad` stand for errors that residuals do not show (a bent target).
+        The squares of `floor_m` and `floor_rad` are added, for errors that residuals do not show (a bent target).
         """
         variance = max(SIGMA_M, float(self.rms_m[k])) ** 2
         trusted = self._without_spurious(k, SPURIOUS)
@@ -230,7 +233,7 @@ class Alignment:
 
 
 def ambiguity_of(field: LikelihoodField, cloud: Cloud, alignment: Alignment) -> float:
-    """Ambiguity of the first registration along its least certain direction; see `ambiguity`."""
+    """Ambiguity of the first registration of a cloud (moving frame) along its least certain direction; see `ambiguity`."""
     pose, weakest = alignment.poses[0], alignment.weakest_direction(0)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     direction = np.array([cos * weakest[0] - sin * weakest[1], sin * weakest[0] + cos * weakest[1]])
@@ -264,6 +267,9 @@ def align(field: LikelihoodField, cloud: Cloud, starts: Array, prior: Prior | No
         cloud: P points in the moving frame.
         starts: (K, 3) poses of the moving frame in the target's.
         prior: expected pose, which joins the solve; the result's `hessian` leaves it out.
+
+    Returns:
+        One result for each start, in their order; those that fit nowhere have few inliers.
     """
     poses = np.array(starts, dtype=np.float64)
     moving = _Moving(*(np.ascontiguousarray(a[..., i]) for a in (cloud.points, cloud.normals) for i in (0, 1)))

@@ -42,7 +42,7 @@ class Submap:
     cloud: Cloud
 
     def viewpoints(self, count: int) -> NDArray[np.int64]:
-        """Indices into `nodes`, evenly spread, at most `count`."""
+        """Indices (n,) into `nodes`, evenly spread from the first to the last, ascending, at most `count`."""
         n = len(self.nodes)
         return np.unique(np.linspace(0, n - 1, min(count, n)).round().astype(np.int64))
 
@@ -84,10 +84,10 @@ class Atlas:
     A new piece begins after a kidnapping; no submap holds nodes of two pieces.
 
     Attributes:
-        clouds, ranges: of each node's scan, the points in its frame, and the ranges (B,) as received.
-        chain: pose (3,) of each node by scan matching from node to node.
-        scatter: covariance (3, 3) of each node's pose relative to the nodes around it, in the node's own frame.
-        travel_m: path length up to each node.
+        clouds, ranges: of each node's scan, the points in its frame, and the ranges (B,) as received, m.
+        chain: pose (3,) of each node in the frame of node 0, by scan matching from node to node, m and rad.
+        scatter: covariance (3, 3) of each node's pose relative to the nodes around it, in the node's own frame, m^2 and rad^2.
+        travel_m: path length from node 0 to each node along `chain`, m.
         scene: how far the walls are; the scale of clouds that are made now.
     """
 
@@ -139,7 +139,11 @@ class Atlas:
         insort(self._pieces, node)
 
     def join(self, node: int) -> None:
-        """Join the piece that begins at a node with the one before it: the robot was not kidnapped there after all."""
+        """Join the piece that begins at a node with the one before it: the robot was not kidnapped there after all.
+
+        Raises:
+            ValueError: no piece begins there.
+        """
         self._pieces.remove(node)
 
     @property
@@ -152,21 +156,21 @@ class Atlas:
         return self.pieces[bisect_right(self._pieces, node) - 1]
 
     def along(self, node: int, before_m: float, after_m: float) -> NDArray[np.int64]:
-        """Nodes from `before_m` of travel before a node to `after_m` after it, without those beyond a break of the chain."""
+        """Nodes (n,) from `before_m` of travel before a node to `after_m` after it, ascending, of its own piece only."""
         travel, piece = self.travel_m[node], self.piece(node)
         first = int(np.searchsorted(self.travel_m, travel - before_m - 1e-9))
         stop = int(np.searchsorted(self.travel_m, travel + after_m + 1e-9, side="right"))
         return np.arange(max(first, piece.start), min(stop, piece.stop))
 
     def submap(self, anchor: int, nodes: NDArray[np.int64] | Sequence[int] | range) -> Submap:
-        """Merge the clouds of some nodes in the frame of the node `anchor`."""
+        """Merge the clouds of some nodes in the frame of the node `anchor`; not cached."""
         numbers = np.asarray(nodes, dtype=np.int64)
         poses = between(self.chain[anchor], np.array([self.chain[i] for i in numbers]).reshape(-1, 3))
         cloud = merged_at([self.clouds[i] for i in numbers.tolist()], poses)
         return Submap(anchor, numbers, poses, cloud)
 
     def around(self, anchor: int, half_m: float) -> Submap:
-        """The submap of the nodes within `half_m` of travel from the node `anchor`; cached."""
+        """The submap of the nodes within `half_m` of travel from the node `anchor`, either way, of its piece only; cached."""
         nodes = self.along(anchor, half_m, half_m)
         return self._submaps.get(_span(anchor, nodes), lambda: self.submap(anchor, nodes))
 
@@ -208,11 +212,13 @@ def violation(
 ) -> float:
     """Share of one submap's visible points that most scans of another submap contradict: they lie in the scans' free space.
 
+    It is 0 if fewer than ten points are in view. At most 250 points are tested, by at most six scans.
+
     Args:
         walls: the submap whose points are tested.
         seers: the submap whose scans test them.
-        pose_seers_walls: (3,) frame of `walls` in that of `seers`.
-        ranges: (B,) ranges of every node's scan, indexed by node.
+        pose_seers_walls: (3,) frame of `walls` in that of `seers`, m and rad.
+        ranges: (B,) ranges of every node's scan, m, indexed by node.
         laser: bearings and mounting.
     """
     cloud = walls.cloud.thinned(POINTS).moved(pose_seers_walls)
@@ -227,19 +233,25 @@ def violation(
 def violation_both_ways(
     here: Submap, there: Submap, pose_there_here: Array, ranges: Sequence[NDArray[np.float32]], laser: Laser
 ) -> float:
-    """The larger one of `violation(here, there)` and `violation(there, here)`: each submap tests the points of the other."""
+    """The larger one of `violation(here, there)` and `violation(there, here)`: each submap tests the points of the other.
+
+    `pose_there_here` (3,) is the frame of `here` in that of `there`, m and rad; the rest is as for `violation`.
+    """
     forth = violation(here, there, pose_there_here, ranges, laser)
     return max(forth, violation(there, here, inverse(pose_there_here), ranges, laser))
 
 
 def violation_of_step(node: int, motion: Array, atlas: Atlas, laser: Laser) -> float:
-    """Share of the walls of a node's scan and of the one before in each other's free space, given the motion (3,) between."""
+    """Share of the walls of a node's scan and of the one before in each other's free space (the larger of both ways).
+
+    `motion` (3,) is the pose of the node in the frame of the one before, m and rad.
+    """
     last, here = (alone(atlas.clouds[i], i) for i in (node - 1, node))
     return violation_both_ways(here, last, motion, atlas.ranges, laser)
 
 
 def alone(cloud: Cloud, number: int) -> Submap:
-    """A submap of one scan, that of the node `number`."""
+    """A submap of one scan, that of the node `number`, in its own frame."""
     return Submap(number, np.array([number]), IDENTITY[None], cloud)
 
 

@@ -23,7 +23,7 @@ class SearchWindow:
     """A grid of start poses around the odometry, and the standard deviations of the odometry as prior.
 
     Attributes:
-        half_m, half_deg: half-widths of the grid.
+        half_m, half_deg: half-widths of the grid, in x and y and in heading.
         prior_m, prior_deg: standard deviations of the odometry.
     """
 
@@ -67,8 +67,8 @@ class Step:
         relative: pose of the new node in the frame of the one before; the odometry's if a check failed.
         checks: checks of the registration.
         contradicts_odometry: whether a good registration says that the odometry is wrong.
-        inliers, fit: see `Alignment`.
-        scatter: covariance (3, 3) of the new node's pose relative to the submap.
+        inliers, fit: shares of the registration, measured even if it failed; see `Alignment`.
+        scatter: covariance (3, 3) of the new node's pose relative to the submap, in the node's own frame, m^2 and rad^2.
     """
 
     relative: RelativePose
@@ -91,12 +91,13 @@ class Tracker:
         self._atlas = atlas
 
     def step(self, cloud: Cloud, odometry: RelativePose, between_nodes: Callable[[], Iterable[tuple[Array, Cloud]]]) -> Step:
-        """Measure the motion from the last node of the atlas to a new one.
+        """Measure the motion from the last node of the atlas to a new one; the atlas is not changed.
 
         Args:
-            cloud: scan of the new node.
+            cloud: scan of the new node, in its frame.
             odometry: pose of the new node in the frame of the last node, by the wheels.
-            between_nodes: returns the scans between the two nodes in order: motion (3,) since the last node, and cloud.
+            between_nodes: returns the scans between the two nodes in order: the robot's pose (3,) in the frame of the last node
+                by the wheels, and the cloud in the robot's frame. It is called only where the first search is weak.
         """
         field = self._field()
         best = self._search(field, cloud, odometry.delta)
@@ -108,7 +109,10 @@ class Tracker:
         return self._judge(best, odometry)
 
     def pair(self, cloud: Cloud, following: Cloud, odometry: Array) -> Alignment:
-        """Register one scan (`following`) to the scan before it (`cloud`), starting from the odometry (3,) between them."""
+        """Register one scan (`following`) to the scan before it (`cloud`), each in the robot's own frame.
+
+        `odometry` (3,) is the expected pose of the following scan in the frame of the one before, m and rad.
+        """
         field = self._field_of(cloud)
         best = self._search(field, following, odometry)
         if self._is_weak(best, odometry):
@@ -116,7 +120,10 @@ class Tracker:
         return best
 
     def resume(self, last: int, cloud: Cloud, expected: Array) -> Alignment:
-        """Register a scan to the submap that ends at an earlier node (`last`), near an expected pose (3,) in its frame."""
+        """Register a scan to the submap that ends at an earlier node (`last`), near an expected pose; nothing is changed.
+
+        `expected` (3,) is the pose of the scan in the frame of `last`, m and rad.
+        """
         nodes = range(max(last + 1 - SUBMAP_NODES, self._atlas.piece(last).start), last + 1)
         return self._grid(self._field_of(self._atlas.submap(last, nodes).cloud), cloud, expected, RESUMED)
 
@@ -183,7 +190,10 @@ class Tracker:
 
 
 def contradicts(pose: Array, expected: Array) -> bool:
-    """Whether a good registration (3,) says that the odometry (3,) of the same two scans is wrong."""
+    """Whether a registered pose (3,) is so far from that by the odometry (3,), m and rad, that the odometry is wrong.
+
+    The registration is taken for good.
+    """
     off_m = float(np.hypot(*(pose - expected)[:2]))
     return bool(off_m > CONTRADICTION_M or abs(wrap_angle(pose[2] - expected[2])) > np.deg2rad(CONTRADICTION_DEG))
 
