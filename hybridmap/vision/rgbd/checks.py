@@ -30,7 +30,13 @@ PLAUSIBLE_SIGMA = 16.3**0.5
 
 
 def of_step(depth_inliers: float, slack_m: float, odometry_sigma: float) -> tuple[Check, ...]:
-    """Check the depth registration of a new node: share of inliers and, unless it is certain, distance from the odometry."""
+    """Check the depth registration of a new node: share of inliers and, unless it is certain, distance from the odometry.
+
+    Args:
+        depth_inliers: measured share of the points in common view that fit, 0..1.
+        slack_m: its standard deviation in the loosest direction, m, see `Registration`; it decides whether it is certain.
+        odometry_sigma: its distance from the odometry, standard deviations.
+    """
     checks = of_depth(depth_inliers)
     if not (depth_inliers > SURE_INLIERS and slack_m < SURE_SLACK_M):
         checks += (at_most("odometry_sigma", odometry_sigma, CONTRADICTION_SIGMA),)
@@ -43,12 +49,12 @@ def of_depth(depth_inliers: float) -> tuple[Check, ...]:
 
 
 def of_profile(profile_G: float, c_t: float) -> tuple[Check, ...]:
-    """Check a loop that is accepted by profile alone: its score (eq. 13) is at most the threshold `c_t`."""
+    """Check a loop that is accepted by profile alone: its score `profile_G` (eq. 13) is at most the threshold `c_t`."""
     return (at_most("profile_G", profile_G, c_t, "vision.matching.c_t"),)
 
 
 def of_matches(matches: int, least: int) -> tuple[Check, ...]:
-    """Check that two views have at least `least` matching features."""
+    """Check that the number of matching features of two views (`matches`) is at least `least`."""
     return (at_least("matches", matches, least, _MIN_INLIERS),)
 
 
@@ -66,8 +72,8 @@ def of_plane(height_m: float, tilt_deg: float, reverse_m: float, reverse_deg: fl
     """Check that a pose from features is planar, and agrees with the pose estimated in the reverse direction.
 
     Args:
-        height_m, tilt_deg: height and tilt of the pose, which should be 0.
-        reverse_m, reverse_deg: difference of the two directions.
+        height_m, tilt_deg: measured height (absolute) and tilt of the pose, which should be 0.
+        reverse_m, reverse_deg: measured difference of the poses in the two directions.
         held: the camera's tilt was measured and not taken from the mounting; then the limits are wider.
     """
     height, tilt = (HELD_HEIGHT, HELD_TILT) if held else (1.0, 1.0)
@@ -80,7 +86,12 @@ def of_plane(height_m: float, tilt_deg: float, reverse_m: float, reverse_deg: fl
 
 
 def of_refinement(off_m: float, off_deg: float, depth_inliers: float) -> tuple[Check, ...]:
-    """Check a depth registration that started from a pose by features: distance from that pose, and share of inliers."""
+    """Check a depth registration that started from a pose by features.
+
+    Args:
+        off_m, off_deg: its measured distance from that pose.
+        depth_inliers: measured share of the points in common view that fit, 0..1.
+    """
     return (
         at_most("off_features_m", off_m, REFINED * REVERSE_M),
         at_most("off_features_deg", off_deg, REFINED * REVERSE_DEG),
@@ -89,7 +100,10 @@ def of_refinement(off_m: float, off_deg: float, depth_inliers: float) -> tuple[C
 
 
 def of_features_alone(feature_inliers_both: int) -> tuple[Check, ...]:
-    """Check a pose from features where depth cannot confirm it: it needs more feature inliers, in both directions."""
+    """Check a pose from features where depth cannot confirm it: it needs more features.
+
+    `feature_inliers_both` is the number of those that are inliers in both directions.
+    """
     return (at_least("feature_inliers_both", feature_inliers_both, MIN_INLIERS_ALONE),)
 
 
@@ -97,10 +111,10 @@ def of_depth_alone(depth_inliers: float, overlap: float, points: int, slack_m: f
     """Check a depth registration that started from the map's pose and has no features to confirm it.
 
     Args:
-        depth_inliers: share of the points in common view that fit.
-        overlap: share of the points that are in the other frame's view.
+        depth_inliers: measured share of the points in common view that fit, 0..1.
+        overlap: measured share of the points that are in the other frame's view, 0..1.
         points: number of matched points.
-        slack_m: standard deviation in the loosest direction.
+        slack_m: standard deviation in the loosest direction, m, see `Registration`.
     """
     return (
         at_least("depth_inliers", depth_inliers, MAP_INLIERS),
@@ -111,10 +125,13 @@ def of_depth_alone(depth_inliers: float, overlap: float, points: int, slack_m: f
 
 
 def of_map(map_sigma: float) -> tuple[Check, ...]:
-    """Check that a loop differs from the map's relative pose by no more than the map's covariance allows."""
+    """Check that a loop differs from the map's relative pose by no more than the covariances of both allow.
+
+    `map_sigma` is the measured difference, standard deviations (Mahalanobis distance).
+    """
     return (at_most("map_sigma", map_sigma, PLAUSIBLE_SIGMA),)
 
 
 def of_support(supporting: int) -> tuple[Check, ...]:
-    """Check that at least one other measured loop nearby agrees with a loop."""
+    """Check that at least one other measured loop nearby agrees with a loop; `supporting` is their number."""
     return (at_least("supporting", supporting, 1),)

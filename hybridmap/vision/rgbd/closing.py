@@ -51,6 +51,14 @@ SURE = 4.0
 class LoopCloser:
     """Finds loop closures for one camera. The newer node is the source of an edge.
 
+    Args:
+        keyframes: of all nodes, by number; it grows as nodes are made.
+        config: settings of the visual side.
+        verifier: measures the relative pose of two keyframes.
+        yaw_of_shift: shift of a profile in columns -> yaw of the older view in the newer one, rad.
+        new_key: returns the key of a new edge.
+        clock: measures the time of the search for candidates (stage `search`).
+
     Attributes:
         support: the measured loops, and which of them agree with each other.
     """
@@ -90,11 +98,11 @@ class LoopCloser:
         self._rounds_left = config.closing.revisit_rounds
 
     def add_node(self, profile: Profile) -> None:
-        """Store the profile of the next node."""
+        """Store the profile (bands, width) of the next node."""
         self._matcher.add(profile)
 
     def close(self, node: int, belief: Belief) -> list[Edge]:
-        """Look for loops of one node, and decide pending ones; returns new and changed edges."""
+        """Look for loops of the newest node, and decide pending ones; returns new (also rejected) and changed edges."""
         since_m = self._travel_at_closure
         gated = self._gate(node, belief)
         changed = self._try_candidates(node, self._ranked(node, gated), belief) if len(gated) else []
@@ -123,18 +131,19 @@ class LoopCloser:
         return out
 
     def tracked(self, node: int, steps: list[Edge]) -> None:
-        """Note the registrations (`steps`) of a new node to the ones before it."""
+        """Note the registrations (`steps`) of a new node to the ones before it: they tell whether its motion is certain."""
         self._relocaliser.tracked(node, chain_state(steps) if self._may_be_lost else ChainState.HOLDS, steps)
 
     @property
     def lost_since(self) -> int | None:
-        """First node after the robot was kidnapped or lost track of its motion; None while it is localised on the map."""
+        """First node since the last loop closure whose view fits none of those before it (broken motion); None if all fit."""
         return self._relocaliser.whereabouts.lost_since
 
     def note(self, node: int) -> dict[str, Array]:
-        """What the map file keeps of the newest node's search for loops; empty for other nodes.
+        """What the map file keeps of the search for loops of the node closed last; empty for other nodes.
 
-        Keys: `gate` (5,), see `Gate.to_array`; `ranked` (n, 3), the best candidates: node, score G (eq. 13), shift in columns.
+        Keys: `gate` (5,), see `Gate.to_array`; `ranked` (n, 3), the candidates by profile, the best first: node, score G
+        (eq. 13), shift in columns.
         """
         if node != self._noted:
             return {}
@@ -161,7 +170,10 @@ class LoopCloser:
         return found.proposals
 
     def finish(self, belief: Belief) -> list[Edge]:
-        """At the end of the drive, compare nodes near each other on the optimised map; then decide all pending loops."""
+        """At the end of the drive, compare nodes near each other on the optimised map; then decide all pending loops.
+
+        After the configured number of calls nothing is compared any more. Returns new and changed edges.
+        """
         out: list[Edge] = []
         if self._rounds_left > 0 and not self._unverified:
             self._rounds_left -= 1
@@ -175,7 +187,10 @@ class LoopCloser:
         return [*out, *self.support.give_up(before=len(self._keyframes))]
 
     def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
-        """Measure outlier loops again; `belief` is the map without them. Returns the loops that changed."""
+        """Measure outlier loops again; `belief` is the map without them.
+
+        Returns all of them under their keys, rejected where they do not fit; none where loops are not verified.
+        """
         if self._unverified:
             return []
         out = []

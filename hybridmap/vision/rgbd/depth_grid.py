@@ -22,12 +22,12 @@ a cell is known where this share of its pixels is."""
 
 
 def cell_px(width_px: int) -> int:
-    """Side of a grid cell, in pixels, for images of a given width."""
+    """Side of a grid cell, in pixels, for images of a given width (the working width)."""
     return max(2, min(GRID_PX, width_px // GRID_COLUMNS))
 
 
 def reduced(camera: Camera, factor: int) -> Camera:
-    """The pinhole of an image reduced by a whole factor: pixels are `factor` times as large."""
+    """The pinhole of an image reduced by a whole factor: pixels are `factor` times as large, the mounting is the same."""
     return replace(
         camera,
         width_px=camera.width_px // factor,
@@ -64,8 +64,9 @@ class Surface:
 
     Attributes:
         grid: the grid that the points come from.
-        stance: pose of the camera on the robot at that keyframe.
-        T_camera_base: (4, 4) robot's base in the camera's frame.
+        stance: pose of the camera in the level `base_link` at that keyframe (its tilt and height may change), with its
+            uncertainty.
+        T_camera_base: (4, 4) `base_link` in the camera's optical frame: the inverse of the stance's pose.
         rows: (7, N) of the valid points: position in `base_link` (m), normal, standard deviation along the normal (m).
         number: (R, C) int32, index of a cell's point; -1 for none.
     """
@@ -98,7 +99,7 @@ def make_grid(depth_m: NDArray[np.float32], camera: Camera, cell_px: int, depth_
     Args:
         depth_m: (H, W) float32, m along the optical axis; 0 where invalid.
         camera: pinhole of the image.
-        cell_px: side of a cell, pixels.
+        cell_px: side of a cell, pixels; what is left over at the right and at the bottom is cut off.
         depth_sigma: noise of one pixel at 1 m, m; it grows with the square of the distance.
     """
     coarse = reduced(camera, cell_px)
@@ -113,7 +114,10 @@ def make_grid(depth_m: NDArray[np.float32], camera: Camera, cell_px: int, depth_
 
 
 def place(grid: DepthGrid, stance: Stance) -> Surface:
-    """Put a depth grid into the robot's frame, by the camera's pose (stance) at that keyframe."""
+    """Put the valid points of a depth grid into the level `base_link`.
+
+    `stance` is the pose of the camera in `base_link` at that keyframe: as mounted, or measured if the camera is hand-held.
+    """
     valid, T_base_camera = grid.valid, stance.T_base_camera
     number = np.full(valid.shape, -1, dtype=np.int32)
     rows = np.empty((7, np.count_nonzero(valid)))

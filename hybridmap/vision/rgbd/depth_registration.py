@@ -79,16 +79,16 @@ class Registration:
     """Result of a depth registration.
 
     Attributes:
-        T_fixed_moving: (4, 4) moving base in the fixed one, the bases as their stances had them.
+        T_fixed_moving: (4, 4) moving base in the fixed one, the bases as the cameras' stances had them.
         level: the same after both bases are levelled.
         relative: planar part of `level`, with the covariance that the residuals alone give (the prior is taken out), points
             erring independently; see `noise_level` for what it really is.
-        slack_m: standard deviation in the loosest direction if every `correlation` points counted as one: it says whether the
-            surfaces hold each other, whatever the noise.
+        slack_m: standard deviation in the loosest direction if every `CORRELATION` points counted as one, m: it says whether
+            the surfaces hold each other, whatever the noise.
         points: number of matched points.
-        inliers: share of the points in common view that fit.
-        residual_m: root mean square point-to-plane distance of the inliers.
-        overlap: share of the moving points that are in the fixed frame's view.
+        inliers: share of the points in common view that fit, 0..1.
+        residual_m: root mean square point-to-plane distance of the inliers, m.
+        overlap: share of the moving points that are in the fixed frame's view, 0..1.
         height_m, tilt_rad: height and tilt of the pose, which its planar part leaves out.
     """
 
@@ -115,12 +115,12 @@ def register(
 
     Args:
         fixed, moving: surfaces in their own bases.
-        start: (4, 4) first guess of the moving base in the fixed one.
-        prior: planar prior (wheel odometry) of the solve; taken out of the result's covariance.
+        start: (4, 4) first guess of the moving base in the fixed one; it is not changed.
+        prior: moving base in the fixed one by odometry or map, which joins the solve; taken out of the result's covariance.
         pairs: matched keypoints that join the solve.
 
     Returns:
-        None if too few points match.
+        The registration, which may still fit badly (see its figures); None if too few points match.
     """
     T, stride = start.copy(), max(1, moving.rows.shape[1] // COARSE_POINTS)
     known = _Prior.of(fixed.stance, moving.stance, prior)
@@ -251,18 +251,21 @@ class Pairing:
         return len(self.residual)
 
     def mean(self, values: Array) -> float:
-        """Mean of values (n,) over the pairs that match."""
+        """Mean of values (n,), one a pair, over the pairs that match."""
         return float(values[np.isfinite(self.variance)].sum()) / max(self.matched, 1)
 
     def terms(self) -> tuple[Array, Array]:
-        """H (6, 6) and b (6,) of the normal equations, with Cauchy weights."""
+        """H (6, 6) and b (6,) of the normal equations H xi = b, with Cauchy weights.
+
+        xi is a shift (3) of the moving base and a small turn (3) about it, along the axes of the fixed base.
+        """
         J = wrenches(self.arm, self.normal)
         weighted = J / (self.variance + TAILS * self.residual**2)
         return weighted @ J.T, -weighted @ self.residual
 
 
 def associate(fixed: Surface, moving: Array, T: Array) -> Pairing:
-    """Pair each moving point with the fixed point in whose grid cell it falls.
+    """Pair each moving point with the fixed point in whose grid cell it falls; the pairs need not match.
 
     Args:
         fixed: the surface in its own base.

@@ -37,7 +37,7 @@ class Features:
 
 @dataclass(frozen=True, slots=True)
 class Correspondences:
-    """Indices (M,) of matching keypoints in the first and in the second keyframe; no keypoint occurs twice."""
+    """Indices (M,) of matching keypoints in the `Features` of the first and of the second keyframe; none occurs twice."""
 
     first: NDArray[np.int64]
     second: NDArray[np.int64]
@@ -65,7 +65,7 @@ def detect(grey: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: Camera
 def match(a: Features, b: Features) -> Correspondences:
     """Match each keypoint of a with its nearest descriptor in b, by Lowe's ratio test.
 
-    Where several keypoints of a have the same partner in b, only the nearest one is kept.
+    Where several keypoints of a have the same partner in b, only the nearest one is kept. Pairs are in the order of a.
     """
     import cv2
 

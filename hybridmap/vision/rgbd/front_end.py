@@ -81,7 +81,7 @@ class RgbdFrontEnd:
         self._image: WorkingImage | None = None
 
     def observe(self, frame: Observation, delta_node_robot: Array) -> View:
-        """Compute the profile of one frame and recognise its view template.
+        """Compute the profile of one frame and recognise its view template; `delta_node_robot` is not used.
 
         Raises:
             StreamError: not an RGB-D frame, or its size is not the camera's.
@@ -100,9 +100,13 @@ class RgbdFrontEnd:
         return View(frame.stamp_ns, profile, seen.template, seen.founded)
 
     def add_node(self, node: int, view: View) -> None:
-        """Make a node of the frame observed last: keep its features, surface and images."""
+        """Make a node of the frame observed last: keep its features, surface and images; see `FrontEnd.add_node`.
+
+        Raises:
+            ValueError: no frame was observed yet, or `node` is not the next number.
+        """
         if self._frame is None or self._image is None or node != len(self.keyframes):
-            raise ValueError(f"node {node} cannot be made here: {len(self.keyframes)} nodes so far, observe a frame first")
+            raise ValueError(f"vision: found node {node}, expected node {len(self.keyframes)} after a frame was observed")
         rgbd = self._config.rgbd
         features = detect(self._image.grey, self._image.depth_m, self._camera)
         grid = make_grid(self._image.depth_m, self._camera, self._cell_px, rgbd.registration.depth_sigma)
@@ -112,13 +116,16 @@ class RgbdFrontEnd:
         self.closer.add_node(view.profile)
 
     def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
-        """Register the new node to the ones before it."""
+        """Register the new node to the two before it; see `FrontEnd.track`.
+
+        Returns no edges for the first node, nor where `vision.tracking.enabled` is false.
+        """
         steps = self._tracker.track(node, odometry)
         self.closer.tracked(node, steps)
         return steps
 
     def close(self, node: int, belief: Belief) -> list[Edge]:
-        """Look for loop closures of the new node."""
+        """Look for loop closures of the new node; see `FrontEnd.close`."""
         return self.closer.close(node, belief)
 
     def finish(self, belief: Belief) -> list[Edge]:
@@ -126,11 +133,11 @@ class RgbdFrontEnd:
         return self.closer.finish(belief)
 
     def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
-        """Measure again, from the poses of the map, loops that a back-end down-weighted as outliers."""
+        """Measure again, from the poses of the map, loops that a back-end down-weighted; see `LoopCloser.verify`."""
         return self.closer.verify(outliers, belief)
 
     def overrules(self, registration: RelativePose, odometry: RelativePose) -> bool:
-        """Whether a good registration says that the odometry is wrong."""
+        """Whether a good registration says that the odometry is wrong; see `Overruling.overrules`."""
         return odometry_sigma(registration, odometry) > CONTRADICTION_SIGMA
 
     @property
@@ -139,7 +146,7 @@ class RgbdFrontEnd:
         return 0.0
 
     def way(self, node: int) -> tuple[Check, ...]:
-        """Check that the depth of a node fits that of the one before no worse than nearly always on this drive."""
+        """Check that the depth of a node fits that of the one before, not much worse than nearly always; see `Tracker.way`."""
         return self._tracker.way(node)
 
     def part(self, node: int) -> None:
@@ -147,14 +154,14 @@ class RgbdFrontEnd:
 
     @property
     def lost_since(self) -> int | None:
-        """First node after the robot was kidnapped or lost track of its motion; None while it is localised on the map."""
+        """First node since the last loop closure whose view fits none of those before it (broken motion); None if all fit."""
         return self.closer.lost_since
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
         """Arrays of a node's frame for the map file.
 
-        Keys: `profile` float32, `color` and `depth_mm`, and `T_base_camera` (4, 4), the camera on the robot at that time. The
-        newest node has the keys of `LoopCloser.note` too.
+        Keys: `profile` (bands, width) float32; `color` (H, W, 3) uint8 and `depth_mm` (H, W) uint16, of full size; and
+        `T_base_camera` (4, 4), the camera on the robot at that time. The node closed last has those of `LoopCloser.note` too.
 
         Raises:
             StreamError: the node's images are no longer held (see `held_images`); the map file has them.

@@ -25,7 +25,14 @@ RANKED = 6
 
 
 class GlobalSearch:
-    """Finds where a lost robot is: nodes anywhere on the map with the most similar profiles, verified by features."""
+    """Finds where a lost robot is: nodes anywhere on the map with the most similar profiles, verified by features.
+
+    Args:
+        keyframes: of all nodes, by number.
+        matcher: has the profiles of all nodes stored under their numbers.
+        verifier: measures the relative pose of two keyframes.
+        new_key: returns the key of a new edge.
+    """
 
     def __init__(
         self,
@@ -40,7 +47,10 @@ class GlobalSearch:
         self._new_key = new_key
 
     def search(self, node: int, elsewhere: Indices) -> list[Edge]:
-        """Compare a node with the older nodes `elsewhere` (n,), ascending; verified edges are pending."""
+        """Compare a node with the older nodes `elsewhere` (n,), ascending: the few with the most similar profiles.
+
+        Returns an edge from the node to each of these: pending if it is verified, else rejected.
+        """
         return [self._measured(node, target, candidate) for target, candidate in self._candidates(node, elsewhere).items()]
 
     def _candidates(self, node: int, targets: Indices) -> dict[int, Candidate]:
@@ -59,7 +69,10 @@ class GlobalSearch:
 
 
 def chain_state(steps: Sequence[Edge]) -> ChainState:
-    """How certain the motion to a node is, from its registrations; without any, the odometry counts as certain."""
+    """How certain the motion to a node is, from its registrations: broken if all are rejected.
+
+    It is uncertain if the best accepted one may slide along a wall. Without any, the odometry counts as certain.
+    """
     if not steps:
         return ChainState.HOLDS
     accepted = [step.relative for step in steps if step.status is Status.ACCEPTED and step.relative is not None]

@@ -34,9 +34,9 @@ class Keyframe:
     """What is kept of a node's RGB-D image.
 
     Attributes:
-        profile: means of intensity and depth in columns of the image, with which similar views are found.
+        profile: (bands, width) means of intensity and depth in columns of the image, with which similar views are found.
         features: keypoints with their points in space.
-        surface: points and normals of the depth image, on a coarse grid.
+        surface: points and normals of the depth image, on a coarse grid, in `base_link`.
     """
 
     profile: Profile
@@ -45,7 +45,7 @@ class Keyframe:
 
     @property
     def held(self) -> bool:
-        """Whether the camera's tilt was measured at this keyframe, and not taken from the mounting."""
+        """Whether the camera counts as hand-held: its tilt was estimated at this keyframe, and not taken from the mounting."""
         return self.surface.stance.held
 
 
@@ -60,7 +60,7 @@ def working_camera(camera: Camera, max_width_px: int) -> Camera:
 
 
 def working_image(frame: RgbdFrame, factor: int) -> WorkingImage:
-    """Reduce a frame by a whole factor.
+    """Reduce a frame by a whole factor; columns and rows that are left over are cut off.
 
     Grey is averaged over areas. Depth is taken from the pixel in the middle: averaging would invent surfaces at edges.
     """

@@ -40,7 +40,12 @@ class NoiseLevel:
         return self._factor
 
     def observe(self, first: RelativePose, second: RelativePose, across: RelativePose) -> None:
-        """Add a ring of registrations (k-2 to k-1, k-1 to k, and k-2 to k), with the covariances that their residuals give."""
+        """Add a ring of registrations between three nodes in a row, with the covariances before `applied`.
+
+        Args:
+            first, second: pose of the second node in the frame of the first, and of the third in that of the second.
+            across: pose of the third node in the frame of the first.
+        """
         around = compose_relative(first, second)
         error = log(between(around.delta, across.delta))
         self._squared.append(float(error @ np.linalg.solve(around.covariance + across.covariance, error)))
@@ -55,7 +60,7 @@ class NoiseLevel:
         Args:
             relative: a registration with the covariance that its residuals give.
             translation_floor_m, rotation_floor_deg: the floors.
-            shared: a further factor on all, for errors that overlapping registrations have in common.
+            shared: a further factor on the whole covariance, for errors that overlapping registrations have in common.
         """
         floor = np.diag([translation_floor_m**2, translation_floor_m**2, np.deg2rad(rotation_floor_deg) ** 2])
         return RelativePose(relative.delta, shared * (self.factor * relative.covariance + floor))

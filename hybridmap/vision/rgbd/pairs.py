@@ -37,12 +37,12 @@ class PointPairs:
         return len(self.fixed)
 
     def agreeing(self, T_fixed_moving: Array) -> int:
-        """Number of pairs that fit a pose (4, 4) of the moving base: 99 % of right ones do."""
+        """Number of pairs that fit a pose (4, 4) of the moving base in the fixed one: 99 % of right ones do."""
         error = apply(T_fixed_moving, self.moving) - self.fixed
         return int(np.count_nonzero(self._squared(error, np.einsum("ki,ki->k", self.ray, error)) < BOUND))
 
     def near(self, T_fixed_moving: Array, reach_m: float) -> PointPairs | None:
-        """The pairs whose two points are within `reach_m` of each other under a pose (4, 4).
+        """The pairs whose two points are within `reach_m` of each other under a pose (4, 4) of the moving base.
 
         Returns None if they are fewer than three.
         """
@@ -105,7 +105,7 @@ def point_pairs(
         fixed, moving: the keyframes.
         matches: `first` are keypoints of the fixed, `second` of the moving keyframe.
         focal_px: focal length at the working width.
-        depth_sigma: noise of depth at 1 m, m.
+        depth_sigma: noise of depth at 1 m, m; it grows with the square of the distance.
     """
     if len(matches.first) < 3:
         return None

@@ -30,8 +30,8 @@ class Pnp:
     """A pose estimated by PnP and its inliers.
 
     Attributes:
-        T_image_points: (4, 4) the camera that gave the points, seen from the camera that gave the image.
-        inliers: indices of the matches that agree with the pose.
+        T_image_points: (4, 4) the camera that gave the points, seen from the camera that gave the image (optical frames).
+        inliers: indices into the matches, of those that agree with the pose.
     """
 
     T_image_points: Array
@@ -39,7 +39,13 @@ class Pnp:
 
 
 class PnpSolver:
-    """PnP-RANSAC for one camera; the random generator is seeded again in every call, so results repeat."""
+    """PnP-RANSAC for one camera.
+
+    Args:
+        camera: pinhole at the working width.
+        min_inliers: least number of matches to try.
+        seed: seed of RANSAC, set again in every call: equal calls give equal results.
+    """
 
     def __init__(self, camera: Camera, min_inliers: int, seed: int) -> None:
         self._matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1.0]])
@@ -54,7 +60,8 @@ class PnpSolver:
             of_points, of_image: (M,) indices of matching keypoints in either.
 
         Returns:
-            None if too few matches agree.
+            None if there are fewer than `min_inliers` matches, or if fewer than four agree. The inliers of a pose may be fewer
+            than `min_inliers`.
         """
         import cv2
 
@@ -100,7 +107,7 @@ class Candidate:
 
     Attributes:
         search: by which search the pair was found.
-        shift: columns by which the older view is shifted against the newer one.
+        shift: columns of the profile, positive when things lie farther right in the newer view than in the older one.
         figures: values measured by the search, by name.
     """
 
@@ -115,7 +122,7 @@ class Verification:
 
     Attributes:
         relative: the pose; None if a check failed or something else was lacking.
-        method: what the pose was measured by.
+        method: what the pose was measured by, or would have been.
         checks: the checks, in the order in which they were made.
         lack: what was lacking beside checks; None if nothing was.
         figures: further measured values, by name.
@@ -145,7 +152,18 @@ class Verification:
 
 
 class Verifier:
-    """Measures the relative pose of two keyframes of one camera, with checks."""
+    """Measures the relative pose of two keyframes of one camera, with checks; the keyframes are not changed.
+
+    Args:
+        camera: pinhole at the working width.
+        min_inliers: least number of features that agree.
+        depth_sigma: noise of depth at 1 m, m.
+        level: factor on the covariances of registrations.
+        seed: seed of RANSAC.
+
+    Attributes:
+        solver: estimates poses from features alone.
+    """
 
     def __init__(
         self,
@@ -161,7 +179,7 @@ class Verifier:
         self._level = level
 
     def verify(self, source: Keyframe, target: Keyframe) -> Verification:
-        """Measure the target's pose in the source's frame: by features, then by depth from there."""
+        """Measure the target's pose in the source's frame: by features, refined by depth where enough is in common view."""
         pairs = match(source.features, target.features)
         asked = checks.of_matches(len(pairs.first), self._min_inliers)
         if not passed(asked):

@@ -46,7 +46,13 @@ MIN_FOLLOWED = 15
 
 
 class Posture:
-    """Estimates the camera's pose on a level robot (its stance) at each keyframe."""
+    """Estimates the camera's pose on a level robot (its stance) at each keyframe.
+
+    Args:
+        mode: see the setting `vision.rgbd.tilt`.
+        T_base_camera: (4, 4) mounting.
+        solver: gives the camera's turn since the keyframe before, where no floor is in view.
+    """
 
     def __init__(self, mode: Literal["auto", "level", "floor"], T_base_camera: Array, solver: PnpSolver) -> None:
         self._mounting = T_base_camera
@@ -59,7 +65,13 @@ class Posture:
         self._unwatched = 0
 
     def stance(self, grid: DepthGrid, features: Features, last: Keyframe | None) -> Stance:
-        """Estimate the camera's stance at a new keyframe; `last` is the keyframe before it, None at the first."""
+        """Estimate the camera's stance at a new keyframe. Call it once for each, in order: floors seen before count.
+
+        Args:
+            grid: depth of the new keyframe.
+            features: its keypoints.
+            last: the keyframe before it; None at the first.
+        """
         if not self._held and not self._looks():
             return self._as_mounted
         found = self._on_floor(grid)
@@ -146,9 +158,9 @@ def find_floor(grid: DepthGrid, up_nominal: Array, height_nominal_m: float, tole
 
     Args:
         grid: depth of the frame.
-        up_nominal: (3,) the vertical in the optical frame if the camera sat as mounted.
-        height_nominal_m: mounting height.
-        tolerance_m: largest difference from the mounting height.
+        up_nominal: (3,) the vertical in the optical frame if the camera sat as mounted, unit length.
+        height_nominal_m: expected height of the camera above the floor.
+        tolerance_m: largest difference from that height.
         min_cells: least number of cells of a floor.
 
     Returns:
@@ -178,7 +190,7 @@ def find_floor(grid: DepthGrid, up_nominal: Array, height_nominal_m: float, tole
 
 
 def vertical_of_structure(normals: Array, guesses: Array) -> Array:
-    """Vertical (3,) of an indoor scene from the normals of its walls and level surfaces, near one of some guesses.
+    """Vertical (3,), unit, of an indoor scene from the normals of its walls and level surfaces, near one of some guesses.
 
     Each guess is refined by least squares over the normals of such surfaces. The result with most agreeing normals wins, less
     a penalty for guesses far from the first.

@@ -29,14 +29,17 @@ class Revisits:
 
         Args:
             node: the node.
-            since_m: path length at the loop closure before; only nodes made after that may have moved.
+            since_m: path length at the loop closure before, m; of the nodes before `node`, those made since may have moved.
             belief: the map before the new closure.
         """
         behind = np.flatnonzero(belief.travel_m[:node] > since_m)
         self._waiting += [(int(n), belief.poses_map_node[n].copy()) for n in behind]
 
     def next_moved(self, belief: Belief) -> int | None:
-        """Remove and return the newest node that the closure moved; None if there is none left."""
+        """Remove and return the newest waiting node that has moved on the map; None if there is none left.
+
+        Newer ones that have not moved are removed too.
+        """
         while self._waiting:
             node, before = self._waiting.pop()
             now = belief.poses_map_node[node]
@@ -60,7 +63,7 @@ class Reverification:
         self._map_covariance = map_covariance
 
     def measure(self, outlier: Edge, belief: Belief) -> Verification:
-        """Measure one loop again; `belief` is that of the map without outliers."""
+        """Measure one loop again; `belief` is that of the map without outliers. Without a pose the loop is to be retracted."""
         source, target = self._keyframes[outlier.source], self._keyframes[outlier.target]
         on_map = between(belief.poses_map_node[outlier.source], belief.poses_map_node[outlier.target])
         there = self._verifier.verify_near(source, target, RelativePose(on_map, self._map_covariance))

@@ -18,8 +18,8 @@ class Stance:
 
     Attributes:
         T_base_camera: (4, 4) the camera in the robot's base, the base being level.
-        tilt_sigma_rad, height_sigma_m: standard deviations of roll and pitch, and of the height.
-        held: whether the pose was measured at this keyframe (hand-held camera) and not taken from the mounting.
+        tilt_sigma_rad, height_sigma_m: standard deviations of roll and pitch (each), and of the height.
+        held: whether tilt and height were estimated at this keyframe (hand-held camera) and not taken from the mounting.
     """
 
     T_base_camera: Array
@@ -76,7 +76,7 @@ def level_pair(T_fixed_moving: Array, fixed: Stance, moving: Stance) -> LevelPai
 
     Args:
         T_fixed_moving: (4, 4) moving base in the fixed one, the bases as their stances have them.
-        fixed, moving: the stances.
+        fixed, moving: the cameras' poses in either base, with their uncertainty.
     """
     T_cameras = inverse_rigid(fixed.T_base_camera) @ T_fixed_moving @ moving.T_base_camera
     weight_fixed, weight_moving = fixed.tilt_sigma_rad**-2, moving.tilt_sigma_rad**-2
@@ -105,7 +105,7 @@ class FloorPose:
 
 
 def inverse_rigid(T_a_b: Array) -> Array:
-    """Return T_b_a (4, 4)."""
+    """Return T_b_a (4, 4), the inverse of a rigid transform."""
     out = _IDENTITY.copy()
     out[:3, :3] = T_a_b[:3, :3].T
     out[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
@@ -113,7 +113,7 @@ def inverse_rigid(T_a_b: Array) -> Array:
 
 
 def from_planar(pose: Array) -> Array:
-    """Lift (x, y, yaw) to (4, 4)."""
+    """Lift a planar pose (3,), m and rad, to (4, 4)."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     out = _IDENTITY.copy()
     out[:2, :2] = [[cos, -sin], [sin, cos]]
@@ -122,7 +122,7 @@ def from_planar(pose: Array) -> Array:
 
 
 def to_floor(T_a_b: Array) -> FloorPose:
-    """Split a transform (4, 4) between two bases into planar pose, height and tilt."""
+    """Split the pose (4, 4) of base b in base a into planar pose, height and tilt."""
     yaw = math.atan2(T_a_b[1, 0] - T_a_b[0, 1], T_a_b[0, 0] + T_a_b[1, 1])
     tilt = math.acos(min(max(float(T_a_b[2, 2]), -1.0), 1.0))
     return FloorPose(np.array([T_a_b[0, 3], T_a_b[1, 3], yaw]), float(T_a_b[2, 3]), tilt)

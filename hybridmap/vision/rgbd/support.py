@@ -19,7 +19,7 @@ SUPPORT_NODES = 12
 
 @dataclass(slots=True)
 class MeasuredLoop:
-    """A loop that was measured and is pending or accepted.
+    """A loop that was measured: it is pending, accepted, or given up.
 
     Attributes:
         proposal: the edge, with its present status.
@@ -49,11 +49,11 @@ class Support:
         self._filed: set[tuple[int, int]] = set()
 
     def has(self, source: int, target: int) -> bool:
-        """Whether the two nodes have an edge, accepted or pending."""
+        """Whether there is an edge from `source` to `target` (in this order) that was not given up."""
         return (source, target) in self._filed
 
     def join(self, source: int, target: int) -> None:
-        """Note that two nodes have an edge that is kept elsewhere."""
+        """Note for `has` that two nodes have an edge that is kept elsewhere."""
         self._filed.add((source, target))
 
     def accepted(self, source: int) -> int:
@@ -61,7 +61,7 @@ class Support:
         return sum(h.proposal.status is Status.ACCEPTED for h in self._of_source.get(source, ()))
 
     def file(self, new: MeasuredLoop, belief: Belief) -> list[Edge]:
-        """Add a loop. If another loop agrees with it, accept it and the pending ones that agree with it.
+        """Add a loop. If a loop from another node nearby agrees with it, accept it and the pending ones that agree with it.
 
         Returns the edge of the new loop, then those whose status changed.
         """
@@ -81,7 +81,7 @@ class Support:
         return [h.proposal for h in changed]
 
     def replace(self, proposal: Edge) -> None:
-        """Replace the edge of a loop that was measured again."""
+        """Replace the edge of a loop that was measured again (found by its key); one without a pose is dropped."""
         of_source = self._of_source[proposal.source]
         kept = [h for h in of_source if h.proposal.key != proposal.key]
         if proposal.relative is not None and len(kept) < len(of_source):
@@ -89,7 +89,7 @@ class Support:
         self._of_source[proposal.source] = kept
 
     def give_up(self, before: int) -> list[Edge]:
-        """Reject the pending loops whose source node is older than `before`; returns their edges."""
+        """Reject the pending loops whose source has a number below `before`; returns their edges."""
         self._pending = [h for h in self._pending if h.proposal.status is Status.PENDING]
         late = [h for h in self._pending if h.source < before]
         for h in late:

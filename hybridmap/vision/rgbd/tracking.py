@@ -40,7 +40,15 @@ STRAIGHTENED_M = 0.01
 
 
 class Tracker:
-    """Registers node k to the nodes k-1, k-2, ... before it."""
+    """Registers node k to the nodes k-1 and k-2 before it.
+
+    Args:
+        keyframes: of all nodes, by number; it grows as nodes are made, and the newest one may be replaced.
+        config: settings of the visual side.
+        camera: pinhole at the working width.
+        level: factor on the covariances of registrations, which is learnt here.
+        new_key: returns the key of a new edge.
+    """
 
     def __init__(
         self,
@@ -61,9 +69,10 @@ class Tracker:
         self._outliers: dict[int, float] = {}
 
     def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
-        """Register a new node to the ones before it; returns proposed edges from these to the new node.
+        """Register a new node to the two before it; returns edges from these to the new node, rejected ones too.
 
-        `odometry` is the pose of the new node in the frame of node - 1 (None for the first node).
+        `odometry` is the pose of the new node in the frame of node - 1 (None for the first node). The new keyframe may get a
+        stance (tilt and height of its camera) that is propagated from the one before.
         """
         if odometry is None or node == 0:
             return []
@@ -79,7 +88,10 @@ class Tracker:
         return proposals
 
     def way(self, node: int) -> tuple[Check, ...]:
-        """Check that the registration of a node to the one before does not fit much worse than nearly all of the drive's."""
+        """Check that the registration of a node to the one before does not fit much worse than nearly all of the drive's.
+
+        Empty if the node was not registered.
+        """
         if node not in self._outliers:
             return ()
         limit = ODD_FACTOR * float(np.percentile(list(self._outliers.values()), ODD))
