@@ -315,7 +315,8 @@ def build_field(
     index = (column * ny + row)[None] + (offsets[:, 0] * ny + offsets[:, 1])[:, None]
     value = np.maximum(1.0, 255.0 * np.exp(-0.5 * (distance_m / sigma_m) ** 2)).astype(np.int32)
     both = np.zeros(nx * ny, np.int32)  # label and likelihood in one number: the scattered write is what costs
-    both[index] = (np.arange(1, points.shape[1] + 1, dtype=np.int32) << 8)[None] | value[:, None]
+    if len(usable):  # else the one point only gives the grid a place
+        both[index] = (np.arange(1, points.shape[1] + 1, dtype=np.int32) << 8)[None] | value[:, None]
     labels, likelihood = both >> 8, (both & 255).astype(np.uint8)
     lines = np.zeros((3, 1 + points.shape[1]))
     lines[:2, 1:], lines[2, 1:] = normals, normals[0] * points[0] + normals[1] * points[1]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybridmap.geometry import IDENTITY, between, compose, log
-from hybridmap.vision.laser.cloud import EMPTY, LikelihoodField, build_field, cloud_of_scan
+from hybridmap.vision.laser.cloud import EMPTY, Cloud, LikelihoodField, build_field, cloud_of_scan
 from hybridmap.vision.laser.scan_matching import (
     STEP_DEG,
     STEP_M,
@@ -164,3 +164,10 @@ def test_an_empty_scan_is_no_error():
     assert alignment.inliers[0] == 0.0
     assert np.isfinite(alignment.covariance(0, 0.01, 0.003)).all()
     assert align(field, EMPTY, IDENTITY[None]).near[0] == 0.0
+
+
+def test_points_at_the_origin_have_no_partner_in_an_empty_cloud():
+    beside = Cloud(np.array([[0.1, 0.1], [0.0, 0.2]]), np.array([[0.0, 1.0], [1.0, 0.0]]))
+    field = build_field(EMPTY)
+    assert align(field, beside, IDENTITY[None]).near[0] == 0.0
+    assert score_poses(field, beside.points, IDENTITY[None])[0] == 0.0
