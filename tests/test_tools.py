@@ -156,6 +156,13 @@ def test_table_of_verdicts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert [line.partition(":")[0] for line in told[4:]] == ["right and doubtful", "wrong and trusted"]
 
 
+def test_a_clean_map_that_lost_true_loops_is_no_measure() -> None:
+    names = ("source", "setting", "backend", "ate_m", "own_lost_percent")
+    rows = [("laps", "clean", "lm", "0.1", "0"), ("laps", "clean", "dcs", "0.4", "30"), ("laps", "worse", "dcs", "0.1", "0")]
+    clean = verdict_table.clean_errors([dict(zip(names, row, strict=True)) for row in rows])
+    assert clean == {("laps", "lm"): 0.1, ("laps", "dcs"): 0.1}
+
+
 def test_spoilt_tables_are_read_without_a_finding() -> None:
     command = [sys.executable, "tools/mutate.py", "--kind", "csv", "--count", "12"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)

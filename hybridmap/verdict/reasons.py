@@ -65,10 +65,18 @@ KINDS = {
         " motion are wrong here",
     ),
     "unsettled": Kind(
-        Verdict.DOUBTFUL, "m", "a node lies {value:.2f} m from where the map's own edges want it (at most {limit:.1f} m)"
+        Verdict.DOUBTFUL, "m", "the map lies {value:.2f} m from where its own edges want it (at most {limit:.1f} m)"
     ),
     "edges contradict": Kind(
-        Verdict.DOUBTFUL, "1", "the edges of the map contradict each other: unit variance {value:.1f} (at most {limit:.0f})"
+        Verdict.DOUBTFUL,
+        "1",
+        "the edges of the map contradict each other, this one most: unit variance {value:.1f} (at most {limit:.0f})",
+    ),
+    "loops alone": Kind(
+        Verdict.DOUBTFUL,
+        "m",
+        "{count} loops move the map by {value:.2f} m (at most {limit:.1f} m) to where nothing else has it, and no other loop"
+        " confirms them; the farthest joins these two nodes",
     ),
     "loops rejected": Kind(
         Verdict.DOUBTFUL, "1", "the back-end rejected {value:.0f} loops and kept {count}: hardly any loop holds the map"

@@ -12,9 +12,10 @@ from hybridmap.backends.base import ODOMETRY, SolveStatus
 from hybridmap.backends.judging.breaks import SAME_DEG, SAME_M
 from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.judging.rivals import Rival, rivals, spans
-from hybridmap.backends.judging.strain import bend_of, largest_bend, optimum, straightened
+from hybridmap.backends.judging.strain import bend_of, largest_bend, lone_pull, optimum, straightened
 from hybridmap.backends.objective import SLACK, squared_norms, unit_variance
 from hybridmap.calibration.clock import MATTERS_S, TRANSPORT_S, ClockState
+from hybridmap.errors import BackendError
 from hybridmap.graph.agreement import BOUND
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.paths import chain_of
@@ -127,12 +128,31 @@ def _at_odds(facts: Facts, graph: PoseGraph) -> Iterator[Reason]:
     if facts.solution.report.weak_edges:
         return
     best = optimum(graph, facts.poses)
-    apart_m = float(np.hypot(*(best - facts.poses)[:, :2].T).max())
-    if apart_m > UNSETTLED_MAX_M:
-        yield facts.reason("unsettled", apart_m, UNSETTLED_MAX_M)
-    variance = unit_variance(graph, squared_norms(graph, best))
+    apart_m = np.hypot(*(best - facts.poses)[:, :2].T)
+    if apart_m.max() > UNSETTLED_MAX_M:
+        yield facts.reason("unsettled", apart_m.max(), UNSETTLED_MAX_M, node=int(np.argmax(apart_m)))
+    squared = squared_norms(graph, best)
+    variance = unit_variance(graph, squared)
     if variance > STRAIN_MAX:
-        yield facts.reason("edges contradict", variance, STRAIN_MAX)
+        first, last = sorted((int(graph.sources[np.argmax(squared)]), int(graph.targets[np.argmax(squared)])))
+        yield facts.reason("edges contradict", variance, STRAIN_MAX, node=first, until=last)
+
+
+def alone(facts: Facts) -> Iterable[Reason]:
+    """Loops of a file that no other loop confirms move the map to where nothing else has it.
+
+    Those of a drive were verified by views.
+    """
+    if facts.solution is None or facts.poses is None or facts.driven or facts.solution.report.weak_edges:
+        return []
+    try:
+        pull = lone_pull(facts.graph.with_edges(facts.in_map), facts.poses)
+    except BackendError:  # what the other edges hold is too loose to be tested
+        return []
+    if pull is None or pull.shift_m <= UNSETTLED_MAX_M:
+        return []
+    older, newer = pull.nodes
+    return [facts.reason("loops alone", pull.shift_m, UNSETTLED_MAX_M, node=older, until=newer, count=pull.count)]
 
 
 def none_kept(facts: Facts) -> Iterable[Reason]:
@@ -169,9 +189,12 @@ def contradicted_odometry(facts: Facts) -> Iterable[Reason]:
     """Registrations contradicted many odometry edges."""
     if facts.wheels is None or not facts.wheels.n_edges:
         return []
-    dropped = int(np.count_nonzero(~np.isin(facts.wheels.edge_ids, facts.graph.edge_ids)))
-    share = dropped / facts.wheels.n_edges
-    return [facts.reason("odometry dropped", 100.0 * share, 100.0 * DROPPED_MAX, count=dropped)] if share > DROPPED_MAX else []
+    dropped = facts.wheels.targets[~np.isin(facts.wheels.edge_ids, facts.graph.edge_ids)]
+    share = len(dropped) / facts.wheels.n_edges
+    if share <= DROPPED_MAX:
+        return []
+    place = {"node": int(dropped.min()), "until": int(dropped.max())}
+    return [facts.reason("odometry dropped", 100.0 * share, 100.0 * DROPPED_MAX, count=len(dropped), **place)]
 
 
 def clock_offset(facts: Facts) -> Iterable[Reason]:
@@ -228,6 +251,7 @@ RULES: tuple[Callable[[Facts], Iterable[Reason]], ...] = (
     refused_together,
     none_kept,
     strained,
+    alone,
     against_wheels,
     contradicted_odometry,
     clock_offset,

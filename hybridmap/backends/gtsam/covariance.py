@@ -19,7 +19,9 @@ _AT_ONCE = 64  # pairs of nodes, whose columns are dense
 _EXPECTED = 0.999  # quantile of the innovation up to which a loop is expected
 
 
-def expected_loops(graph: PoseGraph, poses: Array, loops: NDArray[np.int64], variance: float) -> NDArray[np.bool_]:
+def expected_loops(
+    graph: PoseGraph, poses: Array, loops: NDArray[np.int64], variance: float, bound: float | None = None
+) -> NDArray[np.bool_]:
     """Test loops against a map made without them: (L,) whether the innovation fits the covariance of loop and map.
 
     Args:
@@ -27,6 +29,7 @@ def expected_loops(graph: PoseGraph, poses: Array, loops: NDArray[np.int64], var
         poses: (N, 3) poses of the map, m and rad.
         loops: (L,) indices of the loops among the edges of the graph.
         variance: unit variance of the map; if below 1, the covariances of map and loops are scaled by it.
+        bound: largest squared Mahalanobis distance of an innovation that fits; None: that by which loops are refused.
 
     Raises:
         BackendError: the map is singular without the loops.
@@ -36,7 +39,7 @@ def expected_loops(graph: PoseGraph, poses: Array, loops: NDArray[np.int64], var
     covariance = (covariance + np.linalg.inv(graph.information[loops])) * min(1.0, variance)
     r = residuals(graph.with_edges(loops), poses)
     innovation = np.einsum("ei,ei->e", r, np.linalg.solve(covariance, r[:, :, None])[:, :, 0])
-    return np.asarray(innovation <= SLACK * chi2_quantile(_EXPECTED))
+    return np.asarray(innovation <= (SLACK * chi2_quantile(_EXPECTED) if bound is None else bound))
 
 
 class Covariances:

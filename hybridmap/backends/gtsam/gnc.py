@@ -21,11 +21,10 @@ from hybridmap.backends.gtsam.covariance import expected_loops
 from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph, factors, noise_models, poses_of, values
 from hybridmap.backends.gtsam.initial import best_start, trusted_start
 from hybridmap.backends.gtsam.robust import WarmKernel, with_kernel
-from hybridmap.backends.judging.clusters import neighbouring_pairs, rejected_clusters
+from hybridmap.backends.judging.clusters import lone_loops, rejected_clusters
 from hybridmap.backends.objective import (
     SLACK,
     gate_of,
-    parts,
     softened,
     squared_norms,
     truncated_cost,
@@ -196,11 +195,8 @@ def on_probation(graph: PoseGraph, result: Truncated, config: BackendsConfig) ->
         BackendError: the map is singular without the loops.
     """
     loops = np.flatnonzero(graph.is_loop)
-    accepted = loops[result.kept]
-    backed = np.unique(neighbouring_pairs(graph, accepted))
-    lone = np.delete(accepted, backed)
-    part = parts(graph, tuple(graph.edge_ids[np.union1d(loops[~result.kept], lone)].tolist()))
-    lone = lone[part[graph.sources[lone]] == part[graph.targets[lone]]]
+    used = np.setdiff1d(np.arange(graph.n_edges), loops[~result.kept])
+    lone = used[lone_loops(graph.with_edges(used))]
     if len(lone) == 0:
         return result
     without = result.kept & ~np.isin(loops, lone)
@@ -208,7 +204,7 @@ def on_probation(graph: PoseGraph, result: Truncated, config: BackendsConfig) ->
     outcome = run("lm", problem.weighted(without.astype(np.float64)), result.poses, config.max_iterations)
     bare = replace(result, poses=outcome.poses, kept=without, rounds=result.rounds + outcome.iterations)
     variance = _variance(graph, bare, config)
-    others = softened(graph.with_edges(np.setdiff1d(np.arange(graph.n_edges), loops[~result.kept])), bare.poses, config.robust)
+    others = softened(graph.with_edges(used), bare.poses, config.robust)
     expected = expected_loops(others, bare.poses, np.flatnonzero(np.isin(others.edge_ids, graph.edge_ids[lone])), variance)
     kept = without | np.isin(loops, lone[expected])
     if not np.any(kept != without):

@@ -8,6 +8,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from hybridmap.backends.objective import parts
 from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.agreement import Loops, ring
 from hybridmap.graph.paths import chain_of
@@ -36,6 +37,14 @@ def rejected_clusters(graph: PoseGraph, poses: Array, rejected: tuple[int, ...],
     sizes = np.bincount(label, minlength=count)
     chosen = [group for group in np.argsort(-sizes, kind="stable").tolist() if sizes[group] >= _LEAST]
     return tuple(tuple(graph.edge_ids[edges[label == group]].tolist()) for group in chosen)
+
+
+def lone_loops(graph: PoseGraph) -> NDArray[np.int64]:
+    """Indices of the loops of a graph that have no neighbour and without which the graph would not fall into parts."""
+    loops = np.flatnonzero(graph.is_loop)
+    lone = np.delete(loops, np.unique(neighbouring_pairs(graph, loops)))
+    part = parts(graph, tuple(graph.edge_ids[lone].tolist()))
+    return np.asarray(lone[part[graph.sources[lone]] == part[graph.targets[lone]]])
 
 
 def loops_of(graph: PoseGraph, edges: NDArray[np.int64]) -> Loops:

@@ -16,10 +16,14 @@ from numpy.typing import NDArray
 
 from hybridmap.backends.gtsam.batch import run
 from hybridmap.backends.gtsam.calibrated import calibrate, with_calibrated_odometry
+from hybridmap.backends.gtsam.covariance import expected_loops
 from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph
+from hybridmap.backends.judging.clusters import lone_loops
+from hybridmap.backends.objective import residuals, squared_norms, unit_variance
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import EvaluationError
 from hybridmap.geometry import Array, between, log
+from hybridmap.graph.agreement import BOUND
 from hybridmap.graph.paths import Chain, chain_of, own_odometry
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.odometry_model import NEUTRAL, Gains
@@ -134,3 +138,46 @@ def _gains_of(graph: PoseGraph, poses: Array) -> Gains:
 def _travel(chain: Chain) -> Array:
     """Path length (N,) along a chain, m."""
     return np.concatenate([[0.0], np.hypot(*np.diff(chain.poses[:, :2], axis=0).T).cumsum()])
+
+
+@dataclass(frozen=True, slots=True)
+class LonePull:
+    """Loops that no other loop confirms and that the rest of the map does not expect, and what they do to it.
+
+    Attributes:
+        nodes: older and newer node of the loop that was farthest from what the rest of the map expects.
+        count: number of these loops.
+        shift_m: how far they move a node of the map, at most.
+    """
+
+    nodes: tuple[int, int]
+    count: int
+    shift_m: float
+
+
+def lone_pull(graph: PoseGraph, poses: Array) -> LonePull | None:
+    """Find the loops of a map without a neighbour whose innovation against the map without such loops is too large.
+
+    True loops mostly come in runs. A single one that says what the others say is harmless; a single one that says something
+    else may be false, and where a file overstates its noise, it fits all the same.
+
+    Args:
+        graph: the edges of the map.
+        poses: (N, 3) poses near the optimum of these edges, m and rad.
+
+    Returns:
+        None if there are none.
+    """
+    lone, every = lone_loops(graph), np.arange(graph.n_edges)
+    if not len(lone):
+        return None
+    rest = graph.with_edges(np.setdiff1d(every, lone))
+    bare = optimum(rest, poses)
+    odd = lone[~expected_loops(graph, bare, lone, unit_variance(rest, squared_norms(rest, bare)), BOUND)]
+    if not len(odd):
+        return None
+    without = optimum(graph.with_edges(np.setdiff1d(every, odd)), bare)
+    shift_m = float(np.hypot(*(optimum(graph, poses) - without)[:, :2].T).max())
+    farthest = odd[int(np.argmax(np.hypot(*residuals(graph.with_edges(odd), bare)[:, :2].T)))]
+    ends = sorted((int(graph.sources[farthest]), int(graph.targets[farthest])))
+    return LonePull((ends[0], ends[1]), len(odd), shift_m)
