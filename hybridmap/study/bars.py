@@ -25,10 +25,12 @@ class Verdict:
         bar: the configured limit that was checked.
         cell: first cell of the group; all cells of the group share its labels, except for the seed.
         values: the figure in each cell of the group, one per seed; None for a missing figure, which misses any bar.
-        limits: the limit of each value.
-        value: the bar's statistic (worst, median or mean) of the values; NaN if a value is missing.
-        limit: the limit for that statistic; NaN if a value is missing.
-        passed: whether the figure is within the limit.
+        limits: the limit of each value: the bar's number, or the figure of the back-end that it names in the cell of the same
+            seed (NaN if missing).
+        value: the bar's statistic of the values: median, mean, or with `worst` the one farthest on the wrong side of its limit;
+            NaN if a value is missing.
+        limit: what `value` is compared with: the same statistic of `limits`, or with `worst` the limit of that value.
+        passed: whether the value keeps the limit; False if either is NaN.
     """
 
     bar: BarConfig
@@ -41,7 +43,7 @@ class Verdict:
 
     @property
     def label(self) -> str:
-        """Name of the group and the back-end, for people."""
+        """Name of the group and the back-end, for people: `source/setting/kind rate %/back-end`, or without the kind."""
         return f"{self.cell.label}/{self.cell.backend}"
 
     @property
@@ -69,10 +71,14 @@ class Verdict:
 
 
 def judge(grid: Grid, results: Mapping[str, CellResult]) -> list[Verdict]:
-    """Check every bar (limit of a figure) of a study against every group of its runs to which the bar applies.
+    """Check every bar (limit of a figure) of a study in every group of cells, and for every back-end, to which it applies.
 
-    `results` holds the result of each cell of the grid (a run with one combination of settings) by the cell's name. Returns one
-    verdict for each bar and group, in the order of the bars.
+    Args:
+        grid: the cells of the study.
+        results: `Cell.key` -> result, for every cell of the grid.
+
+    Returns:
+        One verdict per bar, group and back-end, in the order of the bars, then of the grid. A missed bar is not an error.
     """
     groups = grid.groups()
     return [

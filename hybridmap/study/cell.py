@@ -40,7 +40,7 @@ class CellTask:
         drift: errors to add to the odometry edges.
         kind: kind of the false loop closures to add.
         rate: share of false loops among all loops of the disturbed graph, 0 <= rate < 1.
-        seed: seed of the random disturbances.
+        seed: seed of random drift and of the false loops; the graph in `frozen` is made already.
         variant: the back-end, its settings, and how it gets the graph.
     """
 
@@ -59,10 +59,11 @@ class CellResult:
 
     Attributes:
         key: key of the task.
-        status: status of the back-end; `failed` for an error of hybridmap, `unmapped` if the source gave no graph, `mapped` if
-            the map of the drive itself was judged.
-        message: one line for people.
-        figures: name -> value, for the figures of `measures` and counts of the graph; None for a missing one.
+        status: status of the back-end (`SolveStatus`); `failed` also for an error of hybridmap, `unmapped` if the source gave
+            no graph, `mapped` if the map of the drive itself was judged, `crashed` for any other exception.
+        message: one line for people: the solver's words, or what failed; may be empty.
+        figures: name -> value, for the figures of `measures` and counts of the graph; a figure that could not be computed is
+            None or not there.
         timings: name -> value, for the names in `measures.TIMINGS`; stored apart from the figures, as they differ between runs.
         code: digest of the code that computed the result.
     """
@@ -80,7 +81,10 @@ class CellResult:
 
 
 def key_of(source_key: str, drift: DriftConfig, false_loops: tuple[str, float, int], variant: BackendVariant) -> str:
-    """Digest of everything that determines a cell. At a rate of 0, the kind and seed of false loops are left out.
+    """Digest of everything that determines the figures of a cell, code and libraries included.
+
+    The seed counts only for what is random: drift with noise or drop-outs, and false loops at a rate above 0. Names and titles
+    do not count.
 
     Args:
         source_key: key of the clean graph.
@@ -103,7 +107,10 @@ def key_of(source_key: str, drift: DriftConfig, false_loops: tuple[str, float, i
 
 
 def run(task: CellTask) -> CellResult:
-    """Disturb the graph, solve it and compute the errors. A `HybridMapError` becomes a result; other exceptions are raised."""
+    """Disturb the graph, solve it and compute the errors; with `way: mapped` only the figures of the drive are looked up.
+
+    A `HybridMapError` becomes a result with the status `failed`; other exceptions are raised.
+    """
     frozen = Frozen.unpack(task.frozen)
     if frozen.graph is None:
         return CellResult(task.key, UNMAPPED, frozen.failure)
@@ -145,9 +152,12 @@ def judge(own: PoseGraph, graph: PoseGraph, solution: Solution, reference: Array
 
     Args:
         own: the graph without false loops.
-        graph: the same graph with false loops appended.
+        graph: the same graph with false loops appended behind its edges.
         solution: a back-end's solution of `graph`.
-        reference: (N, 3) reference poses, m and rad; NaN where unknown.
+        reference: (N, 3) reference poses of the nodes in any frame, m and rad; NaN where unknown.
+
+    Returns:
+        Name -> value, for the figures of `measures.MEASURES` that depend on the poses; None for one that is not finite.
     """
     false = np.arange(graph.n_edges) >= own.n_edges
     kept, rejected = _fates(graph, solution)
@@ -168,9 +178,9 @@ def judge(own: PoseGraph, graph: PoseGraph, solution: Solution, reference: Array
 
 
 def errors(poses: Array, reference: Array) -> tuple[float, float]:
-    """Root mean square errors of position (m) and heading (deg) against the reference (N, 3), after SE(2) alignment.
+    """Root mean square errors of position (m) and heading (deg) of poses (N, 3) against a reference, after SE(2) alignment.
 
-    Only nodes with a known reference pose count; both errors are NaN if there are too few.
+    Only nodes with a known reference pose count (a row without NaN); both errors are NaN if there are fewer than three.
     """
     known = np.isfinite(reference).all(axis=1)
     if np.count_nonzero(known) < 3:

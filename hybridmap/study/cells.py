@@ -40,12 +40,12 @@ class Cell:
 
     @property
     def label(self) -> str:
-        """Source, setting, kind and rate of the cell, as one name for people."""
+        """Name for people without back-end and seed: `source/setting/kind rate %`, without kind and rate at rate 0."""
         return f"{self.source}/{self.setting}" + (f"/{self.kind} {100 * self.rate:g} %" if self.kind else "")
 
     @property
     def group(self) -> Group:
-        """The labels of the cell without back-end and seed; cells with equal labels are summarised together."""
+        """Source, setting, kind and rate. The cells of one group and one back-end differ in the seed alone."""
         return self.source, self.setting, self.kind, self.rate
 
 
@@ -64,14 +64,19 @@ class Grid:
     sources: dict[str, SourceTask]
 
     def groups(self) -> dict[tuple[Group, str], list[Cell]]:
-        """(Group, back-end) -> its cells, one per seed, in the order of the tables."""
+        """(Group, title of the back-end) -> its cells, one per seed or one if nothing is random; in the order of the tables."""
         found: dict[tuple[Group, str], list[Cell]] = {}
         for cell in self.cells:
             found.setdefault((cell.group, cell.backend), []).append(cell)
         return found
 
     def task(self, cell: Cell, frozen: bytes) -> CellTask:
-        """The task that computes a cell, given its clean graph as bytes of `Frozen.pack`."""
+        """The task that computes a cell; it is not run.
+
+        Args:
+            cell: a cell of this grid.
+            frozen: its clean graph, as bytes of `Frozen.pack`.
+        """
         setting = next(setting for setting in self.study.settings if setting.name == cell.setting)
         variant = next(variant for variant in self.study.backends if variant.title == cell.backend)
         kind: Kind = "aliased" if cell.kind == "aliased" else "random"
@@ -81,7 +86,8 @@ class Grid:
 def lay_out(study: StudyConfig) -> Grid:
     """Make the cells of a study: the product of sources, settings, false loops, seeds and back-ends; back-ends vary fastest.
 
-    Files, sessions and recordings are read, since their content is part of the keys. Nothing is mapped.
+    Sources and settings vary slowest. What is not random gets one cell for all seeds. Files, sessions and recordings are read,
+    since their content is part of the keys. Nothing is mapped.
 
     Raises:
         GraphError, StoreError, StreamError: a file or session is missing or damaged.

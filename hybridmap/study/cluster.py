@@ -48,7 +48,8 @@ class DaskCluster:
         """Run every task on the cluster; yield (index of the task, outcome) in any order, each index once.
 
         Raises:
-            StudyError: the connection to the scheduler is lost; finished tasks have been yielded.
+            StudyError: the connection to the scheduler is lost, or a worker cannot import hybridmap; finished tasks have been
+                yielded.
         """
         futures = {self._client.submit(work, task, pure=False): index for index, task in enumerate(tasks)}
         try:

@@ -38,9 +38,9 @@ class Disturbance:
     """An entry of the table of disturbances.
 
     Attributes:
-        apply: (samples, strength, generator, rig) -> disturbed samples. The strength is a number, or `count` numbers.
+        apply: (samples, strength, generator, rig) -> disturbed samples. The strength is a number, or a tuple of `count`.
         by_chance: whether the disturbance uses random numbers.
-        most: greatest strength that a study may give.
+        most: greatest strength that a study may give; with a finite one (that of a share) the least is 0.
         count: how many numbers the strength consists of.
     """
 
@@ -51,13 +51,17 @@ class Disturbance:
 
 
 def disturbed(samples: Samples, rig: Rig, disturbances: Mapping[str, float | tuple[float, ...]], seed: int) -> Iterator[Sample]:
-    """Disturb the samples of a drive; the disturbances are applied in the order of `TABLE`.
+    """Disturb the samples of a drive while they are read; the disturbances are applied in the order of `TABLE`.
 
     Args:
-        samples: samples of a stream, in order of stamp.
+        samples: samples of a stream, in order of stamp; they are not changed in place.
         rig: the sensors of the stream.
-        disturbances: name -> strength.
-        seed: seed of the random disturbances; each has a generator of its own.
+        disturbances: name (a key of `TABLE`) -> strength; a missing one and a strength of 0 change nothing. Names are not
+            checked, see `check`.
+        seed: seed of the random disturbances; each has a generator of its own, so that one does not change another.
+
+    Returns:
+        The disturbed samples, in order of stamp.
     """
     for name, one in TABLE.items():
         strength = disturbances.get(name, 0.0)
@@ -72,7 +76,7 @@ def by_chance(disturbances: Mapping[str, float | tuple[float, ...]]) -> bool:
 
 
 def check(name: str, strength: float | tuple[float, ...], origin: str) -> None:
-    """Check one disturbance that a study asks for; `origin` names the study in the error.
+    """Check the name and the strength of a disturbance that a study asks for; `origin` names the study in the error.
 
     Raises:
         ConfigError: an unknown disturbance, or an invalid strength.
@@ -82,42 +86,51 @@ def check(name: str, strength: float | tuple[float, ...], origin: str) -> None:
     numbers = (strength,) if isinstance(strength, float) else strength
     if np.any(strength) and len(numbers) != TABLE[name].count:
         raise ConfigError(f"{origin}: disturb: {name}: expected {TABLE[name].count} number(s), found {len(numbers)}")
-    if not all(abs(number) <= TABLE[name].most for number in numbers):
-        raise ConfigError(f"{origin}: disturb: {name}: expected at most {TABLE[name].most:g}, found {max(numbers):g}")
+    most = TABLE[name].most
+    least = 0.0 if math.isfinite(most) else -most
+    beyond = next((number for number in numbers if not least <= number <= most), None)
+    if beyond is not None:
+        raise ConfigError(f"{origin}: disturb: {name}: expected {least:g} to {most:g}, found {beyond:g}")
     if name == KIDNAPPED and np.any(strength) and not 0.0 <= numbers[0] < numbers[1] < numbers[2]:
         raise ConfigError(f"{origin}: disturb: {name}: expected [picked up, put down, end], seconds from the first stamp")
 
 
 def scan_range_m(ranges: Ranges, limit_m: float, _rng: np.random.Generator) -> Ranges:
-    """Remove laser returns beyond `limit_m`."""
+    """Set the ranges of one scan, m, that reach `limit_m` or more to NaN (no return)."""
     return np.where(ranges < limit_m, ranges, np.float32(np.nan))
 
 
 def scan_covered(ranges: Ranges, share: float, _rng: np.random.Generator) -> Ranges:
-    """Cover this share of the laser's field of view, half of it at either end."""
+    """Set this share (0..1) of the ranges of one scan to NaN: half of it at either end of the field of view."""
     ranges, covered = ranges.copy(), round(0.5 * share * len(ranges))
     ranges[:covered] = ranges[len(ranges) - covered :] = np.nan
     return ranges
 
 
 def scan_noise_m(ranges: Ranges, sigma_m: float, rng: np.random.Generator) -> Ranges:
-    """Add white noise of standard deviation `sigma_m` to every laser range."""
+    """Add white noise of standard deviation `sigma_m` to every range of one scan, m, drawn anew for each scan."""
     return ranges + np.float32(sigma_m) * rng.standard_normal(ranges.shape, dtype=np.float32)
 
 
 def beams_lost(ranges: Ranges, share: float, rng: np.random.Generator) -> Ranges:
-    """Remove the returns of a random share of the laser's beams."""
+    """Set a random share (0..1) of the ranges of one scan to NaN, drawn anew for each scan."""
     return np.where(rng.random(ranges.shape) < share, np.float32(np.nan), ranges)
 
 
 def beams_short(ranges: Ranges, share: float, rng: np.random.Generator) -> Ranges:
-    """Shorten a random share of the laser's beams to a random part of their range, as dust or passers-by would."""
+    """Shorten a random share (0..1) of the ranges of one scan, each to a random part of itself, as dust or passers-by would.
+
+    Both are drawn anew for each scan.
+    """
     stopped, where = rng.random((2, *ranges.shape), dtype=np.float32)
     return np.where(stopped < share, where * ranges, ranges)
 
 
 def blur_s(samples: Samples, exposure_s: float, _rng: np.random.Generator, rig: Rig) -> Iterator[Sample]:
-    """Blur images along their rows, as the robot's turn during an exposure of `exposure_s` would."""
+    """Blur colour images along their rows, as the robot's turn during an exposure of `exposure_s` would.
+
+    The turn rate is that of the last two odometry messages. Depth and scans stay.
+    """
     newest: SelfMotion | None = None
     rate_rad_s, camera = 0.0, rig.sensors.get("camera")
     for sample in samples:
@@ -133,53 +146,56 @@ def blur_s(samples: Samples, exposure_s: float, _rng: np.random.Generator, rig: 
 
 
 def darker(frame: RgbdFrame, share: float, _rng: np.random.Generator) -> RgbdFrame:
-    """Reduce every colour value by this share: 0.9 is like dusk; 1 gives black images."""
+    """Reduce every colour value of one frame by this share (0..1): 0.9 is like dusk; 1 gives a black image. Depth stays."""
     return replace(frame, color=np.rint(round(1.0 - share, 9) * frame.color).astype(np.uint8))
 
 
 def color_noise(frame: RgbdFrame, sigma: float, rng: np.random.Generator) -> RgbdFrame:
-    """Add white noise of standard deviation `sigma` to every colour value, which is in 0..255."""
+    """Add white noise of standard deviation `sigma` to every colour value of one frame, drawn anew; the sum stays in 0..255."""
     grain = np.float32(sigma) * rng.standard_normal(frame.color.shape, dtype=np.float32)
     return replace(frame, color=np.clip(frame.color + grain + np.float32(0.5), 0, 255).astype(np.uint8))
 
 
 def depth_noise_m(frame: RgbdFrame, sigma_m: float, rng: np.random.Generator) -> RgbdFrame:
-    """Add white noise to every depth. Its standard deviation is `sigma_m` at 1 m and grows with the square of the depth."""
+    """Add white noise to every depth of one frame, drawn anew; pixels without depth (0) stay without.
+
+    Its standard deviation is `sigma_m` at 1 m and grows with the square of the depth.
+    """
     grain = np.float32(sigma_m) * rng.standard_normal(frame.depth_m.shape, dtype=np.float32)
     noisy = frame.depth_m + grain * (frame.depth_m / np.float32(_NEAR_DEPTH_M)) ** 2
     return replace(frame, depth_m=np.where(frame.depth_m > 0.0, np.maximum(noisy, 0.0), frame.depth_m))
 
 
 def depth_range_m(frame: RgbdFrame, limit_m: float, _rng: np.random.Generator) -> RgbdFrame:
-    """Remove depth beyond `limit_m`."""
+    """Set depth of one frame beyond `limit_m` to 0 (no depth)."""
     return replace(frame, depth_m=np.where(frame.depth_m > limit_m, np.float32(0.0), frame.depth_m))
 
 
 def depth_lost(frame: RgbdFrame, share: float, rng: np.random.Generator) -> RgbdFrame:
-    """Remove the depth of a random share of the pixels."""
+    """Set the depth of a random share (0..1) of the pixels of one frame to 0 (no depth), drawn anew for each frame."""
     gone = rng.random(frame.depth_m.shape, dtype=np.float32) < share
     return replace(frame, depth_m=np.where(gone, np.float32(0.0), frame.depth_m))
 
 
 def wheel_scale(step: Array, share: float, _rng: np.random.Generator) -> Array:
-    """Increase the distance of an odometry step by this share of it."""
+    """Increase the translation of an odometry step (3,), m and rad, by this share of it (negative: reduce it)."""
     factors: Array = np.array([1.0 + share, 1.0 + share, 1.0])
     return step * factors
 
 
 def wheel_turn_scale(step: Array, share: float, _rng: np.random.Generator) -> Array:
-    """Increase the turn of an odometry step by this share of it."""
+    """Increase the turn of an odometry step (3,), m and rad, by this share of it (negative: reduce it)."""
     factors: Array = np.array([1.0, 1.0, 1.0 + share])
     return step * factors
 
 
 def wheel_pull_deg_per_m(step: Array, bias_deg: float, _rng: np.random.Generator) -> Array:
-    """Turn an odometry step to the left by `bias_deg` per metre driven."""
+    """Add a turn of `bias_deg` per metre driven to an odometry step (3,), m and rad; positive is to the left."""
     return _turned(step, math.radians(bias_deg) * math.hypot(step[0], step[1]))
 
 
 def wheel_noise_deg_per_sqrt_m(step: Array, sigma_deg: float, rng: np.random.Generator) -> Array:
-    """Add a random walk to the heading of odometry, of standard deviation `sigma_deg` times the square root of the metres."""
+    """Add a random turn to an odometry step (3,), m and rad, of standard deviation `sigma_deg` times the root of its metres."""
     return _turned(step, rng.normal() * math.radians(sigma_deg) * math.sqrt(math.hypot(step[0], step[1])))
 
 
@@ -189,13 +205,16 @@ def _turned(step: Array, turn_rad: float) -> Array:
 
 
 def wheel_slips_per_m(step: Array, rate: float, rng: np.random.Generator) -> Array:
-    """Add slips of about 0.3 m and 15 degrees to random odometry steps, on average `rate` per metre driven."""
+    """Add slips to random odometry steps (3,), m and rad, on average `rate` slips per metre driven.
+
+    A slip is normal noise with standard deviations of 0.3 m ahead, 0.05 m sideways and 15 degrees.
+    """
     hit, slip = rng.random() < rate * math.hypot(step[0], step[1]), rng.normal(size=3) * _SLIP
     return step + slip if hit else step
 
 
 def views_lost(samples: Samples, share: float, _rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
-    """Remove this share of the scans and frames at regular intervals, as a lower sensor rate would."""
+    """Leave out this share (0..1) of the scans and frames at regular intervals, as a lower sensor rate would; not random."""
     number, kept = 0, 1.0 - share
     for sample in samples:
         if isinstance(sample, Observation):
@@ -208,7 +227,7 @@ def views_lost(samples: Samples, share: float, _rng: np.random.Generator, _rig: 
 def views_late_s(samples: Samples, late_s: float, _rng: np.random.Generator, _rig: Rig) -> Iterator[Sample]:
     """Make scans and frames late by `late_s` against odometry: odometry is stamped that much earlier (later if negative).
 
-    The stamps of the views stay, so that a map is compared with the same truth.
+    The stamps of the views stay, so that a map is compared with the same truth. Samples are yielded in order of the new stamps.
     """
     order, early_ns = ReorderBuffer(abs(late_s)), round(late_s * NS_PER_S)
     for sample in samples:
@@ -222,7 +241,8 @@ def kidnapped_s(
 ) -> Iterator[Sample]:
     """Kidnap the robot at `times_s`: picked up, put down, end of the drive; seconds from the first stamp.
 
-    Samples between the first two times are removed. Odometry continues from its last pose, as the wheels do not turn.
+    Samples between the first two times, and after the third, are left out. Odometry continues from its last pose, as the wheels
+    do not turn.
     """
     up_ns = down_ns = end_ns = -1
     held, onward = IDENTITY, None

@@ -48,8 +48,8 @@ class MappedDrive:
         source: name of a simulated world, or path of a recording.
         config: configuration of the mapping, as plain values.
         start_s, end_s: map only this part, seconds from the first stamp; None: no limit.
-        disturb: name of a disturbance -> strength.
-        seed: seed of the disturbances.
+        disturb: name of a disturbance -> strength; None: none.
+        seed: seed of the disturbances; that of a simulated world is in `config`.
         reference: path of the ground truth; empty string: the stream's own ground truth, if it has one.
         relations: path of a file of true relative poses; empty string: none.
     """
@@ -66,8 +66,12 @@ class MappedDrive:
     def make(self) -> Frozen:
         """Map the drive once and freeze the accepted edges.
 
+        Returns:
+            The graph, the true poses of its nodes (NaN where unknown), and the figures of each back-end's map of the drive.
+
         Raises:
             HybridMapError: the stream cannot be read or mapped, or gives no edge.
+            FileNotFoundError: the recording or a file beside it is not on this machine.
         """
         config = Config.from_tree(self.config, "study")
         if Path(self.source).is_absolute():

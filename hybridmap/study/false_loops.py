@@ -22,9 +22,16 @@ _RUN = 5  # aliased loops that come one after the other and agree with each othe
 
 
 def with_drift(graph: PoseGraph, drift: DriftConfig, seed: int) -> PoseGraph:
-    """Copy of the graph with errors added to its odometry edges; `initial` becomes the chain of the disturbed edges.
+    """Copy of the graph with errors added to its odometry edges; other edges stay. Without errors: the graph itself.
 
-    A step of length s turns by another bias * s, half of it before the step, and its length becomes (1 + scale) s.
+    An edge of length s, m, turns by `heading_bias_deg_per_m` * s more, half of it before and half after the step, and its
+    length becomes (1 + `scale_bias`) s. Then come noise and drop-outs (see `drop_out`). `initial` keeps its steps from node to
+    node, each changed as the odometry edge of the same two nodes.
+
+    Args:
+        graph: the clean graph.
+        drift: the errors.
+        seed: seed of noise and drop-outs; bias and scale are not random.
     """
     if drift.idle:
         return graph
@@ -44,21 +51,29 @@ def with_drift(graph: PoseGraph, drift: DriftConfig, seed: int) -> PoseGraph:
 def with_false_loops(graph: PoseGraph, kind: Kind, rate: float, seed: int) -> PoseGraph:
     """Copy of the graph with false loops appended (see `inject`); the same arguments give the same loops.
 
+    Args:
+        graph: a graph with true loops.
+        kind: kind of false loops.
+        rate: share of false loops among all loops afterwards; at 0 the graph itself is returned.
+        seed: seed of the false loops.
+
     Raises:
-        GraphError: the graph has no loop to copy.
+        GraphError: no loop to copy, or a rate outside [0, 1).
     """
     return graph if rate == 0.0 else inject(graph, rate, kind, np.random.default_rng(seed))
 
 
 def inject(graph: PoseGraph, share: float, mode: Kind, rng: np.random.Generator) -> PoseGraph:
-    """Append false loops until they are `share` of all loops; their `edge_ids` follow the last one.
+    """Copy of the graph with false loops appended: so many that they are `share` of all loops, rounded to a whole number.
+
+    Their `edge_ids` follow the last one of the graph; `initial` stays.
 
     Args:
         graph: a graph with true loops, whose measurements and information the false ones copy.
         share: share of false loops among all loops afterwards, 0 <= share < 1.
         mode: kind of false loops. `random` joins two random nodes. `aliased` copies a run of neighbouring true loops with all
             old nodes shifted by the same number, as two similar corridors would.
-        rng: the only random generator.
+        rng: random generator; its state advances.
 
     Raises:
         GraphError: no loop to copy, or a share outside [0, 1).
@@ -85,7 +100,7 @@ def inject(graph: PoseGraph, share: float, mode: Kind, rng: np.random.Generator)
 
 
 def drop_out(graph: PoseGraph, share: float, rng: np.random.Generator) -> PoseGraph:
-    """Copy of the graph with large errors in some odometry edges; `initial` becomes the chain of the disturbed edges.
+    """Copy of the graph with large errors in random odometry edges; `initial` is composed anew along the disturbed edges.
 
     Each chosen edge turns by 20 deg more, to either side, and slips 0.5 m in any direction. Its information stays the same,
     as the wheels do not notice.
@@ -93,7 +108,7 @@ def drop_out(graph: PoseGraph, share: float, rng: np.random.Generator) -> PoseGr
     Args:
         graph: a graph with odometry edges.
         share: share of the odometry edges to disturb, 0 <= share <= 1.
-        rng: the only random generator.
+        rng: random generator; its state advances.
 
     Raises:
         GraphError: a share outside [0, 1].

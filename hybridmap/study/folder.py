@@ -37,7 +37,7 @@ class StudyFolder:
             return None
 
     def keep_result(self, result: CellResult) -> None:
-        """Write the result of a cell atomically."""
+        """Write the result of a cell atomically under its key; it replaces one with the same key."""
         write_bytes(self._cell(result.key), json.dumps(asdict(result), allow_nan=False).encode())
 
     def frozen(self, key: str) -> bytes | None:
@@ -50,7 +50,7 @@ class StudyFolder:
         return data
 
     def keep_frozen(self, key: str, data: bytes) -> None:
-        """Write the bytes of a frozen graph atomically under its key."""
+        """Write the bytes of a frozen graph (`Frozen.pack`) atomically under its key; they replace those with the same key."""
         write_bytes(self._source(key), data)
 
     def _cell(self, key: str) -> Path:

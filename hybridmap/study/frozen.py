@@ -39,7 +39,8 @@ class Frozen:
     Attributes:
         graph: the clean graph, without added false loops or drift; None if it could not be made.
         reference: (N, 3) reference pose of each node, m and rad; NaN where unknown.
-        of_truth: True: the reference is ground truth; False: it is the optimum of the clean graph by `gtsam-lm`.
+        of_truth: True: the reference is ground truth; False: it is the optimum of the clean graph by `gtsam-lm`, or NaN where
+            that is not computed or was not found.
         failure: why there is no graph; empty string if there is one.
         mapped: figures of the drive that the graph comes from; None if it does not come from a drive.
     """

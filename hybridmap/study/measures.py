@@ -77,5 +77,5 @@ def measures_of(study: StudyConfig) -> dict[str, tuple[str, str]]:
 
 
 def unit_of(figure: str) -> str:
-    """Unit of the figure of this name."""
+    """Unit of a figure, by its name in `FIGURES`; `1` for a plain number."""
     return (MEASURES | MAPPED | TIMINGS)[figure][0]

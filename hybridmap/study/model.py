@@ -79,7 +79,7 @@ class SourceConfig(Section):
     start_s: float | None = None
     """For drives: skip this many seconds at the beginning."""
     end_s: float | None = None
-    """For drives: end after this many seconds."""
+    """For drives: end this many seconds after the first stamp."""
     reference: Path | None = None
     """For recordings: ground truth in the TUM format; default: that of the recording, if any."""
     relations: Path | None = None
@@ -91,7 +91,7 @@ class SourceConfig(Section):
     synthetic: SyntheticConfig | None = None
     """A graph generated from the seed."""
     first_nodes: int | None = Field(default=None, ge=3)
-    """Keep only this many nodes of the graph."""
+    """Keep only this many nodes of the graph, from its start."""
     seeds: Seeds | None = None
     """Seeds of this source; default: those of the study."""
 
@@ -127,7 +127,7 @@ class DriftConfig(Section):
     heading_bias_deg_per_m: float = Field(default=0.0, ge=-360, le=360)
     """Heading bias to the left, degrees per metre of each odometry edge."""
     scale_bias: float = Field(default=0.0, gt=-1, le=100)
-    """Relative error of each odometry edge's length."""
+    """Relative error of each odometry edge's length: 0.1 makes it 10 % longer."""
     noise: float = Field(default=0.0, ge=0, le=1000)
     """Additional white noise, random by the seed, in standard deviations of the edge's information."""
     dropouts: float = Field(default=0.0, ge=0, le=1)
@@ -195,7 +195,7 @@ class FalseLoopsConfig(Section):
     """False loop closures added to each graph."""
 
     rates: Annotated[tuple[Rate, ...], Field(min_length=1)] = (0.0,)
-    """Share of false loops among all loops."""
+    """Share of false loops among all loops, once they are added."""
     kinds: Annotated[tuple[Literal["random", "aliased"], ...], Field(min_length=1)] = ("random",)
     """`random` joins two random nodes; `aliased` shifts runs of true loops together."""
 
@@ -254,7 +254,7 @@ class StudyConfig(Section):
     description: str = ""
     """The question of the study, for the page."""
     seeds: Seeds = (0,)
-    """Seeds of the simulator, of added noise and of false loops."""
+    """Seeds of the simulator, of added noise and of false loops: a list, or a number n for 0 to n - 1."""
     sources: Annotated[tuple[SourceConfig, ...], Field(min_length=1)]
     """Graphs and drives."""
     settings: Annotated[tuple[SettingConfig, ...], Field(min_length=1)] = (SettingConfig(name="default"),)
@@ -275,10 +275,13 @@ class StudyConfig(Section):
 
     @classmethod
     def load(cls, source: str | Path, overrides: Mapping[str, Any] | None = None) -> StudyConfig:
-        """Read a study by path, or by name if it comes with the package, and apply `overrides` (`{"seeds": 3}`).
+        """Read a study by path, or by name if it comes with the package, and apply `overrides` (`{"seeds": 3}`, dotted keys).
+
+        Relative paths in it start in the folder of the file.
 
         Raises:
-            ConfigError: no such file, not YAML, an unknown key (named with its path), a value out of range.
+            ConfigError: no such file, not YAML, an unknown key (named with its path), a value out of range, or settings that do
+                not fit together.
         """
         path = _find(source)
         tree = {"name": path.stem, **read_mapping(path)}
@@ -296,7 +299,7 @@ class StudyConfig(Section):
         """Make a study from a nested mapping; `origin` names it in errors, and relative paths start in `folder`.
 
         Raises:
-            ConfigError: an unknown key (named with its path), or a value out of range.
+            ConfigError: an unknown key (named with its path), a value out of range, or settings that do not fit together.
         """
         from hybridmap.study.resolve import resolved
 
@@ -307,7 +310,7 @@ class StudyConfig(Section):
         return resolved(study, origin, folder)
 
     def to_yaml(self) -> str:
-        """The study with all defaults, as YAML that `load` reads back to an equal study."""
+        """The study with all defaults and absolute paths, as YAML that `load` reads back to an equal study."""
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
 
 

@@ -43,7 +43,8 @@ class Pool(Protocol):
     def run(self, work: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[tuple[int, Outcome | Lost]]:
         """Run `work` on every task; yield (index of the task, outcome) in any order, each index once.
 
-        `work` must be a function of a module, so that another process can import it.
+        A task that raises has the outcome `Lost`; the others go on. `work` must be a function of a module, so that another
+        process can import it.
         """
 
 
@@ -51,7 +52,7 @@ class ThisProcess:
     """Runs one task after the other in this process."""
 
     def run(self, work: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[tuple[int, Outcome | Lost]]:
-        """Run `work` on every task in order; yield (index of the task, outcome)."""
+        """Run `work` on every task in order; yield (index of the task, outcome). A task that raises has the outcome `Lost`."""
         for index, task in enumerate(tasks):
             yield index, _attempt(work, task)
 
@@ -60,17 +61,20 @@ class LocalProcesses:
     """Processes on this machine with one thread each. If one dies it is replaced, and another gets its task."""
 
     def __init__(self, count: int) -> None:
-        """Use at most this many processes."""
+        """Use at most this many processes; they are started by `run` and end with it."""
         self._count = count
         self._workers: list[_Worker] = []
 
     @property
     def pids(self) -> tuple[int, ...]:
-        """Process ids of the current workers."""
+        """Process ids of the current workers; empty while `run` is not running."""
         return tuple(worker.pid for worker in self._workers)
 
     def run(self, work: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[tuple[int, Outcome | Lost]]:
-        """Run `work` on every task in parallel; yield (index of the task, outcome) in any order, each index once."""
+        """Run `work` on every task in parallel; yield (index of the task, outcome) in any order, each index once.
+
+        A task that raises, or of which `ATTEMPTS` processes died, has the outcome `Lost`.
+        """
         waiting, deaths = deque(range(len(tasks))), [0] * len(tasks)
         try:
             self._workers = [_Worker(work) for _ in range(min(self._count, len(tasks)))]

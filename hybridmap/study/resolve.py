@@ -43,7 +43,8 @@ def resolved(study: StudyConfig, origin: str, folder: Path) -> StudyConfig:
         folder: folder in which relative paths start.
 
     Raises:
-        ConfigError: an unknown or repeated name, or a setting without effect.
+        ConfigError: an unknown or repeated name, a setting without effect, an environment variable in a path that is not set,
+            or too many cells. Whether the files exist is not checked.
     """
     sources = tuple(_located(source, origin, folder) for source in study.sources)
     variants = tuple(single for entry in study.backends for single in _expanded(entry, "settings", "backends", origin))

@@ -29,7 +29,8 @@ class Outcomes:
 
     Attributes:
         results: cache key of a result -> the result, for every cell of the grid.
-        computed: number of cells that this run computed; the others were stored by earlier runs.
+        computed: number of results that this run computed, crashed cells included; cells that share a key count once. The
+            others were stored by earlier runs, or their graph could not be made.
     """
 
     results: dict[str, CellResult]
@@ -39,13 +40,18 @@ class Outcomes:
 def run(grid: Grid, folder: StudyFolder, pool: Pool, progress: Progress | None = None) -> Outcomes:
     """Compute the results that are missing in the folder, which the caller has locked (`output.held`).
 
-    An interrupted run continues the next time; the results are the same bit for bit.
+    First the graphs that are missing are made, then the cells computed; each result is stored at once. An interrupted run
+    continues the next time; the results are the same bit for bit. A cell that crashes is a result too, but is not stored.
 
     Args:
         grid: the cells.
         folder: where results are stored.
         pool: runs the tasks.
-        progress: called with the number of cells done and their total, after each cell.
+        progress: called at the start and after each graph and each cell, with the number of graphs and cells done (those stored
+            by earlier runs included) and their total.
+
+    Returns:
+        The results of all cells of the grid, stored ones included.
 
     Raises:
         OutputError: the folder cannot be written to.

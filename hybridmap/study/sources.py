@@ -70,7 +70,10 @@ class Source:
 
 
 def prepare(task: SourceTask) -> SourceResult:
-    """Run a task: make the graph and find its reference poses. A `HybridMapError` becomes a result without a graph."""
+    """Run a task: make the graph and find its reference poses.
+
+    Without ground truth the optimum of the clean graph is the reference. A `HybridMapError` becomes a result without a graph.
+    """
     try:
         frozen = _with_reference(_cut(task.make(), task.first_nodes))
     except HybridMapError as error:
@@ -184,7 +187,10 @@ def _read_session(path: Path | None) -> Frozen:
 
 
 def laps(config: SyntheticConfig, seed: int) -> Frozen:
-    """Make a synthetic graph: a drive in circles with noise on every measurement; node k is joined to node k - per_lap."""
+    """Make a synthetic graph: a drive in circles with noise on every measurement; node k is joined to node k - per_lap.
+
+    The seed is that of the noise. The true poses are the reference; the initial ones are dead reckoning.
+    """
     step = np.array([config.step_m, 0.0, 2.0 * np.pi / config.per_lap])
     truth = np.zeros((config.nodes, 3))
     for k in range(1, config.nodes):

@@ -61,7 +61,7 @@ class Summary:
         cell: first cell of the group; all cells of the group share its labels, except for the seed.
         measure: name of the measure.
         cells, solved: number of cells in the group, and of those that have the measure; the others are left out.
-        median, mean: median and mean over the seeds.
+        median, mean: median and mean over the seeds that have the measure; NaN if none has.
         baseline: title of the study's first back-end, with which the others are compared.
         difference: mean over the seeds of this back-end's measure minus the baseline's, for seeds in which both have one; None
             for the baseline itself.
@@ -85,7 +85,12 @@ class Summary:
 
 
 def summarise(grid: Grid, results: Mapping[str, CellResult]) -> list[Summary]:
-    """A summary for each group, back-end and measure, in the order of the grid."""
+    """A summary for each group, back-end and measure, in the order of the grid; also where no cell has the measure.
+
+    Args:
+        grid: the cells of the study.
+        results: `Cell.key` -> result, for every cell of the grid.
+    """
     baseline, groups = grid.study.backends[0].title, grid.groups()
     return [
         _summary(cells, None if backend == baseline else groups[group, baseline], measure, results, grid.study)

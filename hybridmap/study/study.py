@@ -32,8 +32,8 @@ class Study:
         results: cache key of a result -> the result, for every cell of the grid.
         summaries: summaries over the seeds, one per group, back-end and measure.
         verdicts: one verdict per bar, group and back-end.
-        computed: number of cells that this run computed; the others were stored by earlier runs.
-        head: keys of `metrics.json` besides its list of metrics.
+        computed: number of results that this run computed, see `runner.Outcomes`.
+        head: keys of `metrics.json` besides its list of metrics, with their values.
         metrics: the list of metrics in `metrics.json`.
     """
 
@@ -60,7 +60,14 @@ class Study:
 def run_study(study: StudyConfig, out: Path, pool: Pool, progress: Progress | None = None) -> Study:
     """Run or continue a study; results stored by an earlier run in the same folder are not computed again.
 
-    The folder gets `study.yaml`, `cells.csv`, `timings.csv`, `summary.csv`, `bars.csv` and `metrics.json`.
+    The folder gets `study.yaml`, `cells.csv`, `timings.csv`, `summary.csv`, `bars.csv` and `metrics.json`, which replace those
+    of an earlier run, but no page (`report.study_page`). A cell that fails keeps its row; a missed bar is not an error.
+
+    Args:
+        study: the study.
+        out: folder of a study, empty, or to be made.
+        pool: runs the tasks.
+        progress: called with the number of graphs and cells done and their total, see `runner.run`.
 
     Raises:
         OutputError: the folder cannot be used, or another run is writing there.

@@ -33,20 +33,26 @@ BAR_COLUMNS = (
 
 
 def cells_csv(cells: Sequence[Cell], results: Mapping[str, CellResult], measures: Iterable[str]) -> str:
-    """One line per cell in the order of the grid; numbers with all digits, empty for a missing figure."""
+    """The text of `cells.csv`: one line per cell, in order; numbers with all digits, empty for a missing figure.
+
+    Args:
+        cells: the rows.
+        results: `Cell.key` -> result.
+        measures: names of the figures that get a column, before the counts of the graph.
+    """
     names = tuple(dict.fromkeys((*measures, *_COUNTS)))
     columns = (*_LABELS, "status", *names, "message", "key")
     return _text(columns, (_cell_row(cell, results[cell.key], names) for cell in cells))
 
 
 def timings_csv(cells: Sequence[Cell], results: Mapping[str, CellResult]) -> str:
-    """One line per cell with its process time; a table of its own, as times differ between runs."""
+    """The text of `timings.csv`: one line per cell with its process times; a table of its own, as times differ between runs."""
     rows = ((cell, results[cell.key].timings) for cell in cells)
     return _text(TIMING_COLUMNS, ((*_labels(cell), *(shown(spent.get(n)) for n in TIMINGS), cell.key) for cell, spent in rows))
 
 
 def bars_csv(verdicts: Sequence[Verdict]) -> str:
-    """One line per bar, group and back-end; the last column holds the value of each seed, with a dash for a missing one."""
+    """The text of `bars.csv`: one line per bar, group and back-end. The last column has the value of each seed, or a dash."""
     return _text(BAR_COLUMNS, (_bar_row(one) for one in verdicts))
 
 
@@ -80,7 +86,7 @@ def _text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def summary_csv(summaries: Sequence[Summary]) -> str:
-    """One line per group, back-end and measure."""
+    """The text of `summary.csv`: one line per group, back-end and measure; empty where a number is not known."""
     return _text(SUMMARY_COLUMNS, (_summary_row(one) for one in summaries))
 
 
