@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from hybridmap.study.statistics import Summary
     from hybridmap.study.study import Study
 
-_ERRORS = {"ate_m": "ATE", "relation_m": "relation error"}
 _COLUMNS = {"false_kept": "false kept", "own_lost": "own lost", "loop_recall": "recall", "found_m": "found after (m)"}
 
 
@@ -91,6 +90,7 @@ def _show(done: Study) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from hybridmap.report.study_figures import ERRORS
     from hybridmap.report.study_page import error_of, remarks
     from hybridmap.study.model import quoted
 
@@ -105,7 +105,7 @@ def _show(done: Study) -> None:
     measure, others = error_of(done), [name for name in _COLUMNS if _known(done, name)]
     table.add_column("source / setting / false loops")
     table.add_column("back-end")
-    for column in ("solved", f"median {_ERRORS[measure]} (m)", f"mean minus {quoted(done.head['baseline'])} (m)"):
+    for column in ("solved", f"median {ERRORS[measure]} (m)", f"mean minus {quoted(done.head['baseline'])} (m)"):
         table.add_column(column, justify="right")
     for name in others:
         table.add_column(_COLUMNS[name], justify="right")

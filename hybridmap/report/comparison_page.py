@@ -38,8 +38,8 @@ class Compared:
 
     Attributes:
         title: headline.
-        start: origin of the graph's initial poses, in words.
-        head: facts about the graph, shown as `key: value`.
+        start: origin of the graph's initial poses, in words (`dead reckoning`).
+        head: facts about the graph, shown as `key: value`; `nodes`, `edges` and `loops` must be among them.
         graph: the graph that was solved.
         rows: one result per back-end and way of solving.
         cells: the table as text: column titles, then one list of cells per entry of `rows`.
@@ -60,7 +60,7 @@ class Compared:
 
 
 def write_comparison(place: Held, compared: Compared) -> Path:
-    """Write `maps.png` and `comparison.html`.
+    """Write `maps.png` and `comparison.html`, which replace those of an earlier comparison.
 
     Args:
         place: the folder, locked against other writers.
@@ -104,7 +104,10 @@ def write_comparison(place: Held, compared: Compared) -> Path:
 
 
 def worst_edges(graph: PoseGraph, row: Row) -> list[str]:
-    """Describe the inlier edges with the largest squared residuals, worst first: number, end nodes, kind, squared residual."""
+    """Describe the few edges with the largest squared residuals, worst first: number, end nodes, kind, squared residual.
+
+    Edges that the back-end rejected are left out. The row must have a solution.
+    """
     assert row.solution is not None
     squared = squared_norms(graph, row.solution.poses)
     squared[np.isin(graph.edge_ids, row.solution.report.rejected_edge_ids)] = -1.0
@@ -161,16 +164,16 @@ def overlay(rows: Sequence[Row], truth: Sequence[Array], kidnapped: Sequence[Kid
 
 
 def panels(graph: PoseGraph, rows: Sequence[Row], start: str, kidnapped: Sequence[Kidnapping]) -> bytes:
-    """Draw each map with its loops and its rejected loops, side by side. The same input gives the same bytes.
+    """Draw each map with its loops and its rejected loops, one panel per result. The same input gives the same bytes.
 
     Args:
         graph: the graph that was solved; its edges are drawn.
-        rows: one result per back-end and way of solving.
-        start: origin of the graph's initial poses, in words.
+        rows: one result per back-end and way of solving; one without a map gets no panel.
+        start: title of a first panel with the graph's initial poses; it is left out if a result equals them.
         kidnapped: the places where the robot was kidnapped; no line is drawn there.
 
     Returns:
-        A PNG file.
+        The bytes of a PNG file; nothing is written.
     """
     maps = solved(rows)
     if not any(np.allclose(poses, graph.initial) for poses in maps.values()):
@@ -192,7 +195,9 @@ def panels(graph: PoseGraph, rows: Sequence[Row], start: str, kidnapped: Sequenc
 
 
 def convergence(rows: Sequence[Row]) -> str:
-    """Draw how each result converged: chi2 over the iterations (batch), unit variance over the nodes (incremental).
+    """Draw how each result converged (`Row.curve`): chi2 over the iterations (batch), unit variance over nodes (incremental).
+
+    Results without a curve or a map, and dead reckoning, are left out.
 
     Returns:
         A `data:` URI; an empty string if no result recorded its convergence.
@@ -215,7 +220,9 @@ def convergence(rows: Sequence[Row]) -> str:
 
 
 def weights(graph: PoseGraph, rows: Sequence[Row]) -> str:
-    """Draw the weight of every loop over its number, for each result with weights or rejected loops.
+    """Draw the weight of every loop in the order of the graph, for each result with weights or rejected loops.
+
+    A rejected loop has weight 0, one without a stated weight 1.
 
     Returns:
         A `data:` URI; an empty string if there is no such result.
@@ -242,7 +249,9 @@ def weights(graph: PoseGraph, rows: Sequence[Row]) -> str:
 
 
 def residuals(graph: PoseGraph, rows: Sequence[Row]) -> str:
-    """Draw the share of edges (%) whose squared Mahalanobis residual is below a value, one line per result.
+    """Draw the share of edges (%) whose squared Mahalanobis residual is below a value, one line per result with a map.
+
+    Rejected loops count as well.
 
     Returns:
         A `data:` URI; an empty string if no result has a map.
@@ -301,7 +310,7 @@ def draw_map(axes: Any, graph: PoseGraph, poses: Array, rejected: tuple[int, ...
         axes: matplotlib axes.
         graph: the graph.
         poses: (N, 3) poses of its nodes, m and rad.
-        rejected: numbers of the loop edges that the back-end rejected.
+        rejected: `edge_ids` of the loops that the back-end rejected.
     """
     lost, loops = np.isin(graph.edge_ids, np.array(rejected, dtype=np.int64)), graph.is_loop
     _draw_edges(axes, graph, poses, lost, color=_REJECTED, linewidths=0.4, alpha=0.6, zorder=1.1)

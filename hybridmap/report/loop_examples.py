@@ -35,10 +35,10 @@ class Example:
     """One example of a loop closure on a session's page.
 
     Attributes:
-        title: its two nodes, and whether it was accepted.
+        title: its two nodes, and whether it was accepted, in words.
         accepted: whether it is in the graph.
         reason: why it was accepted or rejected.
-        facts: (name, value with unit) of each quantity shown.
+        facts: (name, value with unit) of each quantity shown, as text.
         photos: colour images of the newer and the older node as `data:` URIs; empty without a camera.
         overlay: picture of both nodes' points from above, aligned by the measured relative pose; None without points.
         profiles: picture of both scanline profiles; None without profiles.
@@ -54,7 +54,7 @@ class Example:
 
 
 def examples(scene: SessionScene, store: MapStore, points_of: Mapping[int, Array]) -> list[Example]:
-    """Choose example loops: some accepted ones, spread over the drive, and the rejected one that contradicts the map most.
+    """Choose example loops: up to three accepted ones, spread over the drive, then the rejected one farthest from the map.
 
     Args:
         scene: content of the session's page.
@@ -69,7 +69,7 @@ def examples(scene: SessionScene, store: MapStore, points_of: Mapping[int, Array
 
 
 def spread(edges: Sequence[Edge], count: int) -> list[Edge]:
-    """Choose `count` edges, evenly spaced in the list."""
+    """Choose `count` edges, evenly spaced in the list and in its order; all of them if there are no more than that."""
     if len(edges) <= count:
         return list(edges)
     return [edges[(2 * k + 1) * len(edges) // (2 * count)] for k in range(count)]
@@ -170,7 +170,7 @@ def _overlay(scene: SessionScene, edge: Edge, points_of: Mapping[int, Array]) ->
 
 
 def overlay_title(edge: Edge) -> str:
-    """Describe how the two views of a loop edge were aligned."""
+    """Title of the picture of both views of a loop: aligned by the measured pose, or by the map if nothing was measured."""
     return f"laid over each other {'as the map has them' if edge.relative is None else 'by the measured pose'}"
 
 

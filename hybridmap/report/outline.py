@@ -38,6 +38,8 @@ class Raster:
 def outline(keyframe: Mapping[str, NDArray[Any]], rig: Rig) -> Array:
     """Points (M, 2) that the sensors saw at one node, from above, in `base_link`, m; empty without any.
 
+    Of a laser all of them; of a camera some thousand up to 6 m away and between 0.1 and 2 m above the floor.
+
     Args:
         keyframe: sensor data stored with the node, by name.
         rig: the robot's sensors.
@@ -52,11 +54,11 @@ def outline(keyframe: Mapping[str, NDArray[Any]], rig: Rig) -> Array:
 
 
 def outlines(store: MapStore, count: int) -> dict[int, Array]:
-    """Node -> points (M, 2) that the sensors saw there, in `base_link`, m.
+    """Node -> points (M, 2) that the sensors saw there, in `base_link`, m; a node without points is left out.
 
     Args:
         store: the session's map file.
-        count: number of nodes in the map. Of a very large map only evenly spaced nodes are read.
+        count: number of nodes in the map. Of more than 1500 only evenly spaced ones are read.
     """
     rig = store.rig
     step = max(1, -(-count // _MAX_KEYFRAMES))
@@ -65,7 +67,15 @@ def outlines(store: MapStore, count: int) -> dict[int, Array]:
 
 
 def raster(points_of: Mapping[int, Array], poses: Array) -> Raster | None:
-    """Draw the points of every node at its pose (N, 3), m and rad. Returns None if there are no points."""
+    """Draw the points of every node at its pose, in one grey picture.
+
+    Args:
+        points_of: node -> its points, (M, 2) in `base_link`, m; a node without a pose is left out.
+        poses: (N, 3) poses of the nodes 0 to N - 1 in the frame of the picture, m and rad.
+
+    Returns:
+        The picture; None if no node has points. A few outlying points may lie beyond its edges.
+    """
     placed = [transform_points(poses[node], points) for node, points in points_of.items() if node < len(poses)]
     if not placed:
         return None

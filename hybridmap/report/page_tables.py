@@ -32,7 +32,11 @@ class TableRow:
 def by_backend(metrics: Sequence[Metric], backends: Sequence[str]) -> list[TableRow]:
     """Table of the metrics that belong to a back-end: one row per measure, one cell per back-end.
 
-    Errors come first, the other measures in their order in the list.
+    Errors come first, the other measures in their order in the list. Metrics of other stages are left out.
+
+    Args:
+        metrics: metrics named `<measure>/<back-end>`.
+        backends: the columns.
     """
     measures: dict[str, dict[str, Metric]] = {}
     for metric in metrics:
@@ -48,7 +52,7 @@ def by_backend(metrics: Sequence[Metric], backends: Sequence[str]) -> list[Table
 
 
 def of_session(metrics: Sequence[Metric], backends: Sequence[str]) -> list[TableRow]:
-    """Table of the metrics that belong to no back-end, one row each."""
+    """Table of the metrics that belong to none of the back-ends, one row and one cell each, in their order."""
     return [
         TableRow(metric.name, unit(metric), metric.description, (shown(metric),))
         for metric in metrics
@@ -63,7 +67,7 @@ def shown(metric: Metric) -> str:
 
 
 def number(value: float) -> str:
-    """A number with four significant digits, integers in full; a dash for NaN or infinity."""
+    """A number with four significant digits, below 1e7 with all digits before the point; a dash for NaN or infinity."""
     if not math.isfinite(value):
         return "–"
     if value == round(value) and abs(value) < 1e7:
@@ -88,7 +92,7 @@ def interval(found: Interval) -> str:
 
 
 def length(value_m: float) -> tuple[str, str]:
-    """Format a length: (digits, unit), below a metre in cm."""
+    """Format a length in m: (digits, unit), below a metre in cm; a dash for NaN or infinity."""
     if not math.isfinite(value_m):
         return "–", "m"
     value, name = (100.0 * value_m, "cm") if abs(value_m) < 1.0 else (value_m, "m")
@@ -96,7 +100,7 @@ def length(value_m: float) -> tuple[str, str]:
 
 
 def duration(value_s: float) -> tuple[str, str]:
-    """Format a duration: (digits, unit), beyond two minutes in minutes."""
+    """Format a duration in s: (digits, unit), beyond two minutes in minutes."""
     return (f"{value_s:.0f}", "s") if not value_s > 120.0 else (f"{value_s / 60.0:.1f}", "min")
 
 
@@ -114,7 +118,7 @@ def is_page(path: Path) -> bool:
 
 
 def rendered(template: str, **content: Any) -> str:
-    """Fill in the template of a page.
+    """Fill in the template of a page; returns its HTML.
 
     Args:
         template: file name of the template.

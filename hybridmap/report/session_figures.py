@@ -129,7 +129,10 @@ def chain_and_kidnappings(scene: SessionScene) -> tuple[list[Edge], list[Edge]]:
 
 
 def loops_by_fate(scene: SessionScene) -> dict[str, list[Edge]]:
-    """Status -> the loop edges with it, for every loop that was considered; in the order of the legend."""
+    """Words of the legend -> the loop edges of that status, in the order of the legend, for every loop that was considered.
+
+    The keys are always the same. Retracted loops are among the rejected ones.
+    """
     report = scene.reports.get(scene.primary)
     unweighted = set(report.rejected_edge_ids) if report is not None else set()
     found: dict[str, list[Edge]] = {fate: [] for fate in _FATES}
@@ -172,7 +175,7 @@ class ErrorSeries:
 
     Attributes:
         time_s: (P,) time since the beginning of the recording.
-        position_m, heading_deg: (P,) absolute errors.
+        position_m, heading_deg: (P,) absolute errors, m and degrees.
     """
 
     time_s: Array
@@ -247,7 +250,10 @@ def _series(since_start_ns: Any, estimate: Array, reference: Array) -> ErrorSeri
 
 
 def over_intervals(errors: ErrorSeries, count: int) -> ErrorSeries:
-    """Root mean square of the errors over `count` equal intervals of time; intervals without errors are left out."""
+    """Root mean square of the errors over `count` equal intervals of time; intervals without errors are left out.
+
+    No more than `count` errors are returned as they are.
+    """
     if len(errors.time_s) <= count:
         return errors
     first, last = errors.time_s[0], errors.time_s[-1]
@@ -262,7 +268,7 @@ def over_intervals(errors: ErrorSeries, count: int) -> ErrorSeries:
 
 
 def gaps(time_s: Array) -> Array:
-    """Middle (G,), s, of each long gap in the times of errors, such as a kidnapping or a gap of the ground truth."""
+    """Middle (G,), s, of each gap in times (P,), s, longer than 3 s and five times the median one, such as a kidnapping."""
     spacing = np.diff(time_s)
     if not len(spacing):
         return spacing
@@ -271,7 +277,7 @@ def gaps(time_s: Array) -> Array:
 
 
 def with_gaps(errors: ErrorSeries, gaps_s: Array) -> ErrorSeries:
-    """The errors with NaN inserted at the times `gaps_s`, so that no line is drawn across them."""
+    """The errors with NaN inserted at the times `gaps_s` (see `gaps`), so that no line is drawn across them."""
     at = np.searchsorted(errors.time_s, gaps_s)
     position, heading = (np.insert(values, at, np.nan) for values in (errors.position_m, errors.heading_deg))
     return ErrorSeries(np.insert(errors.time_s, at, gaps_s), position, heading)

@@ -33,7 +33,7 @@ class Tile:
 
 
 def write_report(folder: SessionFolder) -> Path:
-    """Write `report.html` of a session: one self-contained page without network access or scripts.
+    """Write `report.html` of a session, replacing an earlier one: one self-contained page without network access or scripts.
 
     Returns:
         The path of the page.
@@ -41,6 +41,7 @@ def write_report(folder: SessionFolder) -> Path:
     Raises:
         StoreError: there is no session, or its map or metrics are damaged.
         StreamError: one of its trajectories is damaged.
+        OutputError: the page cannot be written.
     """
     folder.require_map()
     with MapStore.open(folder.path) as store:
@@ -82,7 +83,7 @@ def _content(scene: SessionScene, store: MapStore) -> dict[str, Any]:
 
 
 def tiles(scene: SessionScene) -> list[Tile]:
-    """The main values of a session: accuracy, travel, loops and computing time."""
+    """The main values of a session: accuracy, travel, loops and computing time; those without a metric are left out."""
     named = {metric.name: metric for metric in scene.metrics}
     wanted = [
         (f"ate_rmse/{ODOMETRY}", "ATE of odometry"),

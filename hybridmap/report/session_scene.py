@@ -23,7 +23,7 @@ class Correction:
 
     Attributes:
         stamp_ns: stamp at which the map changed.
-        shift_m: largest shift of a node.
+        shift_m: largest shift of a node, m.
         before, after: (K, 3) poses of the nodes at that time, m and rad, in the page's frame.
     """
 
@@ -42,7 +42,8 @@ class SessionScene:
         primary: name of the primary back-end.
         backends: `odometry`, then every back-end with a trajectory or a solution, the primary first.
         truth: true trajectory, None if unknown.
-        estimates: name -> trajectory, each aligned to the truth by itself; online ones are called `<backend>_online`.
+        estimates: name -> trajectory, each aligned to the truth by itself; online ones are called `<backend>_online`. Empty
+            ones are left out.
         pairs: name -> estimate and truth at common stamps, both in the page's frame; empty without a truth.
         nodes: (N, 3) poses of the nodes by the primary back-end, m and rad.
         experiences: the nodes and edges of the map.

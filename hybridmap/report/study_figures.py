@@ -16,6 +16,9 @@ from hybridmap.study.model import quoted
 from hybridmap.study.statistics import Summary
 from hybridmap.study.study import Study
 
+ERRORS = {"ate_m": "ATE", "relation_m": "relation error"}
+"""The errors that a page may compare, the preferred one first, and their names for people."""
+
 MOST_PANELS = 12
 """More are not drawn; the tables have everything."""
 
@@ -35,7 +38,7 @@ class Panel:
     Attributes:
         title: what the results have in common.
         ticks: names of the positions along the horizontal axis.
-        cells: (position, back-end, result) of each run of the study.
+        cells: (index into `ticks`, back-end, result) of each cell that belongs to the panel.
     """
 
     title: str
@@ -60,8 +63,8 @@ class Layout:
 def layout(study: Study) -> Layout:
     """Divide a study's results into panels, and choose the quantity on their horizontal axis.
 
-    It is the number of false loops if that varies, else the setting if that varies. Otherwise, or with many back-ends, it is
-    the back-end.
+    It is the share of false loops if that varies, else the setting if that varies. Otherwise, or with more than nine back-ends,
+    it is the back-end.
     """
     config = study.grid.study
     rates = sorted(config.false_loops.rates)
@@ -105,14 +108,14 @@ def having(plan: Layout, figure: Figure) -> Layout:
 def merit_figure(study: Study, plan: Layout, label: str, figure: Figure, *, logarithmic: bool) -> str:
     """Draw one metric of a study, an error or a share in percent: a dot per run, lines or bars through the medians.
 
-    Panels without a value of the metric are left out.
+    Panels without a value of the metric are left out, and those beyond `MOST_PANELS`.
 
     Args:
         study: the finished study.
         plan: its panels.
         label: text along the metric's axis.
         figure: function that returns the metric of a run's result.
-        logarithmic: whether the metric's axis is logarithmic.
+        logarithmic: whether the metric's axis is logarithmic; if not, it goes from 0 to 100 %.
 
     Returns:
         A `data:` URI; an empty string if no result has a value.
@@ -145,9 +148,13 @@ def merit_figure(study: Study, plan: Layout, label: str, figure: Figure, *, loga
 
 
 def paired_groups(summaries: Sequence[Summary], measure: str) -> dict[str, list[Summary]]:
-    """Group of results -> the mean difference of each back-end's error to the baseline, paired by seed.
+    """Label of a group of cells -> the summaries of its back-ends that have a difference to the baseline, paired by seed.
 
-    Groups without such a difference (fewer than two seeds) are left out.
+    A summary with fewer than two pairs, and a group without any, is left out.
+
+    Args:
+        summaries: all summaries of a study.
+        measure: name of the error that is compared, such as `ate_m`.
     """
     groups: dict[str, list[Summary]] = {}
     for one in summaries:
@@ -159,7 +166,10 @@ def paired_groups(summaries: Sequence[Summary], measure: str) -> dict[str, list[
 def difference_figure(groups: Mapping[str, Sequence[Summary]]) -> str:
     """Draw the mean paired difference of the error to the baseline with its confidence interval, one panel per group.
 
-    A difference without an interval is a single dot.
+    A difference without an interval is a single dot. Groups beyond `MOST_PANELS` are left out.
+
+    Args:
+        groups: what `paired_groups` returns.
 
     Returns:
         A `data:` URI; an empty string if there is no group.
@@ -178,7 +188,7 @@ def difference_figure(groups: Mapping[str, Sequence[Summary]]) -> str:
             axes.set_yticks(range(len(ones)), [one.cell.backend for one in ones])
             axes.set_ylim(len(ones) - 0.5, -0.5)
             axes.set_title(label, fontsize=9.0)
-            axes.set_xlabel(f"ATE minus that of {quoted(ones[0].baseline)} (m)")
+            axes.set_xlabel(f"{ERRORS[ones[0].measure]} minus that of {quoted(ones[0].baseline)} (m)")
             axes.grid(True, axis="x", linewidth=0.5)
             axes.tick_params(axis="x", labelsize=7.5)
         return style.svg_uri(picture)

@@ -14,7 +14,7 @@ from hybridmap.output import write_text
 from hybridmap.report import page_tables as tables
 from hybridmap.report import study_figures
 from hybridmap.report.page_tables import rendered
-from hybridmap.report.study_figures import FLOOR_M, MOST_PANELS
+from hybridmap.report.study_figures import ERRORS, FLOOR_M, MOST_PANELS
 from hybridmap.study.bars import Verdict
 from hybridmap.study.cell import CellResult
 from hybridmap.study.cells import Cell
@@ -26,11 +26,10 @@ from hybridmap.study.study import Study
 
 _TEMPLATE = "study.html.j2"
 _SOLVED = ("converged", "waiting", "max-iterations", "fell-back", "mapped")
-_HEADS = {"ate_m": "ATE", "relation_m": "relation error", "chi2_own": "χ² own"}
+_HEADS = ERRORS | {"chi2_own": "χ² own"}
 SHOWN_M = 5e-7
 """Differences below it are shown as 0."""
 _NAMED = 4  # places or back-ends that a remark names
-_ERRORS = ("ate_m", "relation_m")
 _SUMMED = (
     *("relation_m", "relation_loop_m", "chi2_own", "loop_recall", "false_kept", "wrong_loops", "own_lost", "iterations"),
     *("loop_chi2_ratio", "found_m"),
@@ -39,7 +38,17 @@ _SUMMED = (
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One back-end in a table of a study's page: the texts of its cells, and whether it differs from the baseline."""
+    """One back-end in a table of a study's page; everything is text.
+
+    Attributes:
+        backend: title of the back-end.
+        solved: how many of its cells have the error that the page compares.
+        median, mean: of that error, the mean with its confidence interval.
+        difference: mean of the paired differences to the baseline, with its interval; empty for the baseline.
+        verdict: `lower` or `higher` if the interval of the difference excludes zero; else empty.
+        better: share of the seeds in which its error is lower; empty if unknown.
+        others: medians of the further figures of the table.
+    """
 
     backend: str
     solved: str
@@ -57,8 +66,8 @@ class Group:
 
     Attributes:
         label: the conditions in words: source, setting, false loops.
-        lines: one row per back-end that has a map.
-        without: names of the back-ends without a map.
+        lines: one row per back-end that has a map in any cell of the group.
+        without: names of the other back-ends.
     """
 
     label: str
@@ -71,10 +80,10 @@ class Bar:
     """One row of the table that compares a study's results with their stated limits.
 
     Attributes:
-        what: the metric.
-        where: the runs that it covers.
-        median, worst: its median and worst value as text.
-        bar: the limit.
+        what: the figure and the statistic that is compared.
+        where: the group of cells and the back-end.
+        median, worst: median and worst value over the seeds, as text.
+        bar: the limit, as text.
         passed: whether the limit is kept.
     """
 
@@ -105,7 +114,9 @@ class Remark:
 
 
 def write_study_page(study: Study) -> Path:
-    """Write `report.html` of a study: one self-contained page; the same results give the same page.
+    """Write `report.html` into the study's folder, replacing an earlier one: one self-contained page.
+
+    The same results give the same page. Returns its path.
 
     Raises:
         OutputError: it cannot be written.
@@ -186,8 +197,9 @@ def _reference(study: Study) -> bool:
 
 
 def error_of(study: Study) -> str:
-    """Name of the error that the study's page compares: ATE, or relation errors if no ground truth is known."""
-    return next((name for name in _ERRORS if any(result.figures.get(name) is not None for _, result in study.rows)), _ERRORS[0])
+    """Name of the error that the study's page compares: `ate_m`, or `relation_m` if no cell has an ATE but some have that."""
+    known = (name for name in ERRORS if any(result.figures.get(name) is not None for _, result in study.rows))
+    return next(known, "ate_m")
 
 
 def _others(study: Study) -> list[str]:
@@ -231,7 +243,10 @@ def _share(result: CellResult, part: str, whole: str) -> float | None:
 
 
 def groups_of(study: Study) -> list[Group]:
-    """The tables of a study's page: one per source, setting and false loops, with a row for each back-end that has a map."""
+    """The tables of a study's page: one per source, setting, and kind and share of false loops, in the order of the study.
+
+    A back-end that has a map in any cell of the group gets a row; the others are in `Group.without`.
+    """
     measure, others = error_of(study), _others(study)
     found: dict[str, dict[str, dict[str, Summary]]] = {}
     for one in study.summaries:
@@ -269,7 +284,7 @@ def _mean(found: Interval, cells: int) -> str:
 
 
 def remarks(study: Study) -> list[Remark]:
-    """The runs of a study that gave no solution; those whose messages differ only in numbers are one remark."""
+    """The cells of a study that gave no solution; those of one status whose messages differ only in numbers are one remark."""
     found: dict[tuple[str, str], list[tuple[Cell, str]]] = {}
     for cell, result in study.rows:
         if result.status not in _SOLVED:

@@ -47,7 +47,7 @@ _SETTINGS = {
 
 
 def line_styles(backends: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Back-end -> style of its line (arguments of matplotlib). `backends` begins with `odometry` and the primary back-end."""
+    """Back-end -> style of its line (arguments of matplotlib). The first one that is not `odometry` looks like the primary."""
     styles: dict[str, dict[str, Any]] = {}
     others = [name for name in backends if name != base.ODOMETRY]
     dashes = ((0, (4, 1.2)), (0, (6, 1.2, 1, 1.2)), (0, (1.2, 1.2)))
@@ -71,7 +71,10 @@ def figure(width_in: float, height_in: float, margins: Margins | None = None) ->
 
     Args:
         width_in, height_in: size, inches.
-        margins: space around the axes; computed if None, which is slow.
+        margins: where the axes begin and end, as shares of the figure; computed if None, which is slow.
+
+    Yields:
+        The `matplotlib.figure.Figure`, without axes.
     """
     import matplotlib
     from matplotlib.figure import Figure
@@ -105,7 +108,7 @@ _POWER_OF_TEN = re.compile(r"\$\\mathdefault\{[-−]?10\^\{[-−]?\d+\}\}\$")  #
 
 
 def photo_uri(rgb: NDArray[np.uint8]) -> str:
-    """A colour picture (H, W, 3) uint8 as a `data:` URI."""
+    """A colour picture (H, W, 3) uint8 RGB as JPEG in a `data:` URI."""
     import cv2
 
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 88])
@@ -119,7 +122,7 @@ def thinned(poses: Array) -> Array:
 
 
 def draw_building(axes: Any, building: Raster | None, darkness: float = 0.55) -> None:
-    """Draw the picture of the building in grey, under everything else; draws nothing if it is None."""
+    """Draw the picture of the building in grey, below everything; nothing if it is None. `darkness`: 0 is white, 1 black."""
     if building is None:
         return
     seen = np.ma.masked_equal(building.grey, 0.0) * darkness
@@ -128,7 +131,7 @@ def draw_building(axes: Any, building: Raster | None, darkness: float = 0.55) ->
 
 
 def metric_axes(axes: Any, adjustable: str = "datalim") -> None:
-    """Give matplotlib axes equal scales in metres."""
+    """Give matplotlib axes equal scales in metres; `adjustable` is what gives way, the limits (`datalim`) or the `box`."""
     axes.set_aspect("equal", adjustable=adjustable)
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
@@ -137,7 +140,7 @@ def metric_axes(axes: Any, adjustable: str = "datalim") -> None:
 
 
 def fitted_size(span_m: Array, panels: int = 1) -> tuple[float, float]:
-    """Size of a figure for a map.
+    """Size of a figure for a map: as wide as the page, and as high as the map needs, within limits.
 
     Args:
         span_m: (2,) width and height that each panel shows, m.

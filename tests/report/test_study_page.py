@@ -1,6 +1,7 @@
 """The page of a study: no verdict on few seeds, and what failed said once instead of shown empty."""
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -122,3 +123,12 @@ def test_differences_beyond_the_panels_are_counted_and_names_of_several_words_qu
     text = text_of(made(lambda _: 1.0, settings=settings, backends=backends, false_loops={"rates": [0.1, 0.2]}))
     assert "error minus that of \u201clm, its own start\u201d on the very same graph" in text
     assert "2 further groups are left out" in text
+
+
+@pytest.mark.parametrize(("measure", "error"), [("ate_m", "ATE"), ("relation_m", "relation error")])
+def test_the_axis_of_the_differences_names_the_error_that_is_compared(made, monkeypatch, measure, error):
+    pairs = study_figures.paired_groups(made(better_by_the_seed, seeds=3).summaries, "ate_m")
+    drawn: list[Any] = []
+    monkeypatch.setattr(style, "svg_uri", drawn.append)
+    study_figures.difference_figure({label: [replace(one, measure=measure) for one in ones] for label, ones in pairs.items()})
+    assert {axes.get_xlabel() for axes in drawn[0].axes} - {""} == {f"{error} minus that of gtsam-lm (m)"}
