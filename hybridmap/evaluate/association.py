@@ -23,7 +23,7 @@ class PosePairs:
         stamps_ns: (P,) int64.
         estimate: (P, 3) m and rad, in the estimate's map frame.
         reference: (P, 3) m and rad, in the reference's frame.
-        total: number of all poses of the estimate, with or without a reference.
+        total: number of all poses of the estimate, those without a reference included.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -36,12 +36,13 @@ class PosePairs:
 
 
 def associate(estimate: Trajectory, reference: Trajectory, max_gap_s: float = MAX_GAP_S) -> PosePairs:
-    """Interpolate the reference trajectory at the stamps of the estimate.
+    """Interpolate the reference trajectory at the stamps of the estimate. Nothing is aligned.
 
     Args:
         estimate: trajectory to evaluate.
         reference: true trajectory.
-        max_gap_s: longest gap of the reference over which it is interpolated; other stamps are left out.
+        max_gap_s: longest gap of the reference over which it is interpolated, s. Stamps in longer gaps and outside of the
+            reference are left out.
 
     Raises:
         EvaluationError: fewer than three stamps in common.

@@ -21,10 +21,10 @@ class ClosureLimits:
     """When a loop edge is correct, and what counts as a revisit.
 
     Attributes:
-        right_m, right_deg: a loop edge is correct if its measured relative pose is this close to the truth.
+        right_m, right_deg: a loop edge is correct if its measured relative pose is this close to the truth in both.
         revisit_m, revisit_deg: largest distance and turn between a revisit and the older node that it revisits.
         revisit_gap_s: least time between the two.
-        window_nodes: a revisit counts as found if a correct loop edge starts within this many nodes of it.
+        window_nodes: a revisit counts as found if the newer end of a correct loop edge is at most this many nodes from it.
     """
 
     right_m: float = 1.0
@@ -69,7 +69,7 @@ def closure_errors(
     rejected: Collection[int] = (),
     limits: ClosureLimits = DEFAULT_LIMITS,
 ) -> ClosureErrors:
-    """Evaluate the accepted loop edges of a map.
+    """Evaluate the accepted loop edges of a map; edges between nodes without a known true pose are left out.
 
     Args:
         experiences: the map.
@@ -166,7 +166,7 @@ class EdgeErrors:
 def edge_errors(
     experiences: ExperienceMap, truth: Trajectory, weights: Mapping[int, float] | None = None
 ) -> dict[EdgeKind, EdgeErrors]:
-    """Evaluate the accepted edges of a map: kind of edge -> errors.
+    """Evaluate the accepted edges of a map: kind of edge -> errors; a kind without an edge that can be evaluated is left out.
 
     Args:
         experiences: the map.
@@ -180,7 +180,7 @@ def edge_errors(
 def edge_errors_on(
     experiences: ExperienceMap, poses: Array, known: NDArray[np.bool_] | None = None, weights: Mapping[int, float] | None = None
 ) -> dict[EdgeKind, EdgeErrors]:
-    """Evaluate the accepted edges of a map, kind by kind, given the true poses of its nodes.
+    """Evaluate the accepted edges of a map, given the true poses of its nodes: kind of edge -> errors, as `edge_errors`.
 
     Args:
         experiences: the map.
@@ -197,10 +197,13 @@ def edge_errors_on(
 
 
 def normalised_errors(edges: list[Edge], poses: Array) -> tuple[Array, Array]:
-    """Errors of E edges against the true poses (N, 3) of the nodes.
+    """Errors of E edges against the true poses (N, 3) of the nodes, in any frame, m and rad.
+
+    Edges without a measurement are left out, so that there may be fewer rows than edges.
 
     Returns:
-        (E, 3) errors as twists in the frame of the edge's target node, m and rad, and their squared Mahalanobis norms (E,).
+        (E, 3) the true pose of each edge's target seen from the measured one, as twists, m and rad, and their squared
+        Mahalanobis norms (E,) by the covariances of the edges.
     """
     measured = [edge.relative for edge in edges if edge.relative is not None]
     ends = np.array([(e.source, e.target) for e in edges if e.relative is not None], dtype=np.int64).reshape(-1, 2)

@@ -33,9 +33,9 @@ class Decision:
     Attributes:
         number: number of the edge in the map file.
         edge: the edge, with the checks and the verdict.
-        weights: back-end -> weight that it gives to the loop if it was accepted (0: rejected by this back-end).
+        weights: back-end -> weight 0..1 that it gives to an accepted loop (0: rejected by this back-end); else empty.
         inconsistent: names of the back-ends that rejected the loop as inconsistent with other loops.
-        error: distance (m) and turn (deg) between its measurement and ground truth, None if unknown.
+        error: distance (m) and turn (deg) between its measurement and ground truth; None if unknown.
     """
 
     number: int
@@ -80,8 +80,8 @@ class NodeStory:
         node: number of the node.
         stamp_ns, time_s: stamp of its frame, and seconds since the first stamp of the recording.
         travel_m: path length from the start to the node.
-        moved: distance (m) and turn (deg) since the previous node, None for the first.
-        nearest: the older node with the nearest pose on the final map: (node, m, deg), None if there is none.
+        moved: distance (m) and turn (deg, unsigned) by odometry since the previous node; None for the first.
+        nearest: of the nodes old enough for a loop, the nearest on the final map: (node, m, deg); None if there is none.
         template, founded: number of its view template, and whether the node created that template.
         poses: `odometry` or back-end -> (3,) final pose of the node, m and rad.
         gate: the region in which older nodes were considered for a loop, None if not stored.
@@ -171,7 +171,7 @@ class FrameStory:
 
 
 class Explainer:
-    """Answers questions about the decisions in one session. It is a context manager.
+    """Answers questions about the decisions in one session. A context manager: it holds the map file open, and closes it.
 
     Args:
         folder: the session folder.
@@ -236,10 +236,10 @@ class Explainer:
         )
 
     def frame(self, time_s: float) -> FrameStory:
-        """The decisions made at a time: seconds since the start of the recording, or (if beyond 1e6) a stamp in seconds.
+        """The decisions at the frame nearest to a time: seconds since the start of the recording, or from 1e6 on a stamp, s.
 
         Raises:
-            EvaluationError: the recording does not cover the time.
+            EvaluationError: the time is farther from every frame than the longest gap between frames (at least 1 s).
         """
         track = self._store.track()
         stamps = track.stamps_ns

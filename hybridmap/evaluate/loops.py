@@ -121,7 +121,11 @@ def judge_pairs(
         stamps_ns: (N,) stamps of the nodes.
         truth: true trajectory, in any frame.
         limits: when two nodes show the same place.
-        max_gap_s: longest gap of the truth over which it is interpolated.
+        max_gap_s: longest gap of the truth over which it is interpolated, s.
+
+    Returns:
+        The pairs of every node with a known pose, or of `MOST_QUERIES` evenly spaced ones, and all nodes older by
+        `limits.gap_s`.
     """
     known = known_at(truth, stamps_ns, max_gap_s)
     poses: Array = truth.at(stamps_ns) if known.any() else np.zeros((len(stamps_ns), 3))
@@ -146,7 +150,8 @@ def score_matrix(profiles: Sequence[Profile], queries: Indices, reading: Reading
         reading: how the score is computed.
 
     Returns:
-        (Q, N), smaller for a better match; infinite where a node is not older than the view.
+        (Q, N) score G, infinite where a node is not older than the view. Smaller is better, except with the mode `literal`,
+        see `vision.templates.combine`.
     """
     store = ProfileStore(reading.max_shift, reading.circular)
     for profile in profiles:
@@ -164,7 +169,10 @@ def score_matrix(profiles: Sequence[Profile], queries: Indices, reading: Reading
 
 
 def candidate_errors(scores: Array, truth: Truth) -> CandidateErrors:
-    """Evaluate scores (Q, N), smaller for a better match, against the true places."""
+    """Evaluate scores (Q, N) of the nodes `truth.queries` against all N nodes; the smallest counts as the best match.
+
+    Pairs that are neither the same place nor different ones are not used.
+    """
     same, different = scores[truth.same], scores[truth.different]
     pool = np.where(truth.same | truth.different, scores, np.inf)
     asked = np.flatnonzero(np.isfinite(pool).any(axis=1))
@@ -255,7 +263,7 @@ def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
 
     Raises:
         StoreError: the folder holds no session.
-        StreamError: the reference is damaged.
+        StreamError: the reference is missing or damaged.
         EvaluationError: there is no ground truth, or the session stores no profiles.
     """
     truth = truth_of(folder, reference)
@@ -282,7 +290,7 @@ def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
 
 
 def candidate_metrics(mode: str, errors: CandidateErrors) -> list[Metric]:
-    """The errors of one formula of the score as metrics, named `<measure>/<mode>`."""
+    """The errors of one formula of the score as metrics, named `<measure>/<mode>`; `mode` is the name of the formula."""
     views = f"of {errors.revisits} revisits among {errors.queries} views"
     rows = [
         ("pair_auc", errors.pair_auc),
@@ -297,6 +305,8 @@ def truth_of(folder: Path, reference: Path | None) -> Trajectory:
     """Read the ground truth of a session: the file `reference` in the TUM format, or if it is None the session's own.
 
     Raises:
+        StoreError: the folder holds no session.
+        StreamError: the reference is missing or damaged.
         EvaluationError: no reference is given, and the session has none.
     """
     session = SessionFolder(folder)
@@ -324,6 +334,6 @@ def node_stamps(store: MapStore) -> np.ndarray[Any, np.dtype[np.int64]]:
 
 
 def stored_profiles(store: MapStore) -> list[Profile]:
-    """The stored profiles of a session, one per node; empty if there are none."""
+    """The stored profiles of a session, (bands, width) each, in the order of the nodes; nodes without one are left out."""
     profiles = [store.keyframe(node).get("profile") for node in range(len(store.map()))]
     return [profile for profile in profiles if profile is not None]

@@ -97,7 +97,7 @@ def relations_of(path: Path, trajectory: Trajectory) -> Relations:
     """Read verified relations from a file, for a trajectory of the same recording.
 
     Raises:
-        EvaluationError: the file is missing, empty or damaged, or the trajectory covers none of its relations.
+        EvaluationError: the file is missing, empty or damaged, or the trajectory covers none of its relations (by both stamps).
     """
     relations = read_relations(path)
     if relation_errors(trajectory, relations).all.used == 0:
@@ -112,7 +112,7 @@ def relations_of(path: Path, trajectory: Trajectory) -> Relations:
 def relation_errors(trajectory: Trajectory, relations: Relations) -> RelationErrors:
     """Errors (m, degrees) of a trajectory's relative poses against verified ones, over all relations and over loops alone.
 
-    A relation counts if the trajectory covers both of its stamps.
+    A relation counts if the trajectory covers both of its stamps; the errors are NaN if none does.
     """
     first, second = relations.stamps_ns[:, 0], relations.stamps_ns[:, 1]
     known = known_at(trajectory, first) & known_at(trajectory, second)

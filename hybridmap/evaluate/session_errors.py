@@ -27,7 +27,9 @@ def evaluate_session(
     folder: Path, reference: Path | None = None, relations: Path | None = None, *, loops: bool = False
 ) -> list[Metric]:
     """Evaluate the trajectories of a session (odometry, and each back-end's final and online one) and store the metrics in its
-    `metrics.json`. If that file cannot be written, a warning is logged.
+    `metrics.json`, where they replace those of the same name. If that file cannot be written, a warning is logged.
+
+    With a reference, its loops and its edges by kind are evaluated as well.
 
     Args:
         folder: the session folder.
@@ -36,11 +38,12 @@ def evaluate_session(
         loops: also evaluate how well the views tell places apart, see `evaluate_loops`.
 
     Returns:
-        Metrics named `<measure>/<back-end>`; NaN where the data do not allow a value.
+        The metrics, named `<measure>/<back-end>`, `<measure>/graph` for all accepted loops, `<measure>/<kind>` for edges of
+        one kind; NaN where the data do not allow a value.
 
     Raises:
         StoreError: the folder holds no session.
-        StreamError: the reference is damaged.
+        StreamError: the reference is missing or damaged.
         EvaluationError: there is neither a reference nor a relations file, they share no stamps with the session, or `loops`
             is set and the session stores no views.
     """
@@ -125,7 +128,10 @@ def against_truth(estimate: str, trajectory: Trajectory, truth: Trajectory) -> l
     Args:
         estimate: its name: `odometry`, `<back-end>` or `<back-end>_online`.
         trajectory: the estimate.
-        truth: true trajectory.
+        truth: true trajectory, in any frame.
+
+    Returns:
+        Metrics named `<measure>/<back-end>`, those of an online estimate `<measure>_online/<back-end>`.
 
     Raises:
         EvaluationError: fewer than three stamps in common.
@@ -158,6 +164,9 @@ def against_relations(estimate: str, trajectory: Trajectory, relations: Relation
         estimate: its name: `odometry`, `<back-end>` or `<back-end>_online`.
         trajectory: the estimate.
         relations: verified relative poses.
+
+    Returns:
+        Metrics named as by `against_truth`; NaN where the trajectory covers no relation.
     """
     suffix, backend, when = _names(estimate)
     errors = relation_errors(trajectory, relations)
@@ -227,7 +236,7 @@ class Judged:
 def judge_solutions(
     folder: Path, solutions: Mapping[str, Array], reference: Path | None = None, relations: Path | None = None
 ) -> Judged:
-    """Evaluate several solutions of a session's graph, over the whole recording.
+    """Evaluate several solutions of a session's graph, over the whole recording. Nothing is stored.
 
     Args:
         folder: the session folder.
@@ -237,7 +246,7 @@ def judge_solutions(
 
     Raises:
         StoreError: the folder holds no session.
-        StreamError: the reference is damaged.
+        StreamError: the reference is missing or damaged.
         EvaluationError: the relations are damaged, or reference or relations share no time with the session.
     """
     own = SessionFolder(folder).groundtruth

@@ -25,7 +25,7 @@ class AbsoluteError:
     """Distances between an estimate and the reference after the best SE(2) alignment.
 
     Attributes:
-        rmse_m, mean_m, median_m, max_m: statistics of the distances.
+        rmse_m, mean_m, median_m, max_m: statistics of the distances between positions; headings do not count.
         pose_reference_estimate: (3,) the alignment: pose of the estimate's map frame in the reference's, m and rad.
         used, total: number of compared poses of the estimate, and of all.
     """
@@ -91,7 +91,11 @@ def relative_error(estimate: Trajectory, reference: Trajectory, delta: float, un
 
 
 def relative_error_of(pairs: PosePairs, delta: float, unit: Literal["m", "s"]) -> RelativeError:
-    """RPE of an estimate and a reference at common stamps, over pieces of `delta` metres or seconds."""
+    """RPE of an estimate and a reference at common stamps, over pieces of `delta` metres of the reference's path, or seconds.
+
+    A piece begins at every pose at which the reference moved on, so pieces overlap; those more than half too long are left out.
+    The errors are NaN if there is no piece.
+    """
     along = travel(pairs.reference) if unit == "m" else (pairs.stamps_ns - pairs.stamps_ns[0]) / NS_PER_S
     first, last = _pieces(along, delta)
     if len(first) == 0:
@@ -107,9 +111,9 @@ def relative_error_of(pairs: PosePairs, delta: float, unit: Literal["m", "s"]) -
 
 
 def drift_percent(pairs: PosePairs) -> float:
-    """Mean translational error in % of the distance travelled, over pieces of 5, 10, 20, ... 160 m.
+    """Mean translational error in % of the distance travelled by the reference, over pieces of 5, 10, 20, ... 160 m.
 
-    A path shorter than 5 m is one piece. Returns NaN if the reference does not move.
+    Lengths beyond the path are left out; a path shorter than 5 m is one piece. Returns NaN if the reference does not move.
     """
     along = travel(pairs.reference)
     lengths = [length for length in _DRIFT_LENGTHS_M if length <= along[-1]] or [float(along[-1])]
