@@ -10,11 +10,11 @@ class Format:
     """An export format.
 
     Attributes:
-        writer: `module:function` below this package; it writes one file and returns metrics of it.
+        writer: `module:function` below this package: (view, path) -> metrics of the file that it writes.
         suffix: usual suffix of the file.
         description: one line for people.
-        companion: suffix of a second file in the same folder, None if there is only one.
-        by_suffix: whether Open3D needs this suffix to read the file.
+        companion: suffix of a second file of the same name that the writer writes beside it; None if there is only one.
+        by_suffix: whether Open3D needs this suffix to read the file; another suffix is then refused.
     """
 
     writer: str

@@ -31,7 +31,7 @@ class ExportOptions:
     Attributes:
         resolution_m: cell size of the occupancy grid.
         voxel_m: voxel size of point clouds.
-        max_depth_m: larger depth is left out.
+        max_depth_m: larger depth of a camera is left out; ranges of a laser are not.
         obstacle_low_m, obstacle_high_m: depth points between these heights above the floor are obstacles of the grid.
     """
 
@@ -43,7 +43,7 @@ class ExportOptions:
 
 
 class SessionView:
-    """A session opened for export, with the poses of one back-end."""
+    """A session opened for export, with the poses of one back-end. What it gives is read or computed when first asked for."""
 
     def __init__(self, store: MapStore, backend: str, options: ExportOptions) -> None:
         self.store = store
@@ -91,7 +91,7 @@ def open_view(folder: Path, backend: str | None, options: ExportOptions) -> Sess
 
     Args:
         folder: the session folder.
-        backend: its name; None for the primary one.
+        backend: its name; None for the primary one. `odometry` is dead reckoning.
         options: resolution and limits of the export.
 
     Raises:
@@ -140,10 +140,13 @@ def export_session(
     Args:
         folder: the session folder.
         format_name: one of `FORMATS`.
-        out: the file to write; `grid` writes a `.yaml` and a `.pgm` of that name.
+        out: the file to write, made with its folder; `grid` writes a `.yaml` and a `.pgm` of that name.
         backend: name of the back-end whose poses to use; None for the primary one.
         overwrite: replace existing files.
         options: resolution and limits.
+
+    Returns:
+        The written files with their metrics. On an error nothing is written, and existing files stay.
 
     Raises:
         StoreError: the folder holds no session.

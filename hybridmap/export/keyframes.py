@@ -62,7 +62,7 @@ class _Fan:
 
 
 def write_grid(view: SessionView, path: Path) -> list[Metric]:
-    """Write an occupancy grid: `path` (yaml) and a picture beside it (pgm).
+    """Write an occupancy grid: `path` (yaml) and a picture of the same name beside it (pgm); returns its size and areas.
 
     Pixels are 0 for occupied, 254 for free, 205 for unknown; the top row has the largest y.
 
@@ -96,7 +96,7 @@ def write_grid(view: SessionView, path: Path) -> list[Metric]:
 
 
 def build_grid(view: SessionView) -> OccupancyGrid:
-    """Build an occupancy grid: ray-cast every keyframe into log-odds.
+    """Build an occupancy grid in `map`: ray-cast every keyframe, at the pose of its node, into log-odds. Nothing is written.
 
     Raises:
         ExportError: the session's keyframes hold no obstacle, or the grid would be too large.
@@ -174,7 +174,7 @@ def _fan(seen: Seen, options: ExportOptions) -> _Fan:
 
 
 def write_cloud(view: SessionView, path: Path) -> list[Metric]:
-    """Write the points of all keyframes, reduced to one per voxel, as PLY or PCD, depending on the suffix of `path`.
+    """Write the points of all keyframes in `map`, m, reduced to one per voxel, as PLY or PCD by the suffix of `path`.
 
     Raises:
         ExportError: the session's keyframes hold no point.

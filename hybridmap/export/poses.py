@@ -28,7 +28,10 @@ _PLANAR = (3, 4, 2)
 
 
 def write_g2o_graph(view: SessionView, path: Path) -> list[Metric]:
-    """Write a g2o file: the nodes at the back-end's poses and all accepted edges, with 17 significant digits."""
+    """Write a g2o file with 17 significant digits: the nodes at the back-end's poses and all accepted edges.
+
+    Edges that the back-end rejected are among them.
+    """
     graph = view.experiences.pose_graph()
     write_g2o(path, graph, view.poses)
     return _counts("g2o", graph.n_nodes, graph.n_edges)
