@@ -25,18 +25,19 @@ HAIR = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Facts:
-    """What the kinds of reasons look at.
+    """What the rules look at: the map of one back-end, and what is known about its drive. What is unknown gives no reason.
 
     Attributes:
-        graph: the accepted edges, and the loops that were measured but are not accepted.
+        graph: the E accepted edges, and loops that were measured but are not accepted; of N nodes.
         in_map: (E,) which edges the map was made of: the accepted ones that its back-end did not reject.
-        plausible: (E,) which of the other loops may be right all the same: not those that failed a check by far.
-        solution: the map of the primary back-end; None if it never gave one.
+        plausible: (E,) which of the other loops may be right all the same: not those that failed a check by more than `HAIR`.
+        solution: the solution of the primary back-end, also without a map of its own; None if it never gave one.
         primary: name of that back-end.
         failure: why the primary back-end failed; empty if it did not.
         stamps_ns: (N,) stamps of the nodes; None if unknown.
         wheels: all odometry edges but those across a kidnapping, also the contradicted ones; None if unknown.
-        free_m: (N,) way to each node on which odometry alone knows the motion, in one direction or in all.
+        free_m: (N,) way to each node from the one before it on which odometry alone knows the motion, in one direction or in
+            all, m; elsewhere 0. None if unknown.
         breaks: nodes to which the robot seems not to have driven, without a kidnapping that was found there.
         lost_since: the first node since which the robot is lost; None if it is not.
         clock: the offset between the clocks of views and odometry; None if it was not looked for.
@@ -61,7 +62,10 @@ class Facts:
 
     @classmethod
     def of_graph(cls, graph: PoseGraph, solution: Solution) -> Facts:
-        """The facts of a graph without a drive, such as a file, and of a back-end's solution of it."""
+        """The facts of a graph without a drive, such as a file, and of a back-end's solution of it.
+
+        Loops that the back-end rejected are plausible; what only a drive knows stays unknown.
+        """
         kept = ~np.isin(graph.edge_ids, np.array(solution.report.rejected_edge_ids, dtype=np.int64))
         meant = _calibrated(graph, solution)
         return cls(graph=meant, in_map=kept, plausible=~kept, solution=solution, primary=solution.report.backend)
@@ -78,7 +82,12 @@ class Facts:
         clock: ClockOffset | None = None,
         lost: Mapping[str, tuple[int, int]] | None = None,
     ) -> Facts:
-        """The facts of a drive; the arguments beside the map are attributes of the same name."""
+        """The facts of a finished drive: of its map and of the solution of its primary back-end.
+
+        Args:
+            experiences: nodes and all edges of the map, whatever their status.
+            solution, primary, failure, lost_since, clock, lost: the attributes of the same names.
+        """
         edges = experiences.edges
         chosen = [
             number
@@ -112,16 +121,22 @@ class Facts:
 
     @property
     def poses(self) -> Array | None:
-        """(N, 3) the poses of the map; None if the primary back-end gave none but those that it began with."""
+        """(N, 3) poses of the nodes, m and rad; None if the primary back-end gave none but those that it began with."""
         return self.solution.poses if self.solution is not None and self.solution.report.status.has_map else None
 
     @property
     def kept(self) -> NDArray[np.bool_]:
-        """(E,) which loops hold the map together."""
+        """(E,) which edges are loops that the map was made of."""
         return np.asarray(self.in_map & self.graph.is_loop)
 
     def reason(self, kind: str, value: float = math.nan, limit: float = math.nan, **more: Any) -> Reason:
-        """A reason with the stamps of its node."""
+        """Make a reason; the stamps of its node are added, if known.
+
+        Args:
+            kind: a key of `KINDS`.
+            value, limit: the figure that decided and its limit; NaN: none.
+            more: other attributes of `Reason`.
+        """
         node, stamps = more.get("node"), self.stamps_ns
         if node is not None and stamps is not None:
             more |= {"stamp_ns": int(stamps[node]), "start_ns": int(stamps[0])}

@@ -35,7 +35,7 @@ class Kind:
     Attributes:
         verdict: the verdict on a map for which it holds.
         unit: unit of its figure and limit.
-        words: template of its words, with the attributes of `Reason`.
+        words: template of its words, with attributes of `Reason` in braces.
     """
 
     verdict: Verdict
@@ -165,11 +165,11 @@ class Reason:
 
     @property
     def time_s(self) -> float | None:
-        """Time of `node` since the first node, s."""
+        """Time of `node` since the first node, s; None if unknown."""
         return None if self.stamp_ns is None or self.start_ns is None else (self.stamp_ns - self.start_ns) / NS_PER_S
 
     def __str__(self) -> str:
-        """The reason in words, with its place."""
+        """The reason in words, with its nodes and their time, if it has any."""
         words = KINDS[self.kind].words.format_map({name: getattr(self, name) for name in _WORDS})
         if self.node is None:
             return words
@@ -193,10 +193,10 @@ class Reason:
 
 
 def verdict_of(reasons: Iterable[Reason]) -> Verdict:
-    """The verdict on a map with these reasons against it."""
+    """The verdict on a map with these reasons against it: that of the gravest; trusted without any."""
     return max((reason.verdict for reason in reasons), key=lambda verdict: verdict.grade, default=Verdict.TRUSTED)
 
 
 def said_of(reasons: Sequence[Reason]) -> dict[str, Any]:
-    """The keys `verdict` and `reasons` of a JSON object about a map."""
+    """The keys `verdict` and `reasons` of a JSON object about a map, with their values; the order of the reasons is kept."""
     return {"verdict": str(verdict_of(reasons)), "reasons": [reason.to_json() for reason in reasons]}

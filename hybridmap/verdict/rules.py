@@ -52,7 +52,7 @@ FREE_MAX_M = 10.0
 
 
 def no_map(facts: Facts) -> Iterable[Reason]:
-    """The primary back-end failed, diverged, returned the poses that it was given, or ended in another way than meant."""
+    """A reason if the primary back-end failed, diverged, ended in another way than meant, or the map is dead reckoning."""
     solution = facts.solution
     if solution is None or facts.failure:
         return [facts.reason("back-end failed", name=f"{facts.primary}: {facts.failure or 'it gave no map'}")]
@@ -70,10 +70,11 @@ def no_map(facts: Facts) -> Iterable[Reason]:
 
 
 def refused_together(facts: Facts) -> Iterable[Reason]:
-    """Loops that are not in the map although they agree with each other, and more of them than the map has against them.
+    """A reason for each group of loops that are not in the map and agree with each other, where no more loops of the map
+    contradict them.
 
-    The loops of a drive were verified by views, so that all groups of them count together. Of those in a file any share may be
-    false.
+    A group needs `TOGETHER` loops, or some more if there are many groups, and must move the map noticeably. The loops of a
+    drive were verified by views, so that all groups of them count together. Of those in a file any share may be false.
     """
     graph, poses = facts.graph, facts.poses
     if poses is None:
@@ -95,7 +96,7 @@ def _moves(rival: Rival) -> bool:
 
 
 def strained(facts: Facts) -> Iterable[Reason]:
-    """The map bends the chain of motion, is not where its own edges are met best, or they contradict each other even there.
+    """Reasons if the map bends the chain of motion, is not where its own edges are met best, or these contradict each other.
 
     Odometry that errs alike on every metre bends the chain too. Such a map is judged by its calibrated odometry, if the
     loops of either half of the drive find a calibration that straightens the whole chain.
@@ -156,7 +157,7 @@ def alone(facts: Facts) -> Iterable[Reason]:
 
 
 def none_kept(facts: Facts) -> Iterable[Reason]:
-    """The back-end rejected nearly all loops that the front-end had accepted."""
+    """A reason if the back-end rejected nearly all loops that the front-end had accepted."""
     if facts.solution is None or facts.poses is None:
         return []
     rejected, kept = len(facts.solution.report.rejected_edge_ids), int(np.count_nonzero(facts.kept))
@@ -165,7 +166,7 @@ def none_kept(facts: Facts) -> Iterable[Reason]:
 
 
 def against_wheels(facts: Facts) -> Iterable[Reason]:
-    """Where no loop spans the way, the map contradicts dead reckoning, and nothing tells which of them is right."""
+    """A reason for each way that no loop of the map spans where map and dead reckoning contradict each other."""
     if facts.poses is None or facts.wheels is None:
         return
     chain = chain_of(facts.wheels)
@@ -186,7 +187,7 @@ def _runs(mask: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
 
 
 def contradicted_odometry(facts: Facts) -> Iterable[Reason]:
-    """Registrations contradicted many odometry edges."""
+    """A reason if registrations contradicted more than the share `DROPPED_MAX` of the odometry edges."""
     if facts.wheels is None or not facts.wheels.n_edges:
         return []
     dropped = facts.wheels.targets[~np.isin(facts.wheels.edge_ids, facts.graph.edge_ids)]
@@ -198,7 +199,7 @@ def contradicted_odometry(facts: Facts) -> Iterable[Reason]:
 
 
 def clock_offset(facts: Facts) -> Iterable[Reason]:
-    """Scans or frames are stamped later or earlier than odometry of the same moment, and the map was not corrected for it."""
+    """A reason if scans or frames are stamped later or earlier than odometry, and the map was not corrected for it."""
     clock = facts.clock
     if clock is None:
         return []
@@ -209,7 +210,7 @@ def clock_offset(facts: Facts) -> Iterable[Reason]:
 
 
 def not_held(facts: Facts) -> Iterable[Reason]:
-    """Long ways on which odometry alone knows the motion, and which no loop of the map spans; nodes without weight."""
+    """A reason for each long way that odometry alone knows and no loop spans, and one if nodes hang on edges without weight."""
     report = None if facts.solution is None else facts.solution.report
     if report is not None and report.hanging_nodes:
         yield facts.reason("nodes without weight", report.hanging_nodes, 0)
@@ -222,7 +223,7 @@ def not_held(facts: Facts) -> Iterable[Reason]:
 
 
 def broken(facts: Facts) -> Iterable[Reason]:
-    """The motion seems broken in more places than kidnappings were found."""
+    """A reason if the motion seems broken in more than `BREAKS_MAX` places where no kidnapping was found."""
     if len(facts.breaks) <= BREAKS_MAX:
         return []
     first, last = facts.breaks[0], facts.breaks[-1]
@@ -230,7 +231,7 @@ def broken(facts: Facts) -> Iterable[Reason]:
 
 
 def lost(facts: Facts) -> Iterable[Reason]:
-    """The robot was not localised at the end."""
+    """A reason if the robot was not localised at the end."""
     if facts.lost_since is None:
         return []
     nodes = facts.graph.n_nodes
@@ -238,7 +239,7 @@ def lost(facts: Facts) -> Iterable[Reason]:
 
 
 def messages_lost(facts: Facts) -> Iterable[Reason]:
-    """Messages of the recording are missing or damaged."""
+    """A reason for each topic of the recording with missing or damaged messages."""
     return [
         facts.reason("messages lost", 100.0 * gone / max(every, 1), 0, count=gone, name=name)
         for name, (gone, every) in facts.lost.items()
@@ -264,6 +265,6 @@ RULES: tuple[Callable[[Facts], Iterable[Reason]], ...] = (
 
 
 def reasons_of(facts: Facts) -> tuple[Reason, ...]:
-    """Every reason against a map, the gravest first."""
+    """Every reason against a map by all rules: those of a failed map first, else in the order of `RULES`."""
     found = [reason for rule in RULES for reason in rule(facts)]
     return tuple(sorted(found, key=lambda reason: reason.verdict is not Verdict.FAILED))
