@@ -6,7 +6,7 @@ import io
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from typing import Annotated, NoReturn
 
@@ -27,6 +27,8 @@ from hybridmap.cli.verify import verify
 from hybridmap.errors import ConfigError, HybridMapError
 
 _INTERRUPTED = 130  # what typer makes of Ctrl-C
+_EVERY = {2: "a wrong input or an error, in one line on standard error", _INTERRUPTED: "interrupted by Ctrl-C"}
+"""Exit codes of every command."""
 
 app = typer.Typer(
     name="hybridmap",
@@ -62,22 +64,54 @@ def _options(
     os.environ["HYBRIDMAP_QUIET"] = "1" if quiet else ""
 
 
-app.command("demo")(demo)
-app.command("map")(map_source)
-app.command("evaluate")(evaluate)
-app.command("explain")(explain)
-app.command("export")(export)
-app.command("optimize")(optimize)
-app.command("compare")(compare)
-app.command("study")(study)
-app.command("calibrate")(calibrate)
-app.command("simulate")(simulate)
-app.command("inspect")(inspect)
-app.command("verify")(verify)
+_COMMANDS: dict[str, tuple[Callable[..., None], dict[int, str]]] = {
+    "demo": (demo, {0: "the session is written, whatever its verdict"}),
+    "map": (
+        map_source,
+        {0: "the session is written, whatever its verdict", 3: "it is written, but --strict found lost or skipped messages"},
+    ),
+    "evaluate": (evaluate, {0: "evaluated, even if metrics.json or the page cannot be written, which is only warned of"}),
+    "explain": (explain, {0: "explained"}),
+    "export": (export, {0: "written"}),
+    "optimize": (
+        optimize,
+        {
+            0: "solved, whatever the verdict",
+            1: "the back-end diverged or found the graph singular: it is shown, and no file is written",
+            2: f"the back-end gave up, or {_EVERY[2]}",
+        },
+    ),
+    "compare": (compare, {0: "compared, even if a back-end failed"}),
+    "study": (
+        study,
+        {0: "no bar (limit) of the study is missed", 1: "a bar is missed, and everything is written all the same"},
+    ),
+    "calibrate": (
+        calibrate,
+        {0: "estimated, whether or not a value changes", 2: f"the drives do not determine the values, or {_EVERY[2]}"},
+    ),
+    "simulate": (simulate, {0: "written"}),
+    "inspect": (inspect, {0: "inspected, even if it cannot be mapped", 3: "inspected, but --strict found lost messages"}),
+    "verify": (
+        verify,
+        {0: "every value keeps its limit", 1: "a value misses its limit, and everything is written all the same"},
+    ),
+}
+"""Name -> the command, and what its exit codes mean, beside those of every command."""
+
+for _name, (_command, _codes) in _COMMANDS.items():
+    _said = "; ".join(f"{code}: {meaning}" for code, meaning in sorted((_EVERY | _codes).items()))
+    app.command(_name, epilog=f"Exit codes: {_said}.")(_command)
 
 
 def main() -> None:
-    """Run the command line. Every error is printed as one line on standard error, with exit code 2."""
+    """Run the command line on `sys.argv`; it never returns.
+
+    Every error that the user can do something about is one line on standard error, with exit code 2.
+
+    Raises:
+        SystemExit: always, with the exit code (see the help of each command).
+    """
     os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")  # pictures are small: a second thread costs more than it gives
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # a damaged picture is reported by our own line
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 26))  # as `streams.cameras.MOST_PIXELS`, for every format

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from hybridmap.cli.options import AsJson
+from hybridmap.cli.options import AsJson, ReplaceFile
 
 _Leg = Annotated[
     float | None,
@@ -18,31 +18,50 @@ _Leg = Annotated[
 
 _Reference = Annotated[
     list[Path] | None,
-    typer.Option(metavar="GT.tum", help="Ground truth of base_link (TUM format), one per session, in the same order."),
+    typer.Option(
+        metavar="GT.tum",
+        help="Ground truth of base_link (TUM format); repeat the option, one per session, in the same order.",
+    ),
+]
+
+_Estimator = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="Method on loop closures, so not with --reference: `alternating` (default), or `joint`, which takes one session.",
+    ),
+]
+
+_Out = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE.yaml",
+        help="Write the configuration of the sessions, corrected as said above, to this file. Default: nothing is written.",
+    ),
 ]
 
 
 def calibrate(
     folders: Annotated[
         list[Path],
-        typer.Argument(metavar="DIR...", help="Session folder. Several sessions of one robot give one joint estimate."),
+        typer.Argument(metavar="DIR...", help="Session folder. Several sessions of one robot give one estimate for all."),
     ],
     reference: _Reference = None,
-    estimator: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Method if no reference is given: `alternating` (default) or `joint`.")
-    ] = None,
+    estimator: _Estimator = None,
     leg: _Leg = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE.yaml", help="Write the session's configuration, corrected, to this file.")
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+    out: _Out = None,
+    overwrite: ReplaceFile = False,
     as_json: AsJson = False,
 ) -> None:
-    """Estimate the systematic errors of wheel odometry: gain, turn gain, heading bias (rad/m), with standard deviations.
+    """Estimate the systematic errors of wheel odometry: gain, turn gain, heading bias (rad/m) and delay (s).
 
-    The estimate comes from the loop closures of the sessions, or from reference trajectories if they are given.
-    --out writes the session's configuration. If one of its values differs from the estimate by more than three
-    standard deviations, all of them are replaced by the estimate; otherwise they stay as they are.
+    The estimate comes from the loop closures of the sessions, or from reference trajectories if they are given. It is
+    printed, with standard deviations; the sessions stay as they are.
+
+    --out writes the configuration that all sessions share. If gain, turn gain or heading bias in use differs from the
+    estimate by more than three standard deviations, all three are replaced, but for those that the drives do not determine.
+    The delay is decided by itself: its estimate is what is left beside the delay in use, and is added to that if it is more
+    than three standard deviations from 0. Otherwise they are written as they are.
     """
     from hybridmap.calibration.estimate import calibrated, changes, metrics_of, verdict
     from hybridmap.calibration.sessions import common_tree, estimate_of, read_drive, require_options

@@ -28,6 +28,8 @@ class OpenedSource:
 def parse_settings(settings: list[str] | None) -> dict[str, Any]:
     """Read the values of `--set`: `["nodes.distance_m=0.3"]` becomes `{"nodes.distance_m": 0.3}`; values are read as YAML.
 
+    None gives {}. Of a key given twice the last value counts. Whether a key exists is not checked.
+
     Raises:
         ConfigError: an entry has no `=` or no key, or its value is not YAML.
     """
@@ -57,9 +59,9 @@ def choose(
     Args:
         source: path of a recording, or name of a simulated world.
         config_name: name or path of a configuration.
-        overrides: dotted key -> value, applied last.
+        overrides: dotted key -> value; they win over the configuration.
         start_s, end_s: the part of the source to read, seconds after its first stamp.
-        skip_damaged: leave out damaged scans and pictures, and count them.
+        skip_damaged: leave out damaged scans and pictures while the stream is read, and count them in its report.
 
     Raises:
         StreamError: the source cannot be opened.

@@ -22,11 +22,19 @@ _DEFAULT = "odometry,relaxation-ratslam,gtsam-lm,gtsam-cauchy,gtsam-gnc"
 _WIDTH = 180  # columns of a table that goes into a file
 _ERRORS = {"ate_rmse": "ATE (m)", "relation_trans_mean": "relations (m)", "relation_loop_trans_mean": "of loops (m)"}
 
+_Out = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        help="Folder for maps.png and comparison.html: new, empty, or with --overwrite one with an earlier comparison."
+        " Default: nothing is written.",
+    ),
+]
 _Batch = Annotated[
     bool,
     typer.Option(
         "--batch",
-        help="Solve the whole graph at once, from dead reckoning or from the poses in the file. Default for files.",
+        help="Solve the whole graph at once, from dead reckoning (session) or from the poses of the file. Default for files.",
     ),
 ]
 _Incremental = Annotated[
@@ -51,7 +59,7 @@ def compare(
     backends: Annotated[
         str, typer.Option(metavar="A,B,...", help="Back-ends, separated by commas. An unknown name gives the list.")
     ] = _DEFAULT,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for maps.png and comparison.html.")] = None,
+    out: _Out = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing comparison.")] = False,
     batch: _Batch = False,
     incremental: _Incremental = False,
@@ -64,7 +72,7 @@ def compare(
     """Compare back-ends on one graph: chi2, status, iterations, CPU seconds, rejected loops, and proof of optimality if found.
 
     A session with ground truth or verified relations also gets errors (m). A session's graph is solved in batch and
-    incrementally: two rows per back-end. A back-end that fails keeps its row, with the reason.
+    incrementally: two rows per back-end. A back-end that fails keeps its row, with the reason. The input is not changed.
     """
     from hybridmap.backends import comparison
     from hybridmap.cli.graphs import open_graph, settings_of

@@ -7,20 +7,23 @@ from typing import Annotated
 
 import typer
 
-from hybridmap.cli.options import AsJson
+from hybridmap.cli.options import OUT, SEED, AsJson
 from hybridmap.cli.show import emit
 
 _SHOWN = ("nodes", "loops_accepted", "travel", "duration", "largest_correction", "ate_rmse", "ate_rmse_online", "drift", "chi2")
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Session folder to write.")] = Path("hybridmap-demo"),
+    out: Annotated[Path, typer.Option(help=OUT)] = Path("hybridmap-demo"),
     world: Annotated[str, typer.Option(help="World to simulate: lab, office, corridor, corridor-landmarks or campus.")] = "lab",
-    seed: Annotated[int, typer.Option(help="Random seed of the drive and its noise.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help=SEED, min=0)] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate a drive, map it with relaxation and GTSAM on the same graph, and write a session folder. Needs no data."""
+    """Simulate a drive, map it with relaxation and GTSAM on the same graph, and write a session folder. Needs no data.
+
+    The folder is as by `hybridmap map`: map, trajectories, ground truth, configuration, metrics.json and the page report.html.
+    """
     from hybridmap.cli.choose import choose
     from hybridmap.cli.map import map_and_report
 

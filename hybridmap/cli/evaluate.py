@@ -37,7 +37,8 @@ def evaluate(
     Precision: share of the accepted loops whose relative pose is within 1 m and 15 deg of the truth.
     Recall: share of the revisits that were closed. A revisit is a node within 1 m and 30 deg of one at least 10 s older. It
     counts as closed if a correct loop starts at most 3 nodes away.
-    The results are printed and stored in metrics.json, and the session's page is rewritten.
+    The results are printed and stored in the session's metrics.json, where they replace earlier ones of the same name; its
+    page report.html is rewritten. Ground truth or relations are needed.
     """
     from hybridmap.cli.show import emit
     from hybridmap.errors import OutputError

@@ -21,18 +21,23 @@ MOST_RANKED, MOST_LATER = 8, 12
 
 def explain(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Session folder, as `hybridmap map` writes it.")],
-    node: Annotated[int | None, typer.Option(metavar="N", help="Explain the decisions at this node; 0 is the first.")] = None,
+    node: Annotated[
+        int | None, typer.Option(metavar="N", help="Explain the decisions at this node; 0 is the first. Not with --frame.")
+    ] = None,
     frame: Annotated[
         float | None,
         typer.Option(
-            metavar="T", help="Explain the decisions at this time: seconds from the start of the recording, or a stamp, s."
+            metavar="T",
+            help="Explain the decisions at the frame nearest to this time: seconds from the start of the recording, or, from"
+            " 1e6 on, a stamp in seconds. Not with --node.",
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Explain the decisions at a node or a frame: why a node was made or not, and why each loop was closed or not.
 
-    Shows the candidates, each check with its value and limit (m, deg), the verdict, and what would have changed it.
+    Give exactly one of --node and --frame. Shows the candidates, each check with its value and limit (m, deg), whether the
+    loop was accepted, and what would have changed that. Reads the session's map file; writes nothing.
     """
     from hybridmap.evaluate.explain import Explainer
     from hybridmap.metrics import to_json

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hybridmap.cli.options import AsJson
+from hybridmap.cli.options import AsJson, ReplaceFile
 from hybridmap.export import FORMATS
 
 _FORMATS = ", ".join(f"{name} ({entry.description})" for name, entry in FORMATS.items())
@@ -16,11 +16,16 @@ _FORMATS = ", ".join(f"{name} ({entry.description})" for name, entry in FORMATS.
 def export(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Session folder, as `hybridmap map` writes it.")],
     format_name: Annotated[str, typer.Option("--format", metavar="F", help=_FORMATS)],
-    out: Annotated[Path, typer.Option(metavar="PATH", help="File to write; `grid` writes a .yaml and a .pgm of this name.")],
+    out: Annotated[
+        Path,
+        typer.Option(metavar="PATH", help="File to write; `grid` writes a .yaml and a .pgm of this name. See --overwrite."),
+    ],
     backend: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME", help="Back-end whose poses to use; an unknown name gives the list. Default: the primary one."
+            metavar="NAME",
+            help="Back-end whose poses to use; an unknown name gives the list. If the session has no result of it, its graph is"
+            " solved now. Default: the primary one.",
         ),
     ] = None,
     resolution: Annotated[float, typer.Option(min=0.001, max=10.0, help="Cell size of the occupancy grid, m.")] = 0.05,
@@ -28,12 +33,16 @@ def export(
         float, typer.Option(min=0.001, max=10.0, help="Voxel size of point clouds, m: one point is kept per voxel.")
     ] = 0.02,
     max_depth: Annotated[
-        float, typer.Option(min=0.1, help="Point clouds and grid: larger depth of a camera is left out, m.")
+        float,
+        typer.Option(min=0.1, help="Point clouds and grid: larger depth of a camera is left out, m; a laser is not limited."),
     ] = 5.0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
+    overwrite: ReplaceFile = False,
     as_json: AsJson = False,
 ) -> None:
-    """Export trajectory, pose graph, point cloud or occupancy grid, in the map frame of one back-end; m and rad."""
+    """Export trajectory, pose graph, point cloud or occupancy grid, in the map frame of one back-end; m and rad.
+
+    The session is not changed, and none of its own files is overwritten.
+    """
     from hybridmap.cli.show import emit
     from hybridmap.export.formats import ExportOptions, export_session
 

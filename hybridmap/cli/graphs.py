@@ -27,7 +27,7 @@ class GraphSource:
         graph: nodes and accepted edges.
         is_session: whether `path` is a session folder.
         start: origin of the graph's initial poses, in words (`dead reckoning`).
-        head: facts about the graph for the JSON output.
+        head: facts about the graph for the JSON output, by key: `graph`, `nodes`, `edges`, `loops`, and more of a session.
         kidnapped: the places where the robot was kidnapped; empty for a graph file.
     """
 
@@ -69,8 +69,8 @@ def settings_of(source: GraphSource, config: str | None, setting: list[str] | No
     """Settings of the back-ends for a graph.
 
     Args:
-        source: the graph; a session brings its own settings, which are used if `config` is None.
-        config: name or path of a configuration.
+        source: the graph; a session brings its own settings, which are used if `config` is None. A file gets the defaults.
+        config: name or path of a configuration; None: none.
         setting: `KEY=VALUE` entries of `--set`, applied last.
 
     Raises:

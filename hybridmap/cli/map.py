@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hybridmap.cli.options import AsJson, OdometryFile, SensorSetting, Source, Topic, sensor_settings
+from hybridmap.cli.options import OUT, SEED, AsJson, OdometryFile, SensorSetting, Source, Topic, sensor_settings
 from hybridmap.cli.show import emit, progress
 from hybridmap.errors import EvaluationError
 
@@ -20,21 +20,37 @@ LOST = 3
 _Configuration = Annotated[
     str | None,
     typer.Option(
-        help="Configuration: a name (an unknown one gives the list) or a YAML file. Default: chosen by the sensors found."
+        help="Configuration: a name (an unknown one gives the list) or a YAML file. Default: that of the simulated world, or"
+        " the one for the sensors found."
     ),
 ]
 _Backends = Annotated[
     list[str] | None,
     typer.Option(
         help="Back-end; may be given several times, the first sets the robot's pose (map -> odom)."
-        " An unknown name gives the list."
+        " An unknown name gives the list. Default: those of the configuration."
+    ),
+]
+_SkipDamaged = Annotated[
+    bool,
+    typer.Option(
+        "--skip-damaged",
+        help="Skip damaged scans and pictures, and count them as lost. Without it the first one is an error, and no session is"
+        " written.",
+    ),
+]
+_Strict = Annotated[
+    bool,
+    typer.Option(
+        "--strict",
+        help="Exit code 3 if messages of the recording were lost or skipped as damaged. The session is written all the same.",
     ),
 ]
 
 
 def map_source(
     source: Source,
-    out: Annotated[Path, typer.Option(help="Session folder to write.")],
+    out: Annotated[Path, typer.Option(help=OUT)],
     config: _Configuration = None,
     backend: _Backends = None,
     start: Annotated[float | None, typer.Option(help="Start this many seconds after the first stamp.")] = None,
@@ -45,18 +61,19 @@ def map_source(
     depth_topic: Topic = None,
     camera_info_topic: Topic = None,
     odometry_file: OdometryFile = None,
-    seed: Annotated[int | None, typer.Option(help="Random seed of the simulated sensors and of RANSAC.", min=0)] = None,
+    seed: Annotated[int | None, typer.Option(help=f"{SEED} Default: that of the configuration.", min=0)] = None,
     setting: SensorSetting = None,
-    skip_damaged: Annotated[
-        bool, typer.Option("--skip-damaged", help="Skip damaged scans and pictures, and count them, instead of ending there.")
-    ] = False,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit code 3 if messages of the recording were lost.")] = False,
+    skip_damaged: _SkipDamaged = False,
+    strict: _Strict = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Map a recording or a simulated world. Writes the map, the trajectories and a page into one session folder.
+    """Map a recording or a simulated world into a session folder.
 
-    Messages that the recording states to hold but that cannot be read are warned of, and counted in `metrics.json` (`lost`).
+    The folder holds the map (map.db), the trajectories, the resolved configuration, metrics.json with the verdict on the map,
+    and the page report.html. Messages that the recording states to hold but that cannot be read are left out, warned of, and
+    counted in metrics.json (`lost`). On an error nothing is written, and a session that was to be replaced stays. Ctrl-C does
+    the same, but in a new folder the map so far is kept.
     """
     from hybridmap.cli.choose import choose, parse_settings
 
@@ -82,7 +99,10 @@ def map_source(
 
 
 def map_and_report(stream: Any, config: Any, out: Path, *, overwrite: bool) -> tuple[dict[str, Any], list[Any]]:
-    """Map a stream into the folder `out`, evaluate the map if ground truth is known, and write the page.
+    """Map a stream into the session folder `out`, evaluate the map if ground truth is known, and write the page.
+
+    With `overwrite` a session that exists is replaced. What `session.run` raises is passed on; that the map could not be
+    evaluated is only logged.
 
     Returns:
         The two parts of `metrics.json`: the facts about the run, and the list of metrics.

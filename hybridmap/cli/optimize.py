@@ -8,11 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hybridmap.cli.options import AsJson, SolverConfig, SolverSetting
+from hybridmap.cli.options import AsJson, ReplaceFile, SolverConfig, SolverSetting
 
 if TYPE_CHECKING:
     from hybridmap.backends.base import Backend, Solution
     from hybridmap.cli.graphs import GraphSource
+
+_Out = Annotated[
+    Path | None, typer.Option(metavar="FILE.g2o", help="File for the optimised graph (m, rad). Default: nothing is written.")
+]
 
 
 def optimize(
@@ -20,17 +24,18 @@ def optimize(
     backend: Annotated[
         str, typer.Option(metavar="NAME", help="Back-end, e.g. gtsam-lm. An unknown name gives the list.")
     ] = "gtsam-lm",
-    out: Annotated[Path | None, typer.Option(metavar="FILE.g2o", help="File for the optimised graph (m, rad).")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+    out: _Out = None,
+    overwrite: ReplaceFile = False,
     config: SolverConfig = None,
     setting: SolverSetting = None,
     as_json: AsJson = False,
 ) -> None:
     """Optimise a pose graph. Shows chi2 before and after, status, iterations, CPU seconds, proof of optimality, and a verdict.
 
-    The verdict is on the graph alone: what a drive knew beside it, such as lost messages, is in the verdict of `map`.
+    The verdict is on the graph alone: what a drive knew beside it, such as lost messages, is in the verdict of `map`. It does
+    not change the exit code.
 
-    If the back-end fails, diverges or finds the graph singular, no file is written and the exit code is 1.
+    If the back-end fails, diverges or finds the graph singular, no file is written. The graph that is read is not changed.
     """
     from hybridmap.backends import create
     from hybridmap.backends.comparison import Row, metrics_of

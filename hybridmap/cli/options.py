@@ -8,6 +8,12 @@ from typing import Annotated
 
 import typer
 
+OUT = "Session folder to write: new, empty, or with --overwrite one that holds a session. What holds anything else is refused."
+SEED = (
+    "Random seed of RANSAC and of the errors of simulated sensors. The simulated world and drive are the same for every seed,"
+    " but for campus, whose layout is drawn."
+)
+
 Source = Annotated[
     str,
     typer.Argument(
@@ -29,11 +35,13 @@ SolverConfig = Annotated[
     str | None,
     typer.Option(
         help="Configuration with the settings of the back-ends: a name (an unknown one gives the list) or a YAML file."
+        " Default: that of the session; for a file the defaults."
     ),
 ]
 SolverSetting = Annotated[
     list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch. Keys: docs/configuration.md.")
 ]
+ReplaceFile = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file, which is otherwise refused.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 
 

@@ -16,20 +16,21 @@ if TYPE_CHECKING:
 
 
 class Advance(Protocol):
-    """Function that is called as work progresses, with the units of work done and, if known, the total."""
+    """Function that is called as work progresses, with the units of work done so far and, if known, the total."""
 
     def __call__(self, done: int, total: int | None = None) -> None:
-        """`done` units of `total`."""
+        """`done` units of `total` are done; a total of None is not known."""
 
 
 def emit(head: dict[str, Any], metrics: Iterable[Metric], *, as_json: bool, title: str = "") -> None:
     """Print results on standard output: one JSON object, or tables with units and the remarks of the run.
 
     Args:
-        head: facts about the run; below a table only its `remarks`, `reasons` and `verdict` are shown.
+        head: facts about the run, the keys of the JSON object beside `metrics`. As text only its `remarks`, `reasons` and
+            `verdict` are shown, below the tables; metrics of its `backends` get a table with a column for each.
         metrics: the values to print.
         as_json: print JSON.
-        title: title of the tables.
+        title: title of the tables; not in JSON.
     """
     rows = list(metrics)
     if as_json:
@@ -105,7 +106,7 @@ def progress(label: str) -> Iterator[Advance]:
     """Show a progress bar on standard error, unless standard error is no terminal or `-q` was given.
 
     Yields:
-        The function to call as work progresses.
+        The function to call as work progresses; without a bar it does nothing.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn

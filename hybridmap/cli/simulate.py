@@ -19,43 +19,60 @@ Format = Literal["rosbag1", "mcap", "db3", "tum"]
 CARRIED_M = 20.0
 _FORMAT_OF_SUFFIX: dict[str, Format] = {".bag": "rosbag1", ".mcap": "mcap", ".db3": "db3"}
 
+_Out = Annotated[
+    Path,
+    typer.Option(
+        help="File or folder to write. The suffix .bag, .mcap or .db3 chooses the format; otherwise a TUM folder. What is there"
+        " already is refused without --overwrite."
+    ),
+]
+_Config = Annotated[
+    str | None,
+    typer.Option(help="Configuration: a name (an unknown one gives the list) or a YAML file. Default: that of the world."),
+]
+_Seed = Annotated[
+    int | None,
+    typer.Option(
+        help="Random seed of the errors of the sensors. World and drive are the same for every seed, but for campus, whose"
+        " layout is drawn. Default: that of the configuration.",
+        min=0,
+    ),
+]
+_Duration = Annotated[float | None, typer.Option(help="Stop the drive after this many seconds. Default: all of it.")]
 _Kidnap = Annotated[
     bool,
     typer.Option(
-        "--kidnap", help="Kidnap the robot: carry it 20 m (simulation.carried_m) to a visited place while its sensors are off."
+        "--kidnap",
+        help="Kidnap the robot: carry it 20 m (simulation.carried_m) to a visited place while its sensors are off.",
     ),
+]
+_ClockOffset = Annotated[
+    float | None,
+    typer.Option(help="Seconds by which scans and frames are stamped later than odometry (simulation.clock_offset_s)."),
 ]
 
 
 def simulate(
     world: Annotated[str, typer.Argument(help="World: lab, office, corridor, corridor-landmarks or campus (outdoors).")],
-    out: Annotated[
-        Path,
-        typer.Option(
-            help="File or folder to write. The suffix .bag, .mcap or .db3 chooses the format; otherwise a TUM folder."
-        ),
-    ],
+    out: _Out,
     format_: Annotated[Format | None, typer.Option("--format", help="Format to write, regardless of the suffix.")] = None,
-    config: Annotated[
-        str | None,
-        typer.Option(help="Configuration: a name (an unknown one gives the list) or a YAML file. Default: that of the world."),
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(help="Random seed of the sensor errors, and of the layout of campus.", min=0)
-    ] = None,
-    duration: Annotated[float | None, typer.Option(help="Stop the drive after this many seconds.")] = None,
+    config: _Config = None,
+    seed: _Seed = None,
+    duration: _Duration = None,
     kidnap: _Kidnap = False,
-    clock_offset: Annotated[
-        float | None,
-        typer.Option(help="Seconds by which scans and frames are stamped later than odometry (simulation.clock_offset_s)."),
-    ] = None,
+    clock_offset: _ClockOffset = None,
     setting: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. simulation.sensors=laser. Keys: docs/configuration.md.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing recording.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an existing file, or a folder with a recording.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate a drive with wheel odometry and an RGB-D camera or a laser. Writes a bag or TUM folder with ground truth."""
+    """Simulate a drive with wheel odometry and an RGB-D camera or a laser. Writes a bag or TUM folder with ground truth.
+
+    Shows the length of the drive, the error of its odometry, and how many messages there are. On an error nothing is written.
+    """
     from hybridmap.cli.choose import parse_settings
     from hybridmap.config import Config
     from hybridmap.simulation import SimulatedStream

@@ -27,7 +27,12 @@ def study(
         ),
     ],
     out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder for the results. An existing one of the same study is continued.")
+        Path,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for the results. In an existing study folder, stored results of the same cells are used again, and its"
+            " tables and page are replaced. One with other files is refused.",
+        ),
     ],
     workers: Annotated[
         int, typer.Option(min=0, help="Worker processes on this machine, one thread each; 0: compute in this process.")
@@ -45,10 +50,12 @@ def study(
 ) -> None:
     """Run a study: map or solve every combination of source, setting, back-end, false loops and seed; compare the back-ends.
 
-    Metrics: error against ground truth, verified relations or the optimum without false loops; chi2; accepted false loops;
-    lost true loops. Differences between back-ends are paired by seed. Writes tables and a page.
-    An interrupted study continues when it is run again. A run that fails keeps its row, with the reason.
-    The exit code is 1 if a result misses a limit (bar) stated in the study.
+    A cell is one such combination. Metrics: error against ground truth, verified relations or the optimum without false loops;
+    chi2; accepted false loops; lost true loops. Differences between back-ends are paired by seed.
+
+    Writes study.yaml, tables (cells.csv, timings.csv, summary.csv, bars.csv), metrics.json, the page report.html, and every
+    result as soon as it is known: an interrupted study continues when it is run again. A cell that fails keeps its row, with
+    the reason. The exit code tells only whether a limit (bar) of the study is missed; a cell without the figure misses it.
     """
     _one_thread()
     from hybridmap.cli.choose import parse_settings

@@ -11,7 +11,13 @@ from hybridmap.cli.options import AsJson
 
 
 def verify(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for verify.html and metrics.json.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for verify.html and metrics.json: new, empty, or with --overwrite one with an earlier verification.",
+        ),
+    ],
     seed: Annotated[int, typer.Option(help="Random seed of drives, sampled cells and noise.", min=0)] = 0,
     setting: Annotated[
         list[str] | None,
@@ -20,9 +26,9 @@ def verify(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing verification.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Verify the head-direction, band, grid and place cells against stated limits (m, rad, deg, %). Writes a page.
+    """Verify the head-direction, band, grid and place cells against stated limits (m, rad, deg, %). Needs no data.
 
-    Needs no data. The exit code is 1 if a value misses its limit.
+    Writes a table of the values (metrics.json) and a page with pictures (verify.html), also if a value misses its limit.
     """
     from hybridmap.cli.choose import parse_settings
     from hybridmap.cli.show import emit, progress
