@@ -43,7 +43,7 @@ def explain(
     from hybridmap.metrics import to_json
 
     if (node is None) == (frame is None):
-        raise ConfigError("explain: expected either --node N or --frame T")
+        raise ConfigError(f"explain: expected either --node N or --frame T, found {'none' if node is None else 'both'}")
     with Explainer(folder) as explainer:
         instant = explainer.frame(frame) if frame is not None else None
         number = node if instant is None else instant.at_node if instant.made else None

@@ -107,7 +107,7 @@ def open_view(folder: Path, backend: str | None, options: ExportOptions) -> Sess
             raise ExportError(f"{folder}: no result of back-end {chosen!r}; --backend can be: {', '.join(known)}")
         view = SessionView(store, chosen, options)
         if len(view.experiences) == 0:
-            raise ExportError(f"{folder}: the map holds no node")
+            raise ExportError(f"{folder}: the map holds no node, so there is nothing to export")
     except BaseException:
         store.close()
         raise

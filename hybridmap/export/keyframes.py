@@ -99,11 +99,11 @@ def build_grid(view: SessionView) -> OccupancyGrid:
     """Build an occupancy grid in `map`: ray-cast every keyframe, at the pose of its node, into log-odds. Nothing is written.
 
     Raises:
-        ExportError: the session's keyframes hold no obstacle, or the grid would be too large.
+        ExportError: the session's keyframes hold no obstacle within the limits of the options, or the grid would be too large.
     """
     fans = list(_fans(view))
     if not fans:
-        raise ExportError("grid: the session's keyframes hold no obstacle; map with a sensor that measures distances")
+        raise ExportError(f"grid: the session's keyframes hold no obstacle{_far(view.options)}")
     resolution = view.options.resolution_m
     corners = np.concatenate([np.vstack([fan.origin[None], fan.ends]) for fan in fans])
     low = np.floor(corners.min(axis=0) / resolution).astype(np.int64) - _MARGIN_CELLS
@@ -114,6 +114,11 @@ def build_grid(view: SessionView) -> OccupancyGrid:
     for fan in fans:
         _cast(log_odds, fan, low, resolution)
     return OccupancyGrid(log_odds, low * resolution, resolution)
+
+
+def _far(options: ExportOptions) -> str:
+    """What to do where no keyframe has a point."""
+    return f" up to {options.max_depth_m:g} m; map with a laser or a depth camera, or give a larger --max-depth"
 
 
 def _cast(log_odds: NDArray[np.float32], fan: _Fan, low: NDArray[np.int64], resolution: float) -> None:
@@ -201,7 +206,7 @@ def merged_cloud(view: SessionView) -> Any:
         if number % _MERGE_EVERY == _MERGE_EVERY - 1:
             merged = merged.voxel_down_sample(view.options.voxel_m)
     if len(merged.points) == 0:
-        raise ExportError("cloud: the session's keyframes hold no point; map with a sensor that measures distances")
+        raise ExportError(f"cloud: the session's keyframes hold no point{_far(view.options)}")
     return merged.voxel_down_sample(view.options.voxel_m)
 
 

@@ -135,6 +135,8 @@ def solved(rows: Sequence[Row]) -> dict[str, Array]:
 def overlay(rows: Sequence[Row], truth: Sequence[Array], kidnapped: Sequence[Kidnapping]) -> str:
     """Draw the maps of all results in one frame, each as a line through its nodes, over the true path if known.
 
+    The picture shows all maps but dead reckoning whole, which may run out of it.
+
     Args:
         rows: one result per back-end and way of solving.
         truth: pieces (P, 3) of the true path, m and rad; empty if unknown.

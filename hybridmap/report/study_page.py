@@ -97,12 +97,12 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """Runs of a study that gave no solution and ended with the same status and message.
+    """Cells of a study that did not end well, with the same status and message.
 
     Attributes:
-        status: status with which the runs ended, such as `diverged`.
-        where, backend: the conditions and the back-ends of these runs, as text.
-        count: number of runs.
+        status: status with which the cells ended, such as `diverged`.
+        where, backend: the groups and the back-ends of these cells, as text; of many only the first.
+        count: number of cells.
         message: message of the first one.
     """
 
@@ -284,7 +284,10 @@ def _mean(found: Interval, cells: int) -> str:
 
 
 def remarks(study: Study) -> list[Remark]:
-    """The cells of a study that gave no solution; those of one status whose messages differ only in numbers are one remark."""
+    """The cells of a study that did not end well, such as `failed`, `diverged`, `stalled` or `crashed`, in groups.
+
+    Cells of one status whose messages differ only in numbers are one remark.
+    """
     found: dict[tuple[str, str], list[tuple[Cell, str]]] = {}
     for cell, result in study.rows:
         if result.status not in _SOLVED:

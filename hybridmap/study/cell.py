@@ -221,8 +221,12 @@ def _begun(graph: PoseGraph, start: str, reference: Array) -> PoseGraph:
             raise BackendError("start: angular: the linear equations are singular; choose another start")
         return replace(graph, initial=poses)
     if start == "reference":
-        if not np.isfinite(reference).all():
-            raise BackendError("start: reference: it is not known for every node; choose another start")
+        unknown = int(np.count_nonzero(~np.isfinite(reference).all(axis=1)))
+        if unknown:
+            raise BackendError(
+                f"start: reference: found {unknown} of {len(reference)} nodes without a reference pose, expected none; choose"
+                f" another start"
+            )
         return replace(graph, initial=compose(graph.initial[0], between(reference[0], reference)))
     return graph
 

@@ -92,7 +92,11 @@ def check(name: str, strength: float | tuple[float, ...], origin: str) -> None:
     if beyond is not None:
         raise ConfigError(f"{origin}: disturb: {name}: expected {least:g} to {most:g}, found {beyond:g}")
     if name == KIDNAPPED and np.any(strength) and not 0.0 <= numbers[0] < numbers[1] < numbers[2]:
-        raise ConfigError(f"{origin}: disturb: {name}: expected [picked up, put down, end], seconds from the first stamp")
+        found = ", ".join(f"{number:g}" for number in numbers)
+        raise ConfigError(
+            f"{origin}: disturb: {name}: expected [picked up, put down, end], ascending seconds from the first stamp,"
+            f" found [{found}]"
+        )
 
 
 def scan_range_m(ranges: Ranges, limit_m: float, _rng: np.random.Generator) -> Ranges:

@@ -112,7 +112,10 @@ def _check(study: StudyConfig, origin: str) -> None:
             raise ConfigError(f"{origin}: {key}: {twice!r} is given twice; give each a name of its own")
     cells = prod(map(len, lists.values()))
     if cells > _MOST_CELLS:
-        raise ConfigError(f"{origin}: {cells} cells, expected at most {_MOST_CELLS}; split the study")
+        raise ConfigError(
+            f"{origin}: found {cells} cells (sources x settings x back-ends x false loops x seeds), expected at most"
+            f" {_MOST_CELLS}; split the study"
+        )
     for variant in study.backends:
         _check_backend(variant, f"{origin}: backends")
     for source in study.sources:
@@ -141,7 +144,8 @@ def _check_source(source: SourceConfig, study: StudyConfig, origin: str) -> None
         raise ConfigError(f"{origin}: no world called {source.simulated!r}; there are {known}")
     for keys, kinds in ((_OF_DRIVES, DRIVES), (_OF_RECORDINGS, ("recording",))):
         if source.kind not in kinds and any(getattr(source, key) for key in keys):
-            raise ConfigError(f"{origin}: {source.title}: {', '.join(keys)} are for {' and '.join(kinds)} only")
+            what = f"{', '.join(keys)} are for {' and '.join(kinds)} only"
+            raise ConfigError(f"{origin}: {source.title}: found a {source.kind}; {what}")
     if source.kind not in DRIVES and study.maps:
         raise ConfigError(f"{origin}: {source.title}: is a graph; give the back-ends that solve it")
     acting = next((setting.name for setting in study.settings if setting.overrides or setting.disturb), None)
@@ -161,7 +165,7 @@ def _check_setting(setting: SettingConfig, study: StudyConfig, origin: str) -> N
 
 def _check_bar(bar: BarConfig, lists: Mapping[str, list[str]], origin: str) -> None:
     if (bar.at_most is None) == (bar.at_least is None):
-        raise ConfigError(f"{origin}: expected either at_most or at_least")
+        raise ConfigError(f"{origin}: expected either at_most or at_least, found {'none' if bar.at_most is None else 'both'}")
     if bar.figure not in FIGURES:
         raise ConfigError(f"{origin}: no such figure; there are {', '.join(FIGURES)}")
     named = {"sources": bar.sources, "settings": bar.settings, "backends": bar.backends, "false_loops.kinds": bar.kinds}

@@ -166,7 +166,7 @@ def none_kept(facts: Facts) -> Iterable[Reason]:
 
 
 def against_wheels(facts: Facts) -> Iterable[Reason]:
-    """A reason for each way that no loop of the map spans where map and dead reckoning contradict each other."""
+    """A reason for each way of at least `FREE_MAX_M` that no loop spans and where map and dead reckoning contradict."""
     if facts.poses is None or facts.wheels is None:
         return
     chain = chain_of(facts.wheels)

@@ -34,6 +34,8 @@ def test_every_command_explains_itself(command):
     done = run(command, "--help")
     assert done.returncode == 0
     assert "--json" in done.stdout
+    said = " ".join(done.stdout.split()).partition("Exit codes: ")[2]
+    assert [code for code in ("0:", "2:", "130:") if code not in said] == []
 
 
 @pytest.mark.parametrize(
