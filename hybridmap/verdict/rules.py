@@ -140,9 +140,9 @@ def _at_odds(facts: Facts, graph: PoseGraph) -> Iterator[Reason]:
 
 
 def alone(facts: Facts) -> Iterable[Reason]:
-    """Loops of a file that no other loop confirms move the map to where nothing else has it.
+    """A reason if loops of a file that no other loop confirms move the map to where nothing else has it.
 
-    Those of a drive were verified by views.
+    There is none for a drive, whose loops were verified by views.
     """
     if facts.solution is None or facts.poses is None or facts.driven or facts.solution.report.weak_edges:
         return []
