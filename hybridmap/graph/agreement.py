@@ -22,8 +22,8 @@ Ways = Callable[[Indices, Indices], RelativePose]
 
 
 def chi2_quantile(probability: float) -> float:
-    """Quantile of the chi-square distribution with 3 degrees of freedom (importing `scipy.stats` would take half a second)."""
-    return float(2.0 * gammaincinv(1.5, probability))
+    """Quantile, at a probability of 0 to 1, of the chi-square distribution with 3 degrees of freedom."""
+    return float(2.0 * gammaincinv(1.5, probability))  # importing `scipy.stats` would take half a second
 
 
 QUANTILE = 0.99
@@ -38,7 +38,7 @@ class Loops:
 
     Attributes:
         older, newer: (L,) nodes.
-        relative: pose (L, 3) of the newer node in the frame of the older one, with its covariance (L, 3, 3).
+        relative: pose (L, 3) of the newer node in the frame of the older one, m and rad, with its covariance (L, 3, 3).
     """
 
     older: Indices
@@ -106,7 +106,7 @@ def ring(first: Loops, second: Loops, ways: Ways) -> Ring:
 
 
 def agrees(loops: Loops, one: int, others: Indices, ways: Ways, bound: float = BOUND) -> NDArray[np.bool_]:
-    """Which loops of the indices `others` (P,) agree with the loop of index `one`; `ways` and `bound` as for `agreement`."""
+    """Which (P,) of the loops with indices `others` (P,) agree with the loop of index `one`; see `agreement` for the rest."""
     return np.asarray(ring(loops[np.full(len(others), one)], loops[others], ways).distance <= bound)
 
 
@@ -115,7 +115,7 @@ def agreement(loops: Loops, ways: Ways, bound: float = BOUND, known: NDArray[np.
 
     Args:
         loops: L loops.
-        ways: gives the relative poses along the chain between the ends of loops; called once for each loop.
+        ways: gives the relative poses along the chain between the ends of loops; called twice for each loop beyond `known`.
         bound: largest squared Mahalanobis distance of a pair that agrees.
         known: (K, K) result of an earlier call for the first K loops, which is not computed again; None: no earlier result.
     """

@@ -17,7 +17,10 @@ from hybridmap.geometry import RelativePose
 
 
 class EdgeKind(IntEnum):
-    """Where an edge comes from."""
+    """Where an edge comes from: wheels, registration to nodes just before, loop closure, or a person.
+
+    The first two measure motion. Only `LOOP` is a loop closure, which a robust back-end may reject.
+    """
 
     ODOMETRY = 0
     REGISTRATION = 1
@@ -28,7 +31,7 @@ class EdgeKind(IntEnum):
 class Status(StrEnum):
     """The state of an edge; only accepted edges are in the graph.
 
-    A rejected edge never was in the graph; a retracted one was.
+    A pending edge waits for others that agree with it. A rejected edge never was in the graph; a retracted one was.
     """
 
     ACCEPTED = "accepted"
@@ -209,12 +212,12 @@ def at_most(figure: str, value: float, limit: float, setting: str | None = None)
 
 
 def passed(checks: Sequence[Check]) -> bool:
-    """Whether all checks passed."""
+    """Whether all checks passed; true if there are none."""
     return all(check.passed for check in checks)
 
 
 def verdict(checks: Sequence[Check], lack: Lack | None) -> Status:
-    """Status of an edge: rejected if a check failed or support is lacking for good, pending if it still waits for support."""
+    """Status of an edge: rejected if a check failed or it lacks anything but `WAITING`, pending if it waits, else accepted."""
     if lack not in (None, Lack.WAITING) or not passed(checks):
         return Status.REJECTED
     return Status.ACCEPTED if lack is None else Status.PENDING
@@ -229,7 +232,7 @@ class Edge:
 
     Attributes:
         source, target: node numbers.
-        kind: odometry, registration or loop closure.
+        kind: odometry, registration, loop closure or by hand.
         status: accepted, pending, rejected or retracted.
         relative: pose of the target in the frame of the source; None if the edge was rejected before it was measured.
         checks: the measured values that decided, with their limits, in order.
@@ -276,7 +279,7 @@ class Edge:
         lack: Lack | None = None,
         **more: Any,
     ) -> Self:
-        """Make an edge whose status follows from its checks and its lack."""
+        """Make an edge whose status follows from its checks and its lack; `more` are further attributes, by name."""
         return cls(source, target, kind, verdict(checks, lack), relative, checks=tuple(checks), lack=lack, **more)
 
     @property
@@ -285,7 +288,10 @@ class Edge:
         return self.kidnapped_m is not None or self.lack is Lack.KIDNAPPED
 
     def settled(self, *more: Check, lack: Lack | None = None) -> Self:
-        """The same edge with the checks `more` added and a new lack; its status follows from these."""
+        """Copy of the edge with the checks `more` added and its lack replaced (None: it lacks nothing).
+
+        The status follows from both. `since_node` stays.
+        """
         checks = (*self.checks, *more)
         return replace(self, status=verdict(checks, lack), checks=checks, lack=lack)
 

@@ -23,9 +23,9 @@ class Node:
     Attributes:
         stamp_ns: time at which the node was made.
         pose_odom: (3,) pose in `odom` by the path integrator at that time, m and rad.
-        place_code: (P,) float32 activity of the cells that identifies the place.
+        place_code: (P,) float32 rates of the place cells at that time.
         template: number of the view template seen there; -1 for none.
-        travel_m: path length so far.
+        travel_m: path length of the drive up to the node.
     """
 
     stamp_ns: int
@@ -62,7 +62,7 @@ class ExperienceMap:
 
     @property
     def initial(self) -> Array:
-        """(N, 3) pose of each node along the chain of odometry edges."""
+        """(N, 3) pose of each node along the chain of odometry edges, m and rad; a copy."""
         return self._initial.view().copy()
 
     def __len__(self) -> int:
@@ -77,17 +77,17 @@ class ExperienceMap:
         return self._edges[number]
 
     def edges_into(self, node: int) -> tuple[int, ...]:
-        """Numbers of the edges whose target is the given node."""
+        """Numbers of the edges whose target is the given node, ascending, whatever their status."""
         return tuple(self._edges_into.get(node, ()))
 
     def add_node(self, node: Node, initial: Array) -> int:
-        """Append a node; `initial` (3,) is its pose along the chain of odometry edges. Returns its number."""
+        """Append a node; `initial` (3,) is its pose along the chain of odometry edges, m and rad. Returns its number."""
         self._nodes.append(node)
         self._initial.append(initial)
         return len(self._nodes) - 1
 
     def add_edge(self, edge: Edge) -> int:
-        """Append an edge and return its number.
+        """Append an edge of any status and return its number.
 
         Raises:
             GraphError: a node does not exist, both nodes are the same, or an accepted edge carries no measurement.
@@ -108,7 +108,7 @@ class ExperienceMap:
         A retracted edge keeps its measurement if the rejected one has none: it is what the edge claimed while in the graph.
 
         Raises:
-            GraphError: the new edge joins other nodes, or is accepted without a measurement.
+            GraphError: the new edge has another source or target, or is accepted without a measurement.
         """
         before = self._edges[number]
         if (before.source, before.target) != (edge.source, edge.target):
@@ -123,7 +123,7 @@ class ExperienceMap:
         self._write(number)
 
     def move_odometry(self, poses_odom: Array) -> None:
-        """Replace the poses (N, 3) in `odom` of all nodes, and their poses along the chain; edges stay as they are."""
+        """Replace the poses (N, 3) in `odom` of all nodes, m and rad, and `initial` but its first pose; no edge changes."""
         self._nodes = [replace(node, pose_odom=pose) for node, pose in zip(self._nodes, poses_odom, strict=True)]
         initial = self._initial.view()
         initial[:] = compose(initial[0], between(poses_odom[0], poses_odom))
@@ -189,7 +189,7 @@ def _invert(covariance: Array) -> Array:
 
 
 class Novelty:
-    """Decides when a new node is made."""
+    """Decides when a new node is made. It changes only by `remember`, to be called for every node."""
 
     def __init__(self, config: NodesConfig) -> None:
         self._config = config
@@ -200,9 +200,9 @@ class Novelty:
         """Why a new node must be made now, in words; None if none is needed.
 
         Args:
-            delta_node_robot: (3,) motion since the node that the robot is at.
-            place_code: returns the current activity (P,); called only if the rule needs it.
-            new_template: whether a new view template was made from the current frame.
+            delta_node_robot: (3,) pose of the robot in the frame of the node that it is at, m and rad; for the rule `travel`.
+            place_code: returns the present rates (P,) of the place cells; called only under the rule `novelty`.
+            new_template: whether the current frame made a new view template; without effect under the rule `travel`.
         """
         if self._count == 0:
             return "first experience"
@@ -214,7 +214,7 @@ class Novelty:
         return f"place code differs by {distance:.2f} from every node's" if distance > self._config.place_threshold else None
 
     def distance(self, place_code: NDArray[np.float32]) -> float:
-        """Distance (1 - cosine) of a place code to the nearest one of all nodes; the paper compares it with its limit S_th."""
+        """Distance (1 - cosine) of a place code (P,) to the nearest one of all nodes; 1 without nodes. S_th is its limit."""
         if self._count == 0:
             return 1.0
         norm = float(np.linalg.norm(place_code))
@@ -222,7 +222,7 @@ class Novelty:
         return float(1.0 - similarity.max())
 
     def remember(self, place_code: NDArray[np.float32]) -> None:
-        """Add the place code of a new node to those that later ones are compared with."""
+        """Add the place code (P,) of a new node to those that later ones are compared with."""
         if self._count == len(self._codes):
             grown = np.zeros((max(64, 2 * self._count), len(place_code)), dtype=np.float32)
             if self._count:

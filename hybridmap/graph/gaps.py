@@ -21,8 +21,8 @@ class Kidnapping:
 
     Attributes:
         before, after: the last node before the kidnapping and the first one after it.
-        found_at: the newest node when the robot was localised again.
-        moved_m: distance between the new pose and the pose by odometry.
+        found_at: number of the newest node when the robot was localised again.
+        moved_m: distance between the pose where it was put down and the pose by odometry.
         search_m: path length from `after` to `found_at`.
     """
 
@@ -39,7 +39,7 @@ class Kidnapping:
 
 
 def kidnappings(experiences: ExperienceMap) -> tuple[Kidnapping, ...]:
-    """Every kidnapping of a drive, in order, read from the edges that global localisation put across them."""
+    """Every kidnapping of a drive that was found, in order, read from the accepted edges that lead across them."""
     found = []
     for edge in experiences.edges:
         if edge.status is Status.ACCEPTED and edge.kidnapped_m is not None:
@@ -49,7 +49,7 @@ def kidnappings(experiences: ExperienceMap) -> tuple[Kidnapping, ...]:
 
 
 def pieces(trajectory: Trajectory, experiences: ExperienceMap) -> list[Trajectory]:
-    """Split a trajectory at the kidnappings; poses during a kidnapping are left out."""
+    """Split a trajectory at the kidnappings, in order of time; poses during a kidnapping and empty pieces are left out."""
     number, aloft = np.zeros(len(trajectory), dtype=np.int64), np.zeros(len(trajectory), dtype=bool)
     for one in kidnappings(experiences):
         down = trajectory.stamps_ns > experiences.node(one.after).stamp_ns
@@ -60,12 +60,12 @@ def pieces(trajectory: Trajectory, experiences: ExperienceMap) -> list[Trajector
 
 
 def parted(poses: Array, kidnapped: Sequence[Kidnapping]) -> Array:
-    """Poses (K, 3) of the first K nodes with a row of NaN at each kidnapping, so that a plotted line is interrupted there."""
+    """Poses (K, 3) of the first K nodes with a row of NaN inserted at each kidnapping, which interrupts a plotted line."""
     return np.insert(poses, [one.after for one in kidnapped if one.after < len(poses)], np.nan, axis=0)
 
 
 def kidnapping_edges(graph: PoseGraph, kidnapped: Sequence[Kidnapping]) -> NDArray[np.bool_]:
-    """(E,) which edges lead across a kidnapping, so that nobody drove along them."""
+    """(E,) which edges of motion join the nodes before and after a kidnapping, so that nobody drove along them; no loops."""
     ends = np.stack([graph.sources, graph.targets], axis=1)
     found = [(ends == (one.before, one.after)).all(axis=1) for one in kidnapped]
     return np.any(found, axis=0) & graph.is_motion if found else np.zeros(graph.n_edges, dtype=np.bool_)

@@ -47,10 +47,12 @@ def read_graph(path: Path) -> PoseGraph:
     Vertices are numbered again from 0 in the order of the drive; edges keep the file's order. That order, and which edges are
     odometry, `graph.order.in_driving_order` finds: where consecutive numbers are all joined by edges, these edges are the
     odometry, and every other one is a loop. If the file has no vertices, initial poses are composed along its edges. The
-    first vertex that a `FIX` line names is the one that is held; nothing else is fixed.
+    first vertex that a `FIX` line names is the one that is held; nothing else is fixed. What the numbers mean is not checked:
+    see `PoseGraph.validate`.
 
     Raises:
-        GraphError: no such file, a damaged line (named), a 3-D file, a vertex given twice or missing, no edge.
+        GraphError: no such file, a damaged line (named), a 3-D file, a vertex given twice or missing, no edge; or no vertices,
+            and edges that do not join all nodes.
     """
     if not path.is_file():
         raise GraphError(f"{path}: no such graph file; expected a g2o or TORO file")
@@ -97,7 +99,7 @@ def _integers(fields: list[str], count: int, where: str) -> list[int]:
             f"{where}: expected {count} whole number(s) after {fields[0]}, found {quoted(' '.join(given))}"
         ) from None
     if max(map(abs, numbers), default=0) > _HIGHEST:
-        raise GraphError(f"{where}: found {quoted(' '.join(given))}, expected numbers of vertices up to {_HIGHEST}")
+        raise GraphError(f"{where}: found {quoted(' '.join(given))}, expected vertex numbers of at most {_HIGHEST}")
     return numbers
 
 
@@ -149,7 +151,10 @@ def _held(lines: _Lines, index: dict[int, int], path: Path) -> int | None:
 
 
 def held(graph: PoseGraph, poses: Array) -> Array:
-    """Poses (N, 3) moved rigidly, so that the node that the graph's file fixes is where the file has it."""
+    """Poses (N, 3) moved rigidly, so that the node that the graph's file fixes is where the file has it.
+
+    They are returned as they are if it fixes none, or node 0, which every solver holds.
+    """
     node = None if graph.file is None else graph.file.held
     if not node:
         return poses
@@ -159,11 +164,14 @@ def held(graph: PoseGraph, poses: Array) -> Array:
 
 
 def write_g2o(path: Path, graph: PoseGraph, poses: Array) -> None:
-    """Write the nodes at `poses` (N, 3), the fixed node and all edges as a g2o file.
+    """Write the nodes at `poses` (N, 3), m and rad, the fixed node and all edges as a g2o file; one that exists is replaced.
 
     Numbers have 17 significant digits; the file appears at once when it is complete. A graph that was read from a file keeps
     the numbers of its vertices. The format has no kinds of edges: read back, every edge between non-consecutive nodes is a
     loop.
+
+    Raises:
+        OutputError: the file cannot be written.
     """
     names = np.arange(graph.n_nodes) if graph.file is None else graph.file.vertices
     rows = [f"VERTEX_SE2 {name} {_row(pose)}\n" for name, pose in zip(names, poses, strict=True)]

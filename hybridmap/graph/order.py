@@ -30,7 +30,7 @@ class Arranged:
 
     Attributes:
         graph: the same edges, with the same `edge_ids`; nodes may have other numbers.
-        nodes: (N,) the number that each node of `graph` had before; None if the numbers are the same.
+        nodes: (N,) node k of `graph` had the number `nodes[k]` before; None if the numbers are the same.
     """
 
     graph: PoseGraph

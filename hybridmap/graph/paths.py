@@ -95,7 +95,7 @@ class Chain:
     breaks: Indices
 
     def ways(self, first: Indices, second: Indices) -> RelativePose:
-        """The poses of nodes `second` (P,) in the frames of nodes `first` (P,), with covariances."""
+        """The poses of nodes `second` (P,) in the frames of nodes `first` (P,), with covariances, infinite across a break."""
         back = adjoint(inverse(self.poses[second]))
         sign = np.where(second >= first, 1.0, -1.0)[:, None, None]
         covariance = back @ (sign * (self.covariance[second] - self.covariance[first])) @ back.transpose(0, 2, 1)
@@ -104,7 +104,10 @@ class Chain:
 
 
 def chain_of(graph: PoseGraph, poses: Array | None = None) -> Chain:
-    """Compose the poses of consecutive nodes from their edges of motion; several edges of two nodes are fused as independent.
+    """Compose the poses of consecutive nodes from their edges of motion.
+
+    Of several edges of two nodes the most certain gives the motion, and the information of all adds up. Across a break the
+    composed pose stays the same.
 
     Args:
         graph: the measurements.
@@ -126,8 +129,8 @@ def chain_of(graph: PoseGraph, poses: Array | None = None) -> Chain:
 def covariances_from(graph: PoseGraph) -> Callable[[int], Array]:
     """Return a function from a node to the covariances of all nodes relative to it. Its results are cached.
 
-    Edges of the same two nodes are fused. Paths are shortest in the trace of the position covariance; along a path covariances,
-    taken as independent, are propagated by adjoints (as `geometry.compose_relative`).
+    The information of edges of the same two nodes adds up. Paths are shortest in the trace of the position covariance; along a
+    path covariances, taken as independent, are propagated by adjoints (as `geometry.compose_relative`).
 
     Returns:
         From a node to (N, 3, 3) m^2 and rad^2, right perturbation in each node's own frame: zero for the node itself, infinite
@@ -237,7 +240,7 @@ def require_connected(graph: PoseGraph) -> None:
 
 
 def extend(graph: PoseGraph, placed: Array) -> Array:
-    """Add poses for the nodes beyond `placed` (M, 3), each by its best edge to a node that has a pose; returns (N, 3).
+    """Poses (N, 3) of all nodes, m and rad: `placed` (M, 3) for the first M, the others by their best edge to one with a pose.
 
     Registrations are better than odometry, and odometry is better than loops; among edges of one kind, the earlier node nearest
     in number is best, then the newest edge. A node without an edge to an earlier one waits for the later ones.
@@ -293,10 +296,14 @@ def _spread(graph: PoseGraph, poses: Array, done: int) -> Array:
 
 
 def own_odometry(graph: PoseGraph) -> Indices:
-    """Indices of the odometry edges that lead from a node to the next."""
+    """Indices, ascending, of the odometry edges that lead from a node to the next."""
     return np.flatnonzero((graph.kinds == EdgeKind.ODOMETRY) & (graph.targets == graph.sources + 1))
 
 
 def chain(graph: PoseGraph) -> PoseGraph:
-    """The graph with initial poses that are composed along its edges, from the pose of node 0 on."""
+    """The graph with initial poses that are composed along its best edges, loops too if need be (`extend`), from node 0 on.
+
+    Raises:
+        GraphError: a node has no path to node 0.
+    """
     return replace(graph, initial=extend(graph, graph.initial[:1]))

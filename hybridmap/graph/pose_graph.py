@@ -25,9 +25,9 @@ class GraphFile:
 
     Attributes:
         path: path of the file.
-        vertices: (N,) int64, number of each node in the file.
+        vertices: (N,) int64, number in the file of each node, in the order of the graph's nodes.
         lines: (E,) int64, line number of each edge, indexed by its `edge_ids`; edges added later have none.
-        held: the node that the file fixes; None if it fixes none (then node 0 is fixed).
+        held: index of the node that the file fixes; None if it fixes none (then node 0 is fixed).
     """
 
     path: Path
@@ -43,7 +43,7 @@ class PoseGraph:
     Attributes:
         initial: (N, 3) initial pose of each node, by odometry or from the file, m and rad.
         sources, targets: (E,) int64 node indices.
-        deltas: (E, 3) measured pose of the target in the frame of the source.
+        deltas: (E, 3) measured pose of the target in the frame of the source, m and rad.
         information: (E, 3, 3) inverse covariance in the frame of the target (right perturbation), x, y, yaw.
         kinds: (E,) int8, `EdgeKind`.
         edge_ids: (E,) int64, number of each edge in the map; strictly increasing.
@@ -91,7 +91,7 @@ class PoseGraph:
         return self.with_edges(np.isin(self.kinds, kinds))
 
     def with_edges(self, kept: NDArray[np.int64] | NDArray[np.bool_]) -> PoseGraph:
-        """The same nodes with only the edges of the given indices or mask."""
+        """The same nodes with only the edges of a mask (E,) or of increasing indices; they keep their `edge_ids`."""
         return PoseGraph(
             self.initial,
             self.sources[kept],
@@ -122,7 +122,7 @@ class PoseGraph:
         return f"{self.file.path}:{self.file.lines[name]}: edge {vertices[source]} -> {vertices[target]}"
 
     def validate(self) -> None:
-        """Refuse a graph that cannot be solved.
+        """Refuse a graph with invalid numbers. Whether it is connected is not checked: see `paths.require_connected`.
 
         Raises:
             GraphError: NaN, unknown node, edge from a node to itself, information not symmetric positive definite, no node,
@@ -211,9 +211,10 @@ class Change:
 
 
 def prefix(graph: PoseGraph, nodes: int) -> PoseGraph:
-    """The graph as it was when it had `nodes` nodes.
+    """The graph as it was when it had its first `nodes` nodes.
 
-    An edge of motion is in it as soon as both of its nodes are; a loop that was accepted later is not in it.
+    An edge of motion is in it as soon as both of its nodes are; a loop that was accepted later is not in it. Edges have their
+    present measurements, and those removed since are missing.
     """
     both = np.maximum(graph.sources, graph.targets)
     entry = np.where(graph.kinds < EdgeKind.LOOP, both, np.maximum(both, graph.entry_nodes))
@@ -221,7 +222,10 @@ def prefix(graph: PoseGraph, nodes: int) -> PoseGraph:
 
 
 def difference(old: PoseGraph | None, new: PoseGraph) -> Change:
-    """Which edges were added and removed between two states of one graph; `old` is None before the first."""
+    """Which edges were added and removed between two states of one graph, whose nodes keep their numbers.
+
+    With `old` None every edge is added, and `closes` is true.
+    """
     if old is None:
         return Change(np.arange(new.n_edges), np.arange(0), closes=True)
     head = _common_head(old.edge_ids, new.edge_ids)
