@@ -24,13 +24,13 @@ class Update:
     """What the mapper did at one instant, and why.
 
     Attributes:
-        stamp_ns: time of the sample.
-        pose_odom_robot: (3,) by the path integrator; `odom` begins at the start of the drive.
-        pose_map_robot: (3,) on the map of the primary back-end.
-        poses_map_robot: (3,) on the map of each back-end, by its name.
+        stamp_ns: time of the step.
+        pose_odom_robot: (3,) by the path integrator, m and rad; `odom` begins at the start of the drive.
+        pose_map_robot: (3,) on the map of the primary back-end; before the first node, that in `odom`.
+        poses_map_robot: (3,) on the map of each back-end, by its name; empty before the first node.
         at_node, delta_node_robot: the node from which the robot is seen (-1 before the first), and its pose (3,) from there.
         new_node: number of the node made now; None if none was made.
-        edges: numbers of new and changed edges.
+        edges: numbers of new and changed edges, whatever their status.
         reason: why a node was made, or why not.
     """
 
@@ -85,7 +85,7 @@ class Position:
         self.driven = (self.driven[0] + travel_m, self.driven[1] + turn_rad)
 
     def odometry(self, pose_odom_before: Array) -> RelativePose:
-        """The motion from a pose (3,) in `odom` to here, with the configured noise of the way since the last node."""
+        """The motion from the newest node, at a pose (3,) in `odom`, to here, with the configured noise of odometry."""
         return RelativePose(between(pose_odom_before, self.pose_odom), odometry_covariance(self._config, *self.driven))
 
     def restart(self) -> None:
@@ -110,7 +110,7 @@ class Position:
         return pose_odom if at_node is None else compose(at_node, between(self.pose_odom_at_node, pose_odom))
 
     def update(self, reason: str, node: int | None = None, edges: Sequence[int] = ()) -> Update:
-        """Make the `Update` of this instant."""
+        """Make the `Update` of this instant; `node` is the number of the node made now, if any. Nothing changes."""
         moved, pose_map = self.moved, self.pose_map(self.pose_odom)
         on_map = {name: compose(pose, moved) for name, pose in self.pose_map_at_node.items()}
         return Update(self.stamp_ns, self.pose_odom, pose_map, on_map, self.at_node, moved, reason, node, tuple(edges))
@@ -132,9 +132,9 @@ class EdgeBook:
         self.motion = MotionEdges(experiences, config)
 
     def enter(self, proposals: Sequence[Edge]) -> list[int]:
-        """Write proposed edges into the map; a proposal with the key of an earlier one replaces that one's edge.
+        """Write proposed edges into the map; a proposal with the key (`Edge.key`) of an earlier one replaces that one's edge.
 
-        Returns the numbers of the new and changed edges.
+        Returns the numbers of the new and changed edges, odometry edges that a proposal contradicts among them.
         """
         changed = []
         for proposal in proposals:
@@ -148,6 +148,8 @@ class EdgeBook:
 
     def belief(self, poses_of: Callable[[PoseGraph], Array], outliers: Sequence[int] = ()) -> Belief:
         """Poses of the nodes and their covariances, with which the front-end looks for loops.
+
+        With the setting `edges.gate: odometry` both are those of the odometry edges alone.
 
         Args:
             poses_of: solves a graph with the primary back-end; returns the poses (N, 3) of its nodes.
@@ -164,7 +166,7 @@ class EdgeBook:
         )
 
     def proposed(self, numbers: Sequence[int]) -> list[Edge]:
-        """Of the edges with these numbers, those that the front-end proposed."""
+        """Of the edges with these numbers, those that the front-end proposed, in the order of the numbers given."""
         proposed = set(self._edge_of_proposal.values())
         return [self._map.edge(number) for number in numbers if number in proposed]
 

@@ -37,6 +37,12 @@ class Mapper:
     mapper.add_odometry(stamp_s, pose_odom_robot)
     update = mapper.add_scan(stamp_s, ranges_m)
     ```
+
+    Attributes:
+        map: the nodes and edges so far.
+        backends: the back-ends with their latest solutions and failures.
+        anchors: poses of frames between nodes; none before `finish`.
+        clock: CPU time of each stage.
     """
 
     def __init__(self, config: Config, rig: Rig | None = None, backends: Sequence[str | Backend] | None = None) -> None:
@@ -45,7 +51,8 @@ class Mapper:
         Args:
             config: all settings.
             rig: which sensors there are; default: those that the configuration describes.
-            backends: names, or unused back-ends, in place of those that the configuration names.
+            backends: names, or unused back-ends, in place of those that the configuration names. The map of the first one,
+                the primary, gives the pose of the robot.
 
         Raises:
             ConfigError: the configuration asks for a sensor that the rig does not have.
@@ -67,7 +74,11 @@ class Mapper:
         self._position = Position(config.edges, self.backends.primary)
 
     def add_odometry(self, stamp_s: float, pose_odom_robot: ArrayLike) -> Update | None:
-        """Take in a pose (3,) of `base_link` in `odom`. Returns the newest update, or None if no step was possible."""
+        """Take in a pose (3,) of `base_link` in `odom`, m and rad.
+
+        Returns the newest update, which may be of an earlier sample, or None if no step was possible; `add` returns all. Order
+        of samples and errors are as for `add`.
+        """
         return _newest(self.add(SelfMotion(stamp_ns_from_s(stamp_s), np.asarray(pose_odom_robot, dtype=np.float64))))
 
     def add_velocity(self, stamp_s: float, v_m_s: float, omega_rad_s: float) -> Update | None:
@@ -90,13 +101,17 @@ class Mapper:
     def add(self, sample: Sample) -> list[Update]:
         """Take in any sample and do every step that it makes possible, in order of stamp; returns the update of each.
 
+        Give samples in order of stamp over all kinds; `sensors.latency_s` sorts late ones. An observation older than the last
+        step, or than the first motion, is left out without an error and counted (`left_out`).
+
         Raises:
-            StreamError: NaN in the motion, or a stamp earlier than the one before.
+            StreamError: NaN in the motion, motion earlier than the last, an observation earlier than one that waits for
+                odometry, or odometry mixed with velocities.
         """
         return [self.step(ready) for ready in self._synchroniser.push(sample)]
 
     def step(self, ready: Ready) -> Update:
-        """One step of the algorithm: path integration, view, new node, loop closure, correction of the map."""
+        """One step of the algorithm, called by `add`: path integration, view, new node, loop closure, correction of the map."""
         self._path_integrate(ready)
         view = self._look(ready)
         if view is None and self.vision is not None:
@@ -115,7 +130,10 @@ class Mapper:
         return self._position.update(reason + self.calibration.follow(self.map, self.poses), node, edges)
 
     def finish(self) -> list[Update]:
-        """End of the drive: find more loops, solve, measure outlier loops again, and register the frames between nodes."""
+        """End of the drive: find more loops, solve, measure outlier loops again, and register the frames between nodes.
+
+        Call it once, after the last sample. The last of the returned updates says `end of the drive`.
+        """
         updates = [self.step(ready) for ready in self._synchroniser.flush()]
         self._position.pose_odom = self.cells.pose_odom_robot
         if len(self.map):
@@ -127,13 +145,18 @@ class Mapper:
         return updates
 
     @property
+    def left_out(self) -> dict[str, int]:
+        """Number of samples that were left out so far, by the reason."""
+        return dict(self._synchroniser.report.counts)
+
+    @property
     def lost_since(self) -> int | None:
         """First node after the robot was kidnapped or lost track of its motion; None while it is localised on the map."""
         return self.vision.lost_since if self.vision is not None else None
 
     @property
     def pose_map_robot(self) -> Array:
-        """(3,) pose of the robot on the map of the primary back-end."""
+        """(3,) pose of the robot on the map of the primary back-end, m and rad; before the first node, its pose in `odom`."""
         return self._position.pose_map(self.cells.pose_odom_robot)
 
     @property
@@ -142,7 +165,11 @@ class Mapper:
         return compose(self.pose_map_robot, inverse(self._position.pose_odom_given))
 
     def poses(self, backend: str | None = None) -> Array:
-        """(N, 3) current poses of all nodes by a back-end (default: the primary)."""
+        """(N, 3) current poses of all nodes by a back-end (default: the primary), m and rad.
+
+        Raises:
+            BackendError: the mapper has no back-end of this name.
+        """
         return self.backends.poses(self.map.pose_graph(), backend)
 
     def belief(self, outliers: Sequence[int] = ()) -> Belief:

@@ -84,10 +84,12 @@ class SecondLook:
         self._may_part = config.vision.relocalising.enabled and config.edges.hanging == "chain"
 
     def take(self, belief: Callable[[Sequence[int]], Belief], clock: StageClock) -> Iterator[tuple[str, list[int]]]:
-        """Change edges of the map in steps; the graph must be solved for good before the first step and after each.
+        """Change edges of the map in steps; the graph must be solved (`Ensemble.finish`) before the first step and after each.
+
+        With the setting `edges.gate: odometry` nothing is done.
 
         Args:
-            belief: the map without the edges of the numbers given.
+            belief: from numbers of edges to the map solved without them.
             clock: measures the time (stage `matching`).
 
         Yields:

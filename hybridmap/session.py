@@ -84,7 +84,9 @@ def run(stream: Stream, config: Config, out: Path, *, overwrite: bool = False, p
 
 
 def first_look(stream: Stream, config: Config) -> ClockOffset:
-    """Estimate how late the views of a stream are stamped, from its first `LOOK_M` metres at most, without making a map of it.
+    """Estimate how late the views of a stream are stamped, from its first `LOOK_M` metres at most, without writing a map.
+
+    The offset may stay unknown: see `ClockOffset.state`.
 
     Raises:
         StreamError: the stream is damaged or unordered.
@@ -246,7 +248,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
 
 
 def facts_of(mapper: Mapper, report: StreamReport) -> Facts:
-    """What the verdict on a finished drive is made from."""
+    """What the verdict on a drive is made from: the mapper after `finish`, and the report of its stream."""
     primary = mapper.backends.primary
     return Facts.of_drive(
         mapper.map,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybridmap.config import Config
-from hybridmap.errors import StreamError
+from hybridmap.errors import BackendError, StreamError
 from hybridmap.evaluate import absolute_error
 from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind, Status
@@ -136,3 +136,18 @@ def test_nan_odometry_is_refused_with_its_stamp():
     mapper = Mapper(Config.load("laser"), stream.rig)
     with pytest.raises(StreamError, match=r"0\.700000000.*NaN"):
         drive(mapper, stream)
+
+
+def test_samples_that_come_too_late_are_left_out_and_counted():
+    stream = RoomDrive()
+    mapper = Mapper(Config.load("laser"), stream.rig)
+    scan = next(sample for sample in stream if isinstance(sample, LaserScan))
+    later = [SelfMotion(scan.stamp_ns + step, np.zeros(3)) for step in (1, 2)]
+    assert [len(mapper.add(sample)) for sample in (*later, scan)] == [1, 1, 0]
+    assert mapper.left_out == {"observations behind odometry": 1}
+
+
+def test_poses_by_a_back_end_that_is_not_in_use_are_refused(mapped):
+    mapper, _, _ = mapped
+    with pytest.raises(BackendError, match=r"'gtsam-gn': is not in use; expected one of gtsam-gnc"):
+        mapper.poses("gtsam-gn")

@@ -308,11 +308,18 @@ class Ensemble:
         self.primary = self.names[0]
 
     def poses(self, graph: PoseGraph, name: str | None = None) -> Array:
-        """Latest poses (N, 3) by the back-end of this name (None: the primary).
+        """Latest poses (N, 3) by the back-end of this name (None: the primary), m and rad.
 
-        Nodes newer than its solution are placed by the edges between consecutive nodes.
+        Nodes newer than its solution are placed by their best edges (`graph.paths.extend`).
+
+        Raises:
+            BackendError: there is no back-end of this name here.
+            GraphError: a node has no path to the others.
         """
-        solution = self.solutions.get(name or self.primary)
+        name = name or self.primary
+        if name not in self._backends:
+            raise BackendError(f"back-end {name!r}: is not in use; expected one of {', '.join(self.names)}")
+        solution = self.solutions.get(name)
         return extend(graph, solution.poses if solution is not None else graph.initial[:1])
 
     def update(self, graph: PoseGraph) -> None:
