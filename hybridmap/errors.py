@@ -51,7 +51,7 @@ class ExportError(HybridMapError):
 
 
 class EvaluationError(HybridMapError):
-    """An evaluation or calibration without enough common data."""
+    """An evaluation or calibration that its data do not allow, or that was asked for in a wrong way."""
 
 
 class StudyError(HybridMapError):

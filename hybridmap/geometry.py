@@ -46,7 +46,7 @@ def wrap_angle(angle_rad: ArrayLike) -> Array:
 
 
 def compose(pose_a_b: ArrayLike, pose_b_c: ArrayLike) -> Array:
-    """Return `pose_a_c`; shapes `(..., 3)` broadcast against each other."""
+    """Return `pose_a_c`, yaw wrapped to [-pi, pi); shapes `(..., 3)` broadcast against each other."""
     a, b = np.asarray(pose_a_b, dtype=np.float64), np.asarray(pose_b_c, dtype=np.float64)
     if a.ndim == 1 and b.ndim == 1:
         return _compose_one(a, b)
@@ -57,7 +57,7 @@ def compose(pose_a_b: ArrayLike, pose_b_c: ArrayLike) -> Array:
 
 
 def inverse(pose_a_b: ArrayLike) -> Array:
-    """Return `pose_b_a`; shape `(..., 3)`."""
+    """Return `pose_b_a`, yaw wrapped to [-pi, pi); shape `(..., 3)`."""
     a = np.asarray(pose_a_b, dtype=np.float64)
     if a.ndim == 1:
         return _inverse_one(a)
@@ -98,7 +98,7 @@ def _stacked(x: Array, y: Array, yaw: Array) -> Array:
 
 
 def between(pose_a_i: ArrayLike, pose_a_j: ArrayLike) -> Array:
-    """Return `delta_i_j`, the pose of j in the frame of i; shapes `(..., 3)`."""
+    """Return `delta_i_j`, the pose of j in the frame of i, yaw wrapped to [-pi, pi); shapes `(..., 3)` broadcast."""
     return compose(inverse(pose_a_i), pose_a_j)
 
 
@@ -140,7 +140,7 @@ def adjoint(pose: ArrayLike) -> Array:
 
 
 def compose_relative(first: RelativePose, second: RelativePose) -> RelativePose:
-    """Chain two independent relative poses; covariances in the frame of each target."""
+    """Chain two independent relative poses, of b seen from a and of c seen from b, to that of c seen from a."""
     carry = adjoint(inverse(second.delta))
     return RelativePose(
         compose(first.delta, second.delta),
@@ -213,8 +213,8 @@ def align(poses_a: ArrayLike, poses_b: ArrayLike) -> Array:
     """Best SE(2) transform `pose_a_b` (3,) in the least-squares sense over positions (Horn/Umeyama without scale).
 
     Args:
-        poses_a: (N, 2 or 3) positions in frame a.
-        poses_b: (N, 2 or 3) the same points in frame b.
+        poses_a: (N, 2 or 3) positions in frame a, m; headings are not used.
+        poses_b: (N, 2 or 3) the same points, row by row, in frame b.
     """
     a = np.asarray(poses_a, dtype=np.float64)[:, :2]
     b = np.asarray(poses_b, dtype=np.float64)[:, :2]

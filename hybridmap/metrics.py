@@ -20,7 +20,7 @@ class Metric:
         value: NaN if it could not be computed.
         unit: `m`, `deg`, `s`, `1`, ...
         description: one line for people.
-        bar: the limit that the value must keep, None without one.
+        bar: the limit that the value must keep, None without one; whether from above or below, the description says.
         passed: whether the value keeps the limit, None without one.
     """
 
@@ -139,7 +139,10 @@ def figure(name: str, value: float, **facts: object) -> Metric:
     Args:
         name: `<measure>` or `<measure>/<back-end or processing stage>`.
         value: NaN if it could not be computed.
-        facts: values to insert into the description.
+        facts: values of what is in braces in the measure's description.
+
+    Raises:
+        KeyError: the measure is not in `FIGURES`, or a fact is missing.
     """
     measure, slash, _ = name.partition("/")
     unit, words = FIGURES[measure.removesuffix(ONLINE) + slash]
@@ -147,7 +150,7 @@ def figure(name: str, value: float, **facts: object) -> Metric:
 
 
 def to_json(head: dict[str, Any], metrics: Iterable[Metric]) -> str:
-    """Write a JSON object: the keys of `head`, and the list `metrics`."""
+    """Return the text of a JSON object: the keys of `head`, and the list `metrics`."""
     return json.dumps({**head, "metrics": [metric.to_json() for metric in metrics]}, indent=2)
 
 

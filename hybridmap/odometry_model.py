@@ -113,7 +113,10 @@ def steps_of(arcs: Array) -> Array:
 
 
 def apply(steps: Array, gains: Gains) -> Array:
-    """Calibrate raw odometry steps (S, 3), m and rad; returns the calibrated steps (S, 3)."""
+    """Calibrate raw odometry steps (S, 3), m and rad; returns the calibrated steps (S, 3), whose turns are not wrapped.
+
+    The turn of a raw step is taken to lie in [-pi, pi).
+    """
     raw = twists(steps)
     turn = gains.turn_gain * raw[:, 2] + gains.heading_bias_rad_m * raw[:, 0]
     return steps_of(np.column_stack([gains.gain * raw[:, :2], turn]))

@@ -36,7 +36,7 @@ class Kind:
         files: names of its files and folders; nothing else in the folder is ever changed.
         is_ours: whether a folder holds an output of this kind.
         continued: whether a new run continues an existing output, without `--overwrite`.
-        useful_unfinished: whether the output of a run interrupted by Ctrl-C is kept.
+        useful_unfinished: whether the output of a run interrupted by Ctrl-C is kept, if it replaced no earlier one.
     """
 
     name: str
@@ -122,7 +122,12 @@ class Held:
 def held(folder: Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Held]:
     """Context in which a folder for an output of this kind is made if needed, and locked against other runs.
 
-    If the folder is empty at the end, it is removed, with the parents made for it.
+    If the folder was made, and is empty at the end, it is removed with the parents made for it.
+
+    Args:
+        folder: the folder.
+        kind: what may be in it.
+        overwrite: whether it may hold an output already. That stays until `Held.replaced` replaces it.
 
     Raises:
         OutputError: the folder is a file, holds something else, holds an output of this kind without `overwrite`, is in use by
@@ -166,7 +171,7 @@ def staged(*targets: Path, kind: Kind | None = None, overwrite: bool = False) ->
 
 
 def is_held(folder: Path) -> bool:
-    """Whether another run is writing in a folder now."""
+    """Whether a run, of this process or another, has a folder locked by `held` now. The folder must exist."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         return not _take(handle, fcntl.LOCK_SH)
@@ -181,9 +186,10 @@ def holds_only(folder: Path, names: tuple[str, ...]) -> bool:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically: a reader or a crash never sees a partial file. Makes the file's folder if needed.
+    """Write a text file in UTF-8 atomically: a reader or a crash never sees a partial file.
 
-    Names of files that are not UTF-8 are written with their bytes as numbers.
+    The file's folder is made if needed, and a file that exists is replaced. Bytes of file names that are not UTF-8 are written
+    as escapes.
 
     Raises:
         OutputError: the file cannot be written.
@@ -192,7 +198,9 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a binary file atomically: a reader or a crash never sees a partial file. Makes the file's folder if needed.
+    """Write a binary file atomically: a reader or a crash never sees a partial file.
+
+    The file's folder is made if needed, and a file that exists is replaced.
 
     Raises:
         OutputError: the file cannot be written.

@@ -43,7 +43,7 @@ class Table(Generic[T]):
         return tuple(dict.fromkeys((*self._own, *self._registered, *(point.name for point in self._entry_points()))))
 
     def values(self) -> tuple[T, ...]:
-        """The implementations of all names, in the order of `names`."""
+        """The implementations of all names, in the order of `names`; loads those of installed packages."""
         return tuple(self[name] for name in self.names())
 
     def __getitem__(self, name: str) -> T:

@@ -86,7 +86,10 @@ class Trajectory:
         return self.stamps_ns / NS_PER_S
 
     def at(self, stamps_ns: ArrayLike) -> Array:
-        """Poses `(M, 3)` at given stamps by interpolation on SE(2); held constant beyond either end."""
+        """Poses `(M, 3)` at given stamps `(M,)`, ns, by interpolation on SE(2); held constant beyond either end.
+
+        Gaps are bridged, however long: see `known_at`.
+        """
         wanted = np.asarray(stamps_ns, dtype=np.int64)
         if len(self) == 1:
             return np.repeat(self.poses, len(wanted), axis=0)
@@ -96,13 +99,13 @@ class Trajectory:
         return interpolate(self.poses[right - 1], self.poses[right], fraction)
 
     def covers(self, stamps_ns: ArrayLike, slack_ns: int = 0) -> NDArray[np.bool_]:
-        """Which of the stamps lie within the trajectory's span, `slack_ns` wider on either side."""
+        """Which of the stamps `(M,)`, ns, lie within the trajectory's span, `slack_ns` wider on either side."""
         wanted = np.asarray(stamps_ns, dtype=np.int64)
         return np.asarray((wanted >= self.stamps_ns[0] - slack_ns) & (wanted <= self.stamps_ns[-1] + slack_ns))
 
 
 def known_at(trajectory: Trajectory, stamps_ns: NDArray[np.int64], max_gap_s: float = MAX_GAP_S) -> NDArray[np.bool_]:
-    """At which stamps a trajectory can be interpolated: inside its span, and not inside a gap longer than `max_gap_s`."""
+    """At which (M,) of the stamps (M,), ns, a trajectory is known: inside its span, and not inside a gap beyond `max_gap_s`."""
     if len(trajectory) == 0:
         return np.zeros(len(stamps_ns), dtype=np.bool_)
     times = trajectory.stamps_ns
@@ -152,7 +155,9 @@ NO_ANCHORS = anchors_on(np.zeros((1, 3)), np.zeros(0, np.int64), np.zeros(0, np.
 
 
 def read_tum(path: Path) -> Trajectory:
-    """Read a file of lines `stamp x y z qx qy qz qw` (seconds, m). Of lines with equal stamps the first is kept.
+    """Read a file of lines `stamp x y z qx qy qz qw` (seconds, m) as planar poses: z, roll and pitch are dropped.
+
+    Of lines with equal stamps the first is kept.
 
     Raises:
         StreamError: the file is missing or empty, or a line is damaged, not finite or earlier than the one before.
@@ -207,7 +212,11 @@ def format_motion(moved_m: float, turned_deg: float) -> str:
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write a TUM file: stamps with 9 decimals, poses with 17 significant digits. The file appears at once when complete."""
+    """Write a TUM file: stamps with 9 decimals, poses with 17 significant digits. The file appears at once when complete.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
     quaternions = quaternion_from_yaw(trajectory.poses[:, 2])
     lines = [
         f"{format_stamp(int(stamp))} {pose[0]:.17g} {pose[1]:.17g} 0 0 0 {q[2]:.17g} {q[3]:.17g}\n"

@@ -131,11 +131,11 @@ class WheelNoise:
         return learns and (was_trusted or self.trusted)
 
     def register(self, registration: RelativePose) -> None:
-        """Add the motion of the newest step by registration."""
+        """Add the motion of the newest step by registration: the pose of its last node in the frame of its first."""
         self._steps[-1].registration = registration
 
     def measure_again(self, deltas: Array) -> bool:
-        """Replace the motion of all steps by the wheels, (S, 3), and learn again what was learnt from them.
+        """Replace the motion of all S steps by the wheels, (S, 3) m and rad, and learn again what was learnt from them.
 
         Returns:
             Whether the covariances of edges must change.
