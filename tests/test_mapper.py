@@ -12,7 +12,7 @@ from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.io import graph_hash
 from hybridmap.mapper import Mapper
-from hybridmap.streams.base import SelfMotion
+from hybridmap.streams.base import Sample, SelfMotion
 from hybridmap.streams.laser import LaserScan
 from hybridmap.trajectory import Trajectory
 from hybridmap.verification.shadow import overwrite
@@ -142,7 +142,7 @@ def test_samples_that_come_too_late_are_left_out_and_counted():
     stream = RoomDrive()
     mapper = Mapper(Config.load("laser"), stream.rig)
     scan = next(sample for sample in stream if isinstance(sample, LaserScan))
-    later = [SelfMotion(scan.stamp_ns + step, np.zeros(3)) for step in (1, 2)]
+    later: list[Sample] = [SelfMotion(scan.stamp_ns + step, np.zeros(3)) for step in (1, 2)]
     assert [len(mapper.add(sample)) for sample in (*later, scan)] == [1, 1, 0]
     assert mapper.left_out == {"observations behind odometry": 1}
 
