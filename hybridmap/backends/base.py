@@ -15,8 +15,10 @@ ODOMETRY = "odometry"
 
 
 class SolveStatus(StrEnum):
-    """Why a solver stopped. After `diverged`, `singular` and `failed` the poses are the initial ones.
+    """Why a solver stopped. After `diverged`, `singular` and `failed` the poses are those that it started from.
 
+    `max-iterations`: the limit ended the solver before it had converged.
+    `stalled`: no step lowered the cost, far from an optimum, or an update raised chi2. The poses are the last ones reached.
     `waiting`: the update only placed new nodes; the solver takes the new edges at a loop closure or at the end of the drive.
     `fell-back`: a robust solver could not go on, and its poses are those of a simpler method, which the message names.
     """
@@ -44,10 +46,11 @@ class Outcome:
         poses: (N, 3) poses of all nodes, m and rad.
         status, message: why the solver stopped; one line for people.
         iterations: number of iterations (sweeps for relaxation).
-        weights: loop edge id -> final weight.
+        weights: loop edge id -> final weight in [0, 1]; empty without a robust kernel.
         rejected: edge ids of the loops treated as outliers.
         values: the poses in the solver's own form, for a warm start; None if it needs none.
         calibrated: the graph with the odometry calibration that the solver estimated; None if it estimates none.
+        figures: further figures of the solver, by name, for tables.
     """
 
     poses: Array
@@ -74,20 +77,23 @@ class SolveReport:
         status: why the solver stopped.
         message: one line for people.
         iterations: number of iterations (sweeps for relaxation).
-        chi2_initial, chi2: chi2 over all edges before and after, by `backends.objective.chi2` for every back-end; never the
-            solver's own cost.
+        chi2_initial, chi2: chi2 over all edges, rejected ones too, at the poses before and after, by
+            `backends.objective.chi2` for every back-end; never the solver's own cost.
         cpu_s: process time spent, s.
         rejected_edge_ids: edge ids of the loops treated as outliers: those of weight zero (graduated non-convexity), or with
             a residual beyond the gate (robust kernels).
         weights: loop edge id -> final weight in [0, 1]; empty for back-ends without a robust kernel.
-        chi2_odometry: part of `chi2` from edges that are not loops. A large part with rejected loops means a wrong map.
-        unit_variance: chi2 of the inlier edges per degree of freedom; 1 if the stated covariances are right.
+        chi2_odometry: part of `chi2` from edges that are not loops; None: not computed. A large part with rejected loops means
+            a wrong map.
+        unit_variance: chi2 of the inlier edges per degree of freedom; 1 if the stated covariances are right; None: not
+            computed.
         rejected_clusters: groups of rejected loops that agree with each other, the largest first: either rejected true
             loops, or one place mistaken for another. Only if a whole graph was solved.
         inconsistent_edge_ids: the rejected loops that the pre-filter (`judging.prefilter`) removed before solving.
         weak_edges: edge id -> weight, for odometry and registration edges that the kernel `backends.robust.odometry` gave a
             weight below a tenth. They are excluded from the unit variance.
         hanging_nodes: number of nodes that only down-weighted edges and rejected loops join to node 0.
+        figures: further figures of the solver, by name, for tables.
 
     If the back-end calibrates odometry, its estimate applies to odometry chi2, unit variance, clusters and down-weighted edges.
     """
@@ -150,7 +156,8 @@ class SupportsPoseGraph(Protocol):
 class Backend(Protocol):
     """Interface of a back-end.
 
-    `update` follows a growing graph while driving; `solve` solves a whole graph from its `initial`.
+    `update` follows a growing graph while driving; `solve` solves a whole graph from its `initial`. Between updates nodes keep
+    their numbers, and each new node has an edge to one before it.
     """
 
     @property
@@ -161,20 +168,22 @@ class Backend(Protocol):
         """Follow the graph as it has grown (or lost edges) since the last call, by a cheap warm start.
 
         Raises:
+            GraphError: a new edge is malformed, or a node is not connected; the state before the call is kept.
             BackendError: the graph cannot be solved; the state before the call is kept.
         """
 
     def finish(self, graph: PoseGraph) -> Solution:
-        """The final solution at the end of a drive, from the state that `update` has reached.
+        """The final solution at the end of a drive, from the state that `update` has reached. It may be called again.
 
         Raises:
+            GraphError: the graph is malformed or not connected.
             BackendError: the graph cannot be solved; the state before the call is kept.
         """
 
     def solve(self, graph: PoseGraph | SupportsPoseGraph) -> Solution:
-        """Solve a whole graph, independently of earlier calls.
+        """Solve a whole graph, independently of earlier calls; what `update` has reached stays as it is.
 
         Raises:
-            GraphError: the graph is malformed (see `PoseGraph.validate`).
+            GraphError: the graph is malformed (see `PoseGraph.validate`) or not connected.
             BackendError: the solver failed; the message says why.
         """

@@ -88,9 +88,11 @@ def compare(
 ) -> list[Row]:
     """Solve one frozen graph with each back-end in each way. A back-end that fails gets a row with the error.
 
+    The rows are in the order of the back-ends, and for each in the order of the ways.
+
     Args:
         graph: the graph.
-        backends: names, or back-ends that have solved nothing yet, in the order of the rows.
+        backends: names, or back-ends that have solved nothing yet.
         config: settings of the back-ends given by name.
         ways: ways of giving the graph to each; dead reckoning is the same in every way and gets only the first.
         certified: try to prove each solution optimal (`backends.judging.certificate`).
@@ -129,7 +131,7 @@ def compare(
 
 
 def convergence(graph: PoseGraph, name: str, config: BackendsConfig, final: Solution) -> Array:
-    """Convergence of a back-end: iterations and chi2 (K, 2) over the inlier edges of `final`.
+    """Convergence (K, 2) of a back-end: number of iterations, and chi2 then over the edges that `final` does not reject.
 
     Each point is a separate run with that limit, at Fibonacci numbers of iterations or sweeps; together they take about two
     and a half times as long as one run. Back-ends that do not iterate on one objective get only the first and last point.
@@ -137,7 +139,7 @@ def convergence(graph: PoseGraph, name: str, config: BackendsConfig, final: Solu
     Args:
         graph: the graph that was solved.
         name, config: name and settings of the back-end.
-        final: its solution of the graph.
+        final: its solution of the whole graph.
     """
     kept = graph.with_edges(~np.isin(graph.edge_ids, final.report.rejected_edge_ids))
     given = graph.with_edges(~np.isin(graph.edge_ids, final.report.inconsistent_edge_ids))

@@ -72,7 +72,8 @@ class Driver:
                 Default: by `solve`, from the graph's `initial`.
             works: when an update calls the solver.
             place: places new nodes.
-            most_rise: relative rise of chi2 above that of the start beyond which a solution is refused.
+            most_rise: relative rise of chi2 above that of the start beyond which a solution is refused, and an update is
+                called `stalled`.
             softens: the solver puts the configured kernel on odometry and registration edges; outliers are reported.
         """
         self._name, self._config = name, config
@@ -94,6 +95,7 @@ class Driver:
         """Follow the graph as it has grown (or lost edges) since the last call.
 
         Raises:
+            GraphError: a new edge is malformed, or a node is not connected.
             BackendError: the graph cannot be solved, or has fewer nodes than before.
         """
         return self._advance(graph, None)
@@ -102,6 +104,7 @@ class Driver:
         """Compute the final solution at the end of a drive.
 
         Raises:
+            GraphError: the graph is malformed or not connected.
             BackendError: the graph cannot be solved.
         """
         if self._last is not None:
@@ -114,7 +117,7 @@ class Driver:
         """Solve a whole graph, independently of earlier calls.
 
         Raises:
-            GraphError: the graph is malformed.
+            GraphError: the graph is malformed or not connected.
             BackendError: the solver failed.
         """
         frozen = graph if isinstance(graph, PoseGraph) else graph.pose_graph()
@@ -248,7 +251,8 @@ class Driver:
 def replay(backend: Backend, graph: PoseGraph) -> Iterator[Solution]:
     """Give a graph to `Backend.update` node by node, as the robot made it; yields the solution after every node.
 
-    An edge enters once both of its nodes exist.
+    The back-end must be in its initial state. A loop enters when it entered the graph (`PoseGraph.entered`), any other edge
+    once both of its nodes exist.
 
     Raises:
         GraphError: the graph is malformed, or a node is joined to later ones only.
@@ -283,7 +287,7 @@ class Ensemble:
         names: names of the back-ends, in order.
         primary: name of the first back-end, whose map the mapper uses.
         solutions: name -> latest solution of the back-end.
-        failures: name -> latest error, for the back-ends that failed.
+        failures: name -> error, for the back-ends whose latest call failed.
     """
 
     def __init__(self, config: BackendsConfig, clock: StageClock, backends: Sequence[str | Backend] | None = None) -> None:

@@ -67,7 +67,12 @@ class GraphSession:
         self._state = Snapshot()
 
     def add_node(self, node: int, pose: ArrayLike | None = None) -> None:
-        """Add a node. The first one stays at its `pose` (3,), m and rad (default: the origin); edges place the others.
+        """Add a node.
+
+        Args:
+            node: its number.
+            pose: (3,) m and rad. The first node stays there (None: at the origin). Of a later one it is only a start for
+                `solve`; None: its edges place it.
 
         Raises:
             BackendError: the node exists already.
@@ -92,18 +97,25 @@ class GraphSession:
     def add_edge(
         self, edge: int, source: int, target: int, delta: ArrayLike, information: ArrayLike, kind: EdgeKind = EdgeKind.LOOP
     ) -> None:
-        """Add an edge: the measured pose (3,) of the target in the frame of the source, m and rad, with its information (3, 3).
+        """Add an edge between two nodes that were added.
+
+        Args:
+            edge: its number, above all earlier ones.
+            source, target: numbers of the nodes.
+            delta: (3,) measured pose of the target in the frame of the source, m and rad.
+            information: (3, 3) inverse covariance of x, y and yaw in the frame of the target.
+            kind: give edges of the chain as `ODOMETRY` or `REGISTRATION`. A robust back-end may reject a `LOOP`.
 
         Raises:
             BackendError: the number `edge` is not above all earlier ones.
-            GraphError: an unknown node, or an invalid measurement.
+            GraphError: an unknown node, both nodes the same, or an invalid measurement.
         """
         state = self._state
         if edge < state.next_edge:
             raise BackendError(f"edge {edge}: numbers must increase, expected {state.next_edge} or more")
         unknown = [node for node in (source, target) if node not in state.rows]
         if unknown:
-            raise GraphError(f"edge {edge} ({source} -> {target}): there is no node {unknown[0]}")
+            raise GraphError(f"edge {edge} ({source} -> {target}): found node {unknown[0]}, expected nodes that were added")
         new = _one_edge(edge, source, target, delta, information, kind)
         replace(new, sources=np.array([0]), targets=np.array([int(target != source)]), initial=np.zeros((2, 3))).validate()
         rows = replace(new, sources=np.array([state.rows[source]]), targets=np.array([state.rows[target]]))
@@ -119,24 +131,27 @@ class GraphSession:
         graph = self._state.graph
         kept = graph.edge_ids != edge
         if kept.all():
-            raise BackendError(f"there is no edge {edge}")
+            raise BackendError(f"edge {edge}: is not in the graph; expected one of its {graph.n_edges} edges")
         require_connected(graph.with_edges(kept))
         self._state = replace(self._state, graph=graph.with_edges(kept))
 
     def remove_node(self, node: int, mode: Literal["drop", "bridge"] = "drop") -> None:
-        """Remove a node and its edges.
+        """Remove a node and its edges; the back-end then starts anew from the present poses.
 
         Args:
             node: the node.
-            mode: `drop`; or `bridge`: join its two neighbours in the chain by one edge, composed of the two edges between them.
+            mode: `drop`; or `bridge`: join the nodes added just before and after it by one odometry edge, composed of the
+                odometry or registration edges that join it to them.
 
         Raises:
-            BackendError: there is no such node, it is the fixed one, or, for `bridge`, it is at an end of the chain.
+            BackendError: there is no such node, it is the fixed one, or, for `bridge`, it is at an end of the chain or such
+                an edge is missing.
             GraphError: another node would be left without a path to the fixed node.
         """
         state = self._state
         if node not in state.rows or node == state.fixed:
-            raise BackendError(f"node {node}: {'is the fixed one' if node in state.rows else 'there is no such node'}")
+            found = "is the fixed one" if node in state.rows else "is not in the graph"
+            raise BackendError(f"node {node}: {found}; expected a node that was added and is not fixed")
         row, graph = state.rows[node], state.graph
         if mode == "bridge":
             graph = _joined(graph, _bridge(state, node))
@@ -153,18 +168,19 @@ class GraphSession:
         self._backend = self._fresh()
 
     def fix(self, node: int) -> None:
-        """Hold this node fixed from now on, instead of the present one.
+        """Hold this node fixed at its present pose from now on, instead of the present one.
 
         Raises:
             BackendError: there is no such node, or it has no pose yet.
         """
         state = self._state
         if node not in state.rows or not np.isfinite(state.graph.initial[state.rows[node]]).all():
-            raise BackendError(f"node {node}: has no pose yet, so it cannot be fixed")
+            found = "has no pose yet" if node in state.rows else "is not in the graph"
+            raise BackendError(f"node {node}: {found}; expected a node with a pose; `step` gives it one")
         self._state = replace(self._state, fixed=node)
 
     def step(self, budget: int = 1) -> Solution:
-        """Solve the changed graph: run up to `budget` updates of the back-end, fewer if it converges.
+        """Solve the changed graph: run up to `budget` updates of the back-end, fewer if it converges; returns the last one.
 
         Raises:
             GraphError: the graph is malformed.
@@ -180,7 +196,7 @@ class GraphSession:
         return self._adopt(solution)
 
     def solve(self) -> Solution:
-        """Solve the whole graph anew, independently of earlier solutions.
+        """Solve the whole graph by `Backend.solve`, from the latest poses.
 
         Raises:
             GraphError: the graph is malformed.
@@ -189,7 +205,12 @@ class GraphSession:
         return self._adopt(self._backend.solve(_graph(self._state)))
 
     def poses(self) -> Array:
-        """Latest poses (N, 3) in the order in which nodes were added; edges place the nodes newer than the last solution."""
+        """Latest poses (N, 3), m and rad, in the order in which nodes were added; edges place those after the last solution.
+
+        Raises:
+            BackendError: the session has no node.
+            GraphError: a node without a pose is not connected.
+        """
         return _graph(self._state).initial.copy()
 
     def edge_weights(self) -> dict[int, float]:
@@ -198,14 +219,16 @@ class GraphSession:
         return {} if solution is None else dict(solution.report.weights)
 
     def marginal(self, node: int) -> Array:
-        """Covariance (3, 3) of a node relative to the fixed one, in the node's own frame, at the latest poses.
+        """Covariance (3, 3) of a node relative to the fixed one, in the node's own frame, at the latest poses; m^2 and rad^2.
+
+        It follows from the information of all edges, rejected loops too.
 
         Raises:
             BackendError: there is no such node, or the graph is singular.
         """
         rows = self._state.rows
         if node not in rows:
-            raise BackendError(f"there is no node {node}")
+            raise BackendError(f"node {node}: is not in the graph; expected one of its {len(rows)} nodes")
         graph, fixed = _graph(self._state), rows[_fixed(self._state)]
         covariances = Covariances(graph, graph.initial)
         return np.asarray(covariances.relative(np.array([fixed]), np.array([rows[node]]))[0])

@@ -87,7 +87,7 @@ def unit_variance(graph: PoseGraph, squared: Array, rejected: tuple[int, ...] = 
 def truncated_cost(graph: PoseGraph, poses: Array, bound: float, config: RobustConfig | None = None) -> float:
     """Chi2 with the squared residual of each loop truncated at `bound`, to compare poses when some loops may be false.
 
-    With `config`, odometry and registration edges have the configured robust cost.
+    With `config`, odometry and registration edges have the configured robust cost; without, their squared residual.
     """
     every = squared_norms(graph, poses)
     motion = every if config is None else np.where(graph.is_motion, _COSTS[config.odometry](every, ODOMETRY_SCALE), every)
@@ -100,12 +100,15 @@ def gate_of(config: BackendsConfig) -> float:
 
 
 def motion_weights(graph: PoseGraph, squared: Array, config: RobustConfig) -> Array:
-    """Weight (E,) of each edge by the configured kernel on odometry and registration, at squared residuals (E,); loops: 1."""
+    """Weight (E,) of each edge at squared residuals (E,): the configured kernel's on odometry and registration, 1 on others."""
     return np.where(graph.is_motion, _WEIGHTS[config.odometry](squared, ODOMETRY_SCALE), 1.0)
 
 
 def weak_edges(graph: PoseGraph, squared: Array, config: RobustConfig) -> dict[int, float]:
-    """Edge id -> weight, for the odometry and registration edges with a weight below `WEAK`."""
+    """Edge id -> weight, for the odometry and registration edges with a weight below `WEAK`; empty without a kernel on them.
+
+    `squared` (E,) are the squared residuals of the graph's edges.
+    """
     if config.odometry == "none":
         return {}
     weights = motion_weights(graph, squared, config)
@@ -119,7 +122,7 @@ def softened(graph: PoseGraph, poses: Array, config: RobustConfig) -> PoseGraph:
 
 
 def parts(graph: PoseGraph, without: tuple[int, ...]) -> NDArray[np.int32]:
-    """Number (N,) of the connected part of each node if the edges with the ids `without` are left out."""
+    """Label (N,) of each node, equal for connected ones, if the edges with the ids `without` are left out."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 

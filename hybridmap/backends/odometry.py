@@ -18,7 +18,7 @@ def create(name: str, config: BackendsConfig) -> Driver:
 
 
 def dead_reckoning(graph: PoseGraph, placed: Array) -> Array:
-    """Poses (N, 3) of all nodes: those of `placed` (M, 3), and for further nodes the chain of odometry edges.
+    """Poses (N, 3) of all nodes: `placed` (M, 3) for the first M, and for further nodes the chain of odometry edges; m and rad.
 
     A node may have no odometry edge, because a registration that contradicts it drops the edge. Then the relative pose of the
     graph's `initial` is used: in a map `initial` is the odometry chain.

@@ -54,7 +54,7 @@ _TABLE: Table[Factory] = Table("back-end", _OURS, "hybridmap.backends", BackendE
 
 
 def names() -> tuple[str, ...]:
-    """The names of all back-ends."""
+    """The names of all back-ends: ours, then registered ones and those of installed packages."""
     return _TABLE.names()
 
 
@@ -70,7 +70,11 @@ def register(name: str, factory: Factory) -> None:
 def create(backend: str | Backend, config: BackendsConfig | None = None) -> Backend:
     """Make a back-end by its name, in its initial state, with the pre-filter before it if configured.
 
-    If an instance is given instead of a name, it is returned unchanged, with its own settings.
+    If an instance is given instead of a name, it is returned unchanged, with its own settings and without a pre-filter.
+
+    Args:
+        backend: a name of `names`, or an instance.
+        config: settings of all back-ends; its list of names is not used. None: the defaults.
 
     Raises:
         BackendError: no such name; the message lists the known names.

@@ -117,7 +117,10 @@ class WarmStart:
         self._values: Any = None
 
     def __call__(self, graph: PoseGraph, start: Array) -> Outcome:
-        """Run the optimiser once; for a graph seen before, `start` (N, 3) must continue the last outcome."""
+        """Run the optimiser once; for a graph seen before, `start` (N, 3) must continue the last outcome.
+
+        The optimiser takes only the poses of new nodes from `start`.
+        """
         added = difference(self._graph, graph).added
         known = self._graph.n_nodes if self._graph is not None else 0
         new = graph.with_edges(added)

@@ -46,7 +46,7 @@ class NoiseModels:
         self._loop, self._motion = loop, motion
 
     def __call__(self, information: Array, *, loop: bool = False, motion: bool = False) -> Any:
-        """The noise model of one edge."""
+        """The noise model of one edge with this information (3, 3); `loop` and `motion` choose which kernel it gets, if any."""
         return self._model(information.tobytes(), information, loop=loop, motion=motion)
 
     def of(self, graph: PoseGraph) -> list[Any]:
@@ -70,7 +70,7 @@ class NoiseModels:
 
 
 def loop_kernel(name: str, config: RobustConfig) -> Any:
-    """The GTSAM kernel for loops of this name."""
+    """The GTSAM kernel for loops of this name: `cauchy`, `huber`, `dcs` or `geman-mcclure`."""
     return _LOOP[name](config)
 
 
@@ -88,7 +88,7 @@ def factors(graph: PoseGraph, models: NoiseModels) -> list[Any]:
 
 
 def anchor(initial: Array) -> Any:
-    """The prior factor that holds node 0 at the first pose of `initial`."""
+    """The prior factor that holds node 0 at the pose `initial` (3,)."""
     noise = gtsam.noiseModel.Isotropic.Sigma(3, _PRIOR_SIGMA)
     return gtsam.PriorFactorPose2(0, gtsam.Pose2(*initial), noise)
 

@@ -61,7 +61,7 @@ class Truncated:
 
     Attributes:
         poses: (N, 3) poses, m and rad.
-        kept: (L,) whether each loop is an inlier.
+        kept: (L,) whether each loop is an inlier, in the graph's order.
         rounds: number of annealing steps and of iterations after them.
         bound: squared residual beyond which a loop was an outlier at the end.
         lack: what could not be done, in words; empty if all was done.

@@ -203,11 +203,11 @@ class Smoother:
 
     @property
     def is_empty(self) -> bool:
-        """Whether the smoother has no factors yet."""
+        """Whether `follow` was not called yet."""
         return self._graph is None
 
     def lacks(self, graph: PoseGraph) -> Change:
-        """The difference between a graph and the edges that the smoother holds."""
+        """What differs between the edges that the smoother holds and a graph, to be given to `follow`."""
         return difference(self._graph, graph)
 
     def follow(self, graph: PoseGraph, start: Array, change: Change) -> None:
@@ -236,7 +236,7 @@ class Smoother:
         return SETTLE_UPDATES
 
     def poses(self) -> Array:
-        """Current estimate (N, 3)."""
+        """Current estimate (N, 3) of the nodes that `follow` has added, m and rad."""
         point, n = self.isam.getLinearizationPoint(), len(self._point)
         if _MANY * len(self._marked) > n:
             self._point = poses_of(point)

@@ -33,7 +33,7 @@ LOOSE_M, LOOSE_RAD = 0.5, float(np.deg2rad(10.0))
 
 
 def is_group(graph: PoseGraph, edges: Indices) -> bool:
-    """Whether loops, given by index, are enough, from enough newer nodes, to be believed together."""
+    """Whether loops, given by indices (L,), are enough, from enough newer nodes, to be believed together."""
     newer = np.maximum(graph.sources[edges], graph.targets[edges])
     return len(edges) >= LEAST_LOOPS and len(np.unique(newer)) >= LEAST_NODES
 
@@ -51,13 +51,16 @@ def shift(motion: Array, poses: Array, place: int) -> tuple[float, float]:
 
 
 def leads_across(graph: PoseGraph, place: int) -> Mask:
-    """(E,) which edges lead from a node before `place` to that node or a later one."""
+    """(E,) which edges join a node before `place` to that node or a later one, in either direction."""
     low, high = np.minimum(graph.sources, graph.targets), np.maximum(graph.sources, graph.targets)
     return np.asarray((low < place) & (high >= place))
 
 
 def wanted_motion(graph: PoseGraph, poses: Array, edges: Indices, place: int) -> Array:
-    """The transform (3,) of the map that loops, given by index, want: the median of where they put the node `place`."""
+    """The transform (3,) of the map, m and rad, that loops, given by indices (L,), want: the median of where they put a node.
+
+    They are carried to the node `place` along the map with poses (N, 3).
+    """
     loops = loops_of(graph, edges)
     seen = compose(poses[loops.older], loops.relative.delta)
     placed = compose(seen, between(poses[loops.newer], np.broadcast_to(poses[place], (len(seen), 3))))

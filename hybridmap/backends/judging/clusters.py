@@ -21,7 +21,7 @@ _LEAST = 3  # loops of a cluster
 
 
 def rejected_clusters(graph: PoseGraph, poses: Array, rejected: tuple[int, ...], gate: float) -> tuple[tuple[int, ...], ...]:
-    """Groups of rejected loops in which neighbouring loops agree: tuples of edge ids, the largest group first.
+    """Groups of three or more rejected loops in which neighbours agree: tuples of edge ids, the largest group first.
 
     Args:
         graph: the graph.

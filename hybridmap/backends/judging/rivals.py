@@ -37,7 +37,7 @@ class Rival:
 
 
 def rivals(graph: PoseGraph, poses: Array, groups: Sequence[Sequence[int]], kept: NDArray[np.bool_]) -> list[Rival]:
-    """What each group of refused loops claims, and how many loops of the map stand against it.
+    """What each group of refused loops claims, and how many loops of the map stand against it; one result for each group.
 
     Args:
         graph: the graph with the loops of the groups.

@@ -52,15 +52,15 @@ class Bend:
 
 
 def largest_bend(graph: PoseGraph, poses: Array, variance: float = 1.0) -> Bend | None:
-    """The stretch of consecutive nodes that a map bends most against the edges of motion.
+    """The stretch of 5, 10 or 20 m that a map bends most against the edges of motion, in standard deviations.
 
     Args:
-        graph: the measurements; several edges of two nodes are fused.
+        graph: the measurements; the information of several edges of two nodes adds up.
         poses: (N, 3) poses of the map, m and rad.
         variance: factor on the covariances of the edges.
 
     Returns:
-        None if the drive is too short.
+        None if the drive is shorter than the shortest stretch, or its chain is broken on all of them.
     """
     chain = chain_of(graph)
     travel, worst = _travel(chain), None

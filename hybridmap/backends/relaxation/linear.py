@@ -87,6 +87,13 @@ def relax(rule: LinearRule, positions: Array, rate: float | Array, sweeps: int, 
     """Run up to `sweeps` sweeps of positions += rate * correction; returns the positions and the number of sweeps.
 
     The positions are None if they grew without bound. The run ends early once no node moves by more than `tolerance_m`.
+
+    Args:
+        rule: the correction.
+        positions: (N, 2) initial positions, m; they are not changed.
+        rate: one for all nodes, or (N, 1).
+        sweeps: most sweeps.
+        tolerance_m: largest step of a coordinate, m, that ends the run.
     """
     before = rule.objective(positions)
     with np.errstate(over="ignore", invalid="ignore"):
