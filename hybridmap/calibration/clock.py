@@ -72,10 +72,11 @@ class ClockOffset:
 
     Attributes:
         state: whether it is known, or why not.
-        offset_s: the offset beside `sensors.odometry_delay_s`, s; NaN if not known. With `TIME_BASE` it is rough.
+        offset_s: the offset beside `sensors.odometry_delay_s`, s, positive if views are stamped later; NaN if not known. With
+            `TIME_BASE` it is rough.
         sigma_s: its standard deviation, s; infinite if not known.
         used_s: the offset that the map was corrected by, s; 0 if it was not.
-        travel_m: path length that it is estimated from, m.
+        travel_m: path length of the drive that it is estimated from, m.
     """
 
     state: ClockState = ClockState.OPEN
@@ -91,7 +92,7 @@ class ClockOffset:
 
     @property
     def matters(self) -> bool:
-        """Whether it is known, large enough to spoil a map, and not zero by its standard deviation."""
+        """Whether it is known, above `MATTERS_S`, and above two of its standard deviations: then it is worth a correction."""
         return self.known and abs(self.offset_s) > max(MATTERS_S, 2.0 * self.sigma_s)
 
     @property
@@ -117,7 +118,7 @@ class Headings:
     Attributes:
         stamps_s: (S,) stamps by the odometry's clock, strictly increasing, s.
         yaw_rad: (S,) heading, not wrapped.
-        travel_m: (S,) path length.
+        travel_m: (S,) path length up to each stamp.
     """
 
     stamps_s: Array
@@ -130,12 +131,12 @@ class Headings:
         return ends[1] - ends[0], ends[3] - ends[2]
 
     def rates(self, at_s: Array) -> Array:
-        """(R,) turn rates at given times, rad/s."""
+        """(R,) turn rates at times (R,) on the odometry's clock, s, taken over 0.2 s; rad/s."""
         after, before = (np.interp(at_s + h, self.stamps_s, self.yaw_rad) for h in (_RATE_S, -_RATE_S))
         return np.asarray((after - before) / (2.0 * _RATE_S))
 
     def gaps(self, at_s: Array) -> Array:
-        """(R,) time between the two messages around given times, s; infinite outside."""
+        """(R,) time between the two messages around times (R,) on the odometry's clock, s; infinite outside."""
         after = np.searchsorted(self.stamps_s, at_s)
         inside = (after > 0) & (after < len(self.stamps_s))
         after = np.clip(after, 1, len(self.stamps_s) - 1)
@@ -170,7 +171,7 @@ def offset_of(headings: Headings, turns: Turns, *, wide: bool = False) -> ClockO
 
     Args:
         headings: the odometry.
-        turns: the registrations.
+        turns: the registrations, with stamps that count from the same moment as those of the odometry.
         wide: whether to look for another time base too, at ten times the cost, if no delay is found.
     """
     turns = turns.select(turns.sigma_rad < _WEAK_RAD)

@@ -30,8 +30,8 @@ class Estimate:
 
     Attributes:
         gains: the estimated gain, turn gain and heading bias.
-        delay_s: delay of the odometry clock: odometry of stamp t gives the pose at t + delay_s. Estimated together with the
-            gains, as a delay would otherwise look like an error of the turn gain.
+        delay_s: delay of the odometry clock, beside one that its stamps were corrected by: odometry of stamp t gives the pose
+            at t + delay_s. Estimated together with the gains, as a delay would otherwise look like an error of the turn gain.
         covariance: (4, 4) covariance of gain, turn gain, heading bias and delay, scaled by the unit variance. A value that the
             drive leaves open has infinite variance, and is neutral (gain 1, turn gain 1, bias 0, delay 0).
         leg_m: length of the legs, m.
@@ -57,30 +57,39 @@ class Estimate:
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """(4,) whether gain, turn gain, bias and delay were observable."""
+        """(4,) which of gain, turn gain, heading bias and delay the drive determines: those whose variance is finite."""
         return np.isfinite(np.diag(self.covariance))
 
     def kept(self, in_use: Gains) -> Gains:
-        """The gains to use from now on: the estimate where it was observable, else the value in use."""
+        """The gains to use from now on: the estimate where the drive determines it (`measured`), else the value in use.
+
+        Whether they differ significantly is not asked: see `differs`.
+        """
         return Gains.from_array(np.where(self.measured[:3], self.gains.to_array(), in_use.to_array()))
 
     def off(self, other: Gains = NEUTRAL) -> Array:
-        """(3,) distance of gain, turn gain and heading bias from `other`, in standard deviations; 0 if unobservable."""
+        """(3,) gain, turn gain and heading bias minus those of `other`, in standard deviations; 0 if unobservable."""
         difference = self.gains.to_array() - other.to_array()
         return np.asarray(difference / np.maximum(self.sigmas[:3], 1e-12))
 
     @property
     def delay_differs(self) -> bool:
-        """Whether the delay differs significantly from zero."""
+        """Whether the delay differs from zero by more than `SIGNIFICANT_SIGMAS` standard deviations."""
         return bool(abs(self.delay_s) > SIGNIFICANT_SIGMAS * self.sigmas[3])
 
     def differs(self, other: Gains = NEUTRAL) -> bool:
-        """Whether gain, turn gain or heading bias differs significantly from that of `other`."""
+        """Whether gain, turn gain or heading bias differs from that of `other` by more than `SIGNIFICANT_SIGMAS`."""
         return bool(np.any(np.abs(self.off(other)) > SIGNIFICANT_SIGMAS))
 
 
 def metrics_of(estimate: Estimate, in_use: Gains, delay_s: float = 0.0) -> list[Metric]:
-    """Each gain with its standard deviation and distance from the value in use (NaN if unobservable), and the data used."""
+    """Each gain with its standard deviation and distance from the value in use (NaN if unobservable), and the data used.
+
+    Args:
+        estimate: what was estimated.
+        in_use: the gains in use.
+        delay_s: the delay in use, s, to be listed beside the estimated one.
+    """
     rows: list[Metric] = []
     told, sigmas, off = estimate.measured, estimate.sigmas, estimate.off(in_use)
     values = np.append(estimate.gains.to_array(), estimate.delay_s)

@@ -104,13 +104,14 @@ def solve(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config
 
 
 def told_by_the_drive(estimate: Estimate) -> Estimate:
-    """Return an estimate without the values about which the drive says less than the prior does.
+    """Return an estimate without the values about which the drive says less than the prior (`PRIOR`) does.
 
-    Of the distance gain and the delay, such a value becomes neutral (1, 0 s) with infinite variance. The turn gain and the
-    heading bias cannot be left out.
+    That is where more than half of the prior's variance is left. Of the distance gain and the delay, such a value becomes
+    neutral (1, 0 s) with infinite variance. The turn gain and the heading bias cannot be left out.
 
     Raises:
-        NotToldError: the drive says less than the prior about the turn gain or the heading bias.
+        NotToldError: more than half of the prior's variance of the turn gain or the heading bias is left.
+        EvaluationError: the delay is beyond `DELAY_LIMIT_S`, or a gain is outside the limits of a configuration.
     """
     open_ = np.diag(estimate.covariance) > _OPEN * estimate.unit_variance * PRIOR**2
     if open_[1] or open_[2]:
@@ -126,7 +127,13 @@ def told_by_the_drive(estimate: Estimate) -> Estimate:
 
 
 class Problem:
-    """The optimisation of one graph and its calibration, to be solved from several initial values."""
+    """The optimisation of one graph and its calibration, to be solved from several initial values.
+
+    Attributes:
+        others: the graph without the odometry edges from a node to the next, which `terms` stand for.
+        terms: the terms of odometry, as of the last call of `solve`.
+        key: number of the calibration among the GTSAM variables; those below are the nodes.
+    """
 
     def __init__(self, graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], config: BackendsConfig) -> None:
         self.graph, self.config = graph, config
@@ -150,11 +157,11 @@ class Problem:
         return poses
 
     def solve(self, poses: Array, variable: Array, scale: float, bias_start_rad_m: float) -> Joint | None:
-        """Solve from given poses (N, 3) and calibration (4,); None if GTSAM fails or the result is not finite.
+        """Solve from given poses and calibration, with `terms` made anew; None if GTSAM fails or the result is not finite.
 
         Args:
-            poses: initial poses, m and rad.
-            variable: initial gain, turn gain, heading bias (rad/m) and delay (s).
+            poses: (N, 3) initial poses, m and rad.
+            variable: (4,) initial gain, turn gain, heading bias (rad/m) and delay (s).
             scale: factor on the assumed standard deviations of odometry.
             bias_start_rad_m: initial heading bias of this attempt, for the log and the result.
         """
@@ -175,21 +182,21 @@ class Problem:
         return self._result(solved, np.asarray(marginal), float(nonlinear.error(solved)), bias_start_rad_m)
 
     def scale(self, poses: Array, variable: Array) -> float:
-        """Median ratio of the odometry residuals to their assumed size, at given poses (N, 3) and calibration (4,)."""
+        """Median ratio of the residuals of `terms` to their assumed size, at given poses (N, 3) and calibration (4,)."""
         norms = np.linalg.norm(self._residuals(poses, variable), axis=1)
         expected = np.array([_MEDIAN_OF_NORM[rows] for rows in self.terms.components])
         return max(float(np.median(norms / expected)), 1e-3)
 
     def require_held(self, poses: Array) -> None:
-        """Refuse poses (N, 3) that contradict nearly all edges besides odometry, as nothing then checks the calibration.
+        """Refuse poses (N, 3) that contradict nearly all registrations and loops, as nothing then checks the calibration.
 
         Raises:
-            NotToldError: fewer than three edges besides odometry have a weight of at least one half.
+            NotToldError: fewer than three registrations and loops together have a weight of at least one half.
         """
         held = int(np.count_nonzero(squared_norms(self.others, poses) <= self.config.robust.cauchy_scale**2))
         if held < _HELD:
             raise NotToldError(
-                f"calibration: found {held} of {self.others.n_edges} loop closures that agree with the map, "
+                f"calibration: found {held} of {self.others.n_edges} registrations and loop closures that agree with the map, "
                 f"expected {_HELD} or more; give a drive that comes back to more places"
             )
 
@@ -199,9 +206,9 @@ class Problem:
         return np.asarray(np.einsum("eij,ej->ei", self.terms.whiten, compose(inverse(predicted), apart)))
 
     def evaluate(self, variable: Array) -> tuple[Array, Array]:
-        """Displacements (E, 3) of all odometry terms, and their derivatives (E, 3, 4) by the calibration.
+        """Displacements (E, 3) of all odometry terms, m and rad, and their derivatives (E, 3, 4) by the calibration.
 
-        Both are computed once per value of the calibration `variable` (4,).
+        Both are kept for the next call with the same calibration `variable` (4,).
         """
         mark = variable.tobytes()
         if self._evaluated is None or self._evaluated[0] != mark:

@@ -51,6 +51,8 @@ class Motion:
 class Legs:
     """Pieces of raw odometry between pairs of times, given on the clock of the sensor that gave the poses.
 
+    Times outside the odometry count as its first or last stamp.
+
     Attributes:
         motion: the odometry.
         first_ns, last_ns: (L,) int64, start and end of each leg.
@@ -127,12 +129,14 @@ class Legs:
 
 
 def corrected(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], gains: Gains, delay_s: float = 0.0) -> PoseGraph:
-    """Copy of the graph with odometry edges recomputed from calibrated odometry; their information is unchanged.
+    """Copy of the graph with the odometry edges from a node to the next recomputed from calibrated odometry.
+
+    Their information and all other edges are unchanged.
 
     Args:
         graph: nodes and accepted edges.
         motion: raw odometry.
-        stamps_ns: (N,) stamps of the nodes.
+        stamps_ns: (N,) stamps of the nodes, ns.
         gains: the calibration.
         delay_s: delay of the odometry clock: odometry of stamp t gives the pose at t + delay_s.
     """

@@ -42,7 +42,7 @@ class OdometryTerms:
     overlap: float
 
     def scaled(self, scale: float) -> OdometryTerms:
-        """Copy of the terms with the standard deviations of the odometry edges multiplied by `scale`."""
+        """Copy of the terms with the standard deviations of all of them, long legs too, multiplied by `scale`."""
         return replace(self, whiten=self.whiten / scale)
 
 

@@ -85,7 +85,11 @@ class SensorClock:
             self._poses.extend(pose_odom.tolist())
 
     def follow(self, experiences: ExperienceMap) -> float | None:
-        """Take note of a new node; returns the offset to correct from now on, s, at the one node where it becomes known."""
+        """Take note of a new node, the newest of the map.
+
+        Returns:
+            The offset to correct from now on, s, once: at the node where it becomes known, if it matters. Else None.
+        """
         travel_m = experiences.node(len(experiences) - 1).travel_m
         if travel_m < self._due_m:
             return None
@@ -146,9 +150,12 @@ def _turns(experiences: ExperienceMap, start_ns: int) -> Turns:
 
 
 class OnlineCalibration:
-    """Collects raw odometry, and from time to time estimates its gains from the map. Does nothing if it is switched off.
+    """Collects raw odometry, and from time to time estimates its gains from the map.
 
     Odometry edges that exist do not change; new gains apply to the rest of the drive.
+
+    Attributes:
+        changes: the changes of the gains so far, in order.
     """
 
     def __init__(self, gains: Gains) -> None:
@@ -172,6 +179,8 @@ class OnlineCalibration:
 
     def follow(self, stamp_ns: int, graph: Callable[[], PoseGraph], poses: Callable[[], Array]) -> GainChange | None:
         """Take note of a new node; returns the change of gains to apply, None if there is none.
+
+        From then on the new gains count as those in use.
 
         Args:
             stamp_ns: stamp of the new node.
@@ -223,11 +232,14 @@ class OdometryWatch:
             self._gains.observe(ready.stamp_ns, ready.delta_robot)
 
     def follow(self, experiences: ExperienceMap, poses: Callable[[], Array]) -> str:
-        """Take note of a new node, and correct what the map shows to be wrong; returns what was corrected, in words.
+        """Take note of a new node, and correct what the map shows to be wrong.
 
         Args:
             experiences: the map with the new node.
             poses: called for the poses (N, 3) of all nodes, only if an estimate of the gains is due.
+
+        Returns:
+            What was corrected, in words that begin with "; ", to be added to a reason; empty string if nothing was.
         """
         said = ""
         if (late_s := self.clock.follow(experiences)) is not None:

@@ -62,7 +62,7 @@ _HEADING = ("turn gain", "heading bias", "delay")
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """A drive with known poses.
+    """A drive with known poses, e.g. those of its nodes on a map, or of a reference.
 
     Attributes:
         motion: raw odometry.
@@ -119,7 +119,9 @@ def require_leg(leg_m: float) -> None:
 
 
 def require_told_by(sighting: Sighting) -> None:
-    """Refuse a drive whose odometry alone shows that turn gain and heading bias are unobservable, whatever the poses.
+    """Refuse a drive whose odometry alone shows that turn gain and heading bias are unobservable.
+
+    Only the odometry and the stamps of the sighting are used, not its poses.
 
     Raises:
         NotToldError: the drive hardly turns, or turn gain and heading bias have the same effect on all of it.
@@ -283,7 +285,7 @@ def _weights(residual: Array) -> Array:
 
 
 class NotToldError(EvaluationError):
-    """The drive does not determine a calibration value that was asked for."""
+    """The drive does not determine a value of the calibration that must be determined; the message names it."""
 
 
 def require_told(slope: Array) -> None:

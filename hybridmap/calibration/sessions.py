@@ -47,9 +47,9 @@ class Drive:
 
     Attributes:
         name: name of the session's folder.
-        motion: raw odometry, without the gains of the session's configuration.
+        motion: raw odometry, without the gains of the session; its stamps include the delay in use.
         graph: nodes and accepted edges.
-        stamps_ns: (N,) stamps of the nodes.
+        stamps_ns: (N,) stamps of the nodes, ns.
         poses: (N, 3) poses of the nodes by the primary back-end, m and rad.
         config: the part of the session's configuration that a calibration needs: gains, delay and back-ends.
         config_tree: the whole configuration, as stored in the map file.
@@ -181,10 +181,10 @@ def require_one_calibration(drives: Sequence[Drive]) -> None:
 
 
 def common_tree(drives: Sequence[Drive]) -> dict[str, Any]:
-    """The configuration that all drives share, as a nested mapping.
+    """The whole configuration that all drives share, as a nested mapping.
 
     Raises:
-        EvaluationError: two configurations differ; the message names the first difference.
+        EvaluationError: two configurations differ in any setting; the message names the first difference.
     """
     first = _flat(drives[0].config_tree)
     for drive in drives[1:]:
@@ -201,8 +201,10 @@ def common_tree(drives: Sequence[Drive]) -> dict[str, Any]:
 def alternating(drives: Sequence[Drive], leg_m: float | None = None) -> Estimate:
     """Calibrate drives on their own maps: alternately regress odometry on the map, and optimise the map with the calibration.
 
+    Maps must have registrations or loops (`require_closures`). `leg_m` is as for `estimate_of`.
+
     Raises:
-        EvaluationError: a map has only odometry edges, or the drives are too short.
+        EvaluationError: too little data, as for `regress`.
         BackendError: a map cannot be optimised.
     """
     poses = [drive.poses for drive in drives]
@@ -219,7 +221,7 @@ def require_closures(drive: Drive) -> None:
     """Refuse a map of odometry alone: a calibration against it would only give back the odometry.
 
     Raises:
-        EvaluationError: there is no edge besides odometry.
+        EvaluationError: there is no edge besides odometry; registrations suffice, too.
     """
     if not np.any(drive.graph.kinds != EdgeKind.ODOMETRY):
         raise EvaluationError(

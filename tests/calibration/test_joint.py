@@ -71,7 +71,9 @@ def test_a_map_that_drops_its_loops_calibrates_nothing(bent):
     four = graph.with_edges(np.union1d(np.flatnonzero(~graph.is_loop), loops))
     deltas = four.deltas.copy()
     deltas[np.flatnonzero(four.is_loop)[:2]] += [0.0, 2.0, 0.0]
-    with pytest.raises(EvaluationError, match=r"found [0-2] of 4 loop closures that agree with the map, expected 3 or more"):
+    with pytest.raises(
+        EvaluationError, match=r"found [0-2] of 4 registrations and loop closures that agree with the map, expected 3 or more"
+    ):
         joint.solve(replace(four, deltas=deltas), motion, stamps, CONFIG)
 
 
