@@ -30,13 +30,13 @@ Rectifier = Callable[[NDArray[np.floating], NDArray[np.floating]], NDArray[np.fl
 
 
 def relu(drive: NDArray[np.floating], zeros: NDArray[np.floating]) -> NDArray[np.floating]:
-    """The paper's rectifying linear f; works in place."""
+    """Return the paper's f, max(drive, 0), written into `drive`; `zeros` are zeros of its shape."""
     np.maximum(drive, zeros, out=drive)
     return drive
 
 
 def softplus(sharpness: float = SOFTPLUS_SHARPNESS) -> Rectifier:
-    """Return f(x) = log(1 + exp(beta x)) / beta, smooth and therefore free of pinning."""
+    """Return the rectifier f(x) = log(1 + exp(beta x)) / beta of this sharpness beta: smooth, and therefore free of pinning."""
 
     def f(drive: NDArray[np.floating], zeros: NDArray[np.floating]) -> NDArray[np.floating]:
         rest = np.abs(drive)
@@ -63,6 +63,13 @@ def kernel_spectrum(
     The spectrum of exp(-gamma |x|^2) is exp(-|k|^2 / (4 gamma)) / gamma up to a constant, so widths (4 gamma, 4 beta). As
     printed (paper eq. 6) a = c: no local excitation, and once `gain_first` is met, `gain_zero` cannot be chosen and is far
     below -1. With two amplitudes the gains at the first mode and at zero are met exactly.
+
+    Args:
+        squared_wave_number: |k|^2 of each mode, of any shape; the result has the same.
+        gain_first: gain at |k|^2 = 1.
+        gain_zero: gain at |k|^2 = 0; the printed kernel ignores it.
+        widths: (4 gamma, 4 beta), of the excitation and of the inhibition.
+        kernel: two amplitudes, or one as printed.
     """
     wide, narrow = widths
     if kernel == "printed":
@@ -74,9 +81,9 @@ def kernel_spectrum(
 
 
 def combine_bands(cycles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the sheet's two phases or shifts (M, 2) from those of the three bands (M, 3), cycles.
+    """Return the sheets' phases or shifts (M, 2), phi0 and phi120, from the bands' (M, 3), phi0, phi60 and phi120, cycles.
 
-    Least squares under phi60 = phi0 + phi120: the misfit, wrapped, is shared equally.
+    Least squares under phi60 = phi0 + phi120: the misfit, wrapped, is shared equally. The result is not wrapped.
     """
     misfit = cycles[:, 1] - cycles[:, 0] - cycles[:, 2]
     misfit = (misfit - np.round(misfit)) / 3.0
@@ -105,6 +112,16 @@ class GridModules:
         metric: Metric = "hexagonal",
     ) -> None:
         """Make the sheets and let them settle.
+
+        Args:
+            modules: M, number of sheets.
+            side: N, cells along a side of a sheet.
+            fourier_modes: K, modes along each axis on which the recurrent weights act.
+            gains: (2K+1, K+1) Fourier gains of the recurrent weights, as `kernel_spectrum` gives them.
+            rectifier: f.
+            band_drive: gain of the bands' stripes; the uniform excitation is 1.
+            dtype: floating-point type of the rates.
+            metric: lattice on which the sheets fire.
 
         Raises:
             ConfigError: with these gains no stationary pattern forms; the message names the instability.
@@ -174,8 +191,8 @@ class GridModules:
         """Advance by one time constant.
 
         Args:
-            band_advance: (M, 3) how far each band ring moved in this step, cycles; two of the three fix the sheet's shift.
-            band_phasors: (M, 3) unit phasors of where the band rings are after it.
+            band_advance: (M, 3) how far each band ring moved in this step, cycles; the first and the last shift the sheet.
+            band_phasors: (M, 3) unit phasors exp(2 pi i phi) of where the band rings are after it.
         """
         modes = self.modes.forward(self._stack)
         factors = self.modes.shift(band_advance[:, ::2])
@@ -204,7 +221,7 @@ class GridModules:
         return weights.reshape(8, -1).astype(self._dtype)
 
     def band_phases(self) -> NDArray[np.float64]:
-        """Return the phases (M, 3) of the modes (1,0), (1,1) and (0,1) of the activity, cycles in [-0.5, 0.5]."""
+        """Return phi0, phi60, phi120 (M, 3): phases of the activity's modes (1,0), (1,1), (0,1), cycles in [-0.5, 0.5]."""
         modes, k = self.modes.forward(self._stack), self._centre
         first = modes[[k + 1, k + 1, k], :, [0, 1, 1]].T
         return np.asarray(-np.angle(first.astype(np.complex128)) / (2.0 * np.pi))
@@ -233,7 +250,7 @@ class Decoded:
 
     @property
     def agreed(self) -> bool:
-        """Whether the modules agree, so that the position can be trusted."""
+        """Whether the modules agree (misfit below 0.06 cycles), so that the position can be trusted."""
         return self.misfit_cycles < _AGREEMENT_CYCLES
 
 
@@ -256,12 +273,13 @@ class PhaseDecoder:
         """Decode phases (M, 3), cycles.
 
         Starts are tried in order until the modules agree: `last_m`; the first of `starts_m`; the position of best
-        agreement in the box around that; all of `starts_m`. If the modules never agree, the best of the box is returned.
+        agreement in the box around that; all of `starts_m`. If the modules never agree, the best of the box is returned,
+        with `agreed` False.
 
         Args:
-            phases_cycles: (M, 3) phases of the sheets' first modes.
-            last_m: (2,) last decoded position.
-            starts_m: returns further starts (S, 2), the likeliest first; called only if `last_m` fails.
+            phases_cycles: (M, 3) phases of the sheets' first modes, as `GridModules.band_phases` gives them.
+            last_m: (2,) last decoded position, m.
+            starts_m: returns further starts (S, 2), m, the likeliest first; called only if `last_m` fails.
         """
         phases = phases_cycles.reshape(-1)
         found = self._refine(phases, last_m)
@@ -299,7 +317,7 @@ class PhaseDecoder:
 
 
 class LowModes:
-    """Transforms between a stack of sheets (N, M, N) and their modes (2K+1, M, K+1).
+    """Transforms between a stack of M sheets (N, M, N), N being `side`, and their modes (2K+1, M, K+1), K being `modes`.
 
     The stack has a sheet's first axis first, then the module, then the sheet's second axis: so each transform of all modules is
     two small matrix products. Modes are p = -K..K on the first axis, q = 0..K on the last; the half plane suffices because
@@ -359,7 +377,7 @@ class LowModes:
         return np.concatenate([angles.reshape(2 * modules, -1), quarter.reshape(1, -1)])
 
     def squared_wave_number(self, metric: Metric = "hexagonal") -> NDArray[np.int64]:
-        """Return |k|^2 (2K+1, K+1).
+        """Return |k|^2 of every mode (p, q), (2K+1, K+1).
 
         Hexagonal: axes 120 degrees apart, first shell (1,0), (0,1), (1,1). Square: orthogonal axes, first shell (1,0), (0,1).
         """
@@ -368,7 +386,7 @@ class LowModes:
 
 
 def shift_sheets(sheets: NDArray[np.floating], shift_cycles: NDArray[np.float64]) -> NDArray[np.floating]:
-    """Move sheets (M, N, N) by any shifts (M, 2), cycles, exactly in all their modes (Fourier interpolation)."""
+    """Return sheets (M, N, N) moved by any shifts (M, 2), cycles, exactly in all their modes (Fourier interpolation)."""
     side = sheets.shape[-1]
     first, second = np.fft.fftfreq(side, 1.0 / side), np.arange(side // 2 + 1)
     turn = np.exp(-2j * np.pi * shift_cycles[:, 0, None] * first)[:, :, None]

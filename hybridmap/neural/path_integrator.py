@@ -54,6 +54,8 @@ class PathIntegrator:
 
     Attributes:
         gains: calibration of the next steps; may be changed at any time.
+        spacings_m: (M,) grid spacing of each module, m.
+        head_direction, bands, grid, place, attractor: the populations of cells.
     """
 
     def __init__(self, config: NeuralConfig, rng: np.random.Generator | None = None, dtype: DTypeLike = np.float64) -> None:
@@ -89,7 +91,7 @@ class PathIntegrator:
         self.place.learn(self.grid.activity)
 
     def step(self, delta_robot: ArrayLike, dt_s: float) -> None:
-        """Integrate one displacement.
+        """Integrate one displacement. One of zero changes nothing; a turn on the spot moves the head-direction ring alone.
 
         Args:
             delta_robot: (3,) pose of the robot now in the frame of the robot at the last step, m and rad (`geometry.between`
@@ -125,14 +127,17 @@ class PathIntegrator:
 
     @property
     def place_code(self) -> NDArray[np.float32]:
-        """Rates (P,) of the place attractor, of unit length; the distance of two places is 1 - the dot product of their codes.
+        """Rates (P,) of the P place-attractor cells, of unit length; two places differ by 1 - the dot product of their codes.
 
         The code is a function of the present activity alone: the same place gives the same code whenever it is visited.
         """
         return self.attractor.code(self.attractor.unwrapped_m(self._last_decoded_m))
 
     def decode(self) -> Decoded:
-        """Decode the position from all sheets together, with how well the modules agree."""
+        """Decode the position from all sheets together, with how well the modules agree.
+
+        The next decoding starts from the result. The first time the modules do not agree, a warning is logged.
+        """
         decoded = self._decoder.decode(self.grid.band_phases(), self._last_decoded_m, self._attractor_starts)
         if not decoded.agreed and not self._warned:
             log.warning(
@@ -144,7 +149,7 @@ class PathIntegrator:
         return decoded
 
     def module_errors(self, position_m: ArrayLike) -> Array:
-        """Distance (M,) between each module's decoded position and a true position (2,), in units of its spacing."""
+        """Distance (M,) of each module's position, in its nearest repetition, from a true one (2,), m; in its spacings."""
         waves = self.bands.wave_vectors[:, [0, 2], :]
         offset = self.grid.phases() - waves @ np.asarray(position_m, dtype=np.float64)[:2]
         offset -= np.round(offset)
@@ -154,7 +159,7 @@ class PathIntegrator:
     def snapshot(self) -> Snapshot:
         """The state that a node stores, so that `restore` returns the network to it (some 8 kB).
 
-        Keys: `heading` (m,), `band_phases` (M, 3), `grid_phases` (M, 2), `attractor` (N, N), and `near_m` (2,): the
+        Keys: `heading` (m,), `band_phases` (M, 3) and `grid_phases` (M, 2), cycles, `attractor` (N, N), and `near_m` (2,): the
         decoded position, which selects the repetition of the code.
         """
         near = self.decode().position_m
@@ -317,17 +322,29 @@ class Reanchoring:
         return pose if self._pose_odom_cells is None else compose(self._pose_odom_cells, pose)
 
     def remember(self, node: int) -> None:
-        """Store the cells' activity at a new node; with weight 0 only the last node's is kept."""
+        """Store the cells' activity, which is now that of a new node; with weight 0 that of the node before is forgotten."""
         if self.weight == 0.0:
             self._activity_at_node.clear()
         self._activity_at_node[node] = self._integrator.snapshot()
 
     def activity_at(self, node: int) -> Snapshot:
-        """The stored activity of a node."""
+        """The stored activity of a node; with weight 0, the default, known for the newest node only.
+
+        Raises:
+            KeyError: none is stored.
+        """
         return self._activity_at_node[node]
 
     def recalibrate(self, node: int, delta_node_robot: Array) -> None:
-        """Set the cells by the share `weight` to the activity of a node, moved by the robot's pose (3,) in its frame."""
+        """Move the cells by the share `weight` towards the activity of a matched node; with 0 nothing changes.
+
+        Args:
+            node: the matched node.
+            delta_node_robot: (3,) pose of the robot in the frame of the node, m and rad; the activity is moved by it.
+
+        Raises:
+            KeyError: the weight is not 0, and no activity of the node is stored.
+        """
         if self.weight == 0.0:
             return
         before = self.pose_odom_robot

@@ -47,11 +47,14 @@ class PlaceCells:
         return self._weights[: self._recruited]
 
     def rates(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return p = A f[W (s - C_inh_g) - C_inh_p] of every recruited cell, (cells,), 1 at the peak of a field."""
+        """Return p = A f[W (s - C_inh_g) - C_inh_p] of every recruited cell, (cells,), for sheets (M, N, N); 1 at a peak."""
         return self.respond(self.inputs(sheets))
 
     def learn(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
         """One learning step: recruit where nothing responds, else move the responding cells' weights (eq. 8).
+
+        Args:
+            sheets: (M, N, N) rates of the grid cells.
 
         Returns:
             The rates (cells,) of all cells at this position; for a newly recruited cell, its rate after recruiting.
@@ -87,7 +90,7 @@ class PlaceCells:
             log.warning("all %d place cells are recruited; new places get no cell of their own", self._recruited)
 
     def inputs(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Rates above the module's mean of the grid cells that project to place cells, (inputs,), of unit length."""
+        """Input (inputs,) of the place cells from sheets (M, N, N): sampled rates above their module's mean, of unit length."""
         sampled = sheets[:, :: self._stride, :: self._stride].reshape(len(sheets), -1).astype(np.float32)
         above = sampled.dot(self._less_mean)
         np.maximum(above, np.float32(0.0), out=above)
@@ -179,14 +182,14 @@ class PlaceAttractor:
         self.activity = spread
 
     def receive(self, place_input: NDArray[np.floating], share: float) -> None:
-        """Mix the input (N * N,) of the place cells into the activity, as a share of its sum; no input changes nothing."""
+        """Replace a `share` (0..1) of the activity by the place cells' input (N * N,), scaled to it; zeros change nothing."""
         total = float(place_input.sum())
         if total > 0.0:
             given = (place_input * (share / total)).reshape(self.activity.shape).astype(self.activity.dtype)
             self.activity = (1.0 - share) * self.activity + given
 
     def settle(self, iterations: int = 10) -> None:
-        """Let the cells compete without self-motion, until one bump is left."""
+        """Let the cells compete so many times without self-motion; the largest bump is left."""
         for _ in range(iterations):
             self.step(np.zeros(2))
 

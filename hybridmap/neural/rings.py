@@ -46,12 +46,12 @@ class HeadDirectionRing:
         return c / norm, s / norm
 
     def heading_of(self, activity: NDArray[np.floating]) -> float:
-        """The heading of an activity (m,), rad in [-pi, pi]."""
+        """The heading that an activity (m,) stands for, rad in [-pi, pi]; no state changes."""
         c, s = (self._readout @ activity).tolist()
         return math.atan2(s, c)
 
     def rates_at(self, heading_rad: float) -> NDArray[np.floating]:
-        """The activity (m,) at a heading, rad."""
+        """The rates (m,), 1 + cos(theta_i - heading), 0..2, at a heading, rad; no state changes."""
         vector = np.array([math.cos(heading_rad), math.sin(heading_rad), 1.0])
         return np.asarray(vector.astype(self._tuning.dtype).dot(self._tuning))
 
@@ -61,7 +61,7 @@ class HeadDirectionRing:
         return self.heading_of(self.activity)
 
     def turn(self, angle_rad: float) -> tuple[float, float]:
-        """Rotate the population vector by omega dt, rad, left positive.
+        """Turn the ring by an angle, rad, left positive.
 
         Returns:
             (cos, sin) of the mid-point heading, half of the turn ahead of where the ring stood.
@@ -77,7 +77,7 @@ class HeadDirectionRing:
         return middle_c, middle_s
 
     def rates(self, turn_rate_rad_s: float = 0.0) -> NDArray[np.floating]:
-        """Rates (m,) with the turn-rate modulation of real cells, gain 1 + `MODULATION_S` |omega|; no state changes."""
+        """Return the rates (m,) times 1 + `MODULATION_S` |turn_rate_rad_s|, as of real cells that turn; no state changes."""
         return self.activity * (1.0 + MODULATION_S * abs(turn_rate_rad_s))
 
 
@@ -106,7 +106,7 @@ class BandRings:
     Attributes:
         activity: (M, 3, n) rates 0..1 in the order of `ORIENTATIONS_DEG`; the whole state. To be replaced, not written into:
             the array that a step leaves is read-only, so that it need not be decoded twice.
-        periods_m, orientations_rad: (M, 3).
+        periods_m, orientations_rad: (M, 3) distance between two stripes, and the direction across them.
         wave_vectors: (M, 3, 2) cycles per metre; the third is the second minus the first (phi60 = phi0 + phi120).
     """
 
@@ -119,6 +119,16 @@ class BandRings:
         dtype: DTypeLike = np.float64,
         metric: Metric = "hexagonal",
     ) -> None:
+        """Make the rings at phase zero.
+
+        Args:
+            spacings_m: (M,) grid spacing lambda of each module.
+            orientations_rad: (M,) direction of each module's first band.
+            cells: n, cells of a ring.
+            width: r, width of a stripe as a share of the period.
+            dtype: floating-point type of the rates.
+            metric: lattice of the sheets that the bands drive.
+        """
         square = metric == "square"
         angles = orientations_rad[:, None] + np.radians(SQUARE_ORIENTATIONS_DEG if square else ORIENTATIONS_DEG)
         period = np.array([1.0, np.sqrt(0.5), 1.0]) if square else np.full(3, np.sqrt(3.0) / 2.0)
@@ -164,7 +174,7 @@ class BandRings:
         return np.asarray(np.angle(self.phasors().astype(np.complex128)) / (2.0 * np.pi)) % 1.0
 
     def rates_at(self, phases: NDArray[np.float64]) -> NDArray[np.floating]:
-        """Return the stationary rates (M, 3, n) at given phases (M, 3), cycles."""
+        """Return the stationary rates (M, 3, n), read-only, at given phases (M, 3), cycles; no state changes."""
         return self._rates(np.exp(2j * np.pi * phases.reshape(-1, 1)).astype(self._complex).view(self._weights.dtype))
 
     def step(self, displacement_m: NDArray[np.float64]) -> BandMotion:
