@@ -51,7 +51,7 @@ class MapStore:
     """A map file, open either for writing (`create`) or for reading (`open`).
 
     Everything up to the last `commit` survives a killed process; call it once for each node. Usable as a context manager.
-    `close` merges SQLite's log into the file, so that one file is left.
+    `close` merges SQLite's log into the file, so that one file is left. Reading a damaged file raises a StoreError.
     """
 
     def __init__(self, path: Path, connection: sqlite3.Connection, *, writable: bool) -> None:
@@ -121,9 +121,9 @@ class MapStore:
         """Write a node.
 
         Args:
-            number: number of the node.
+            number: number of the node; nodes are numbered from 0, without gaps, in the order in which they were made.
             node: the node.
-            initial: (3,) pose composed along odometry edges, m and rad.
+            initial: (3,) pose in `map` composed along odometry edges, m and rad.
             keyframe: arrays that the front-end keeps of the node's frame, by name.
             snapshot: arrays of the state of the path integrator, by name, for re-anchoring.
         """
@@ -143,7 +143,7 @@ class MapStore:
                 self._write("INSERT INTO arrays VALUES (?, ?, ?, ?, ?, ?, ?)", fields)
 
     def put_edge(self, number: int, edge: Edge) -> None:
-        """Write an edge, whatever its status; replaces what was written under the same number."""
+        """Write an edge, whatever its status; replaces what was written under the same number (from 0, without gaps)."""
         measured: tuple[Any, ...] = (None,) * 4
         if edge.relative is not None:
             measured = (*_floats(edge.relative.delta), schema.pack_floats(edge.relative.covariance))
@@ -168,7 +168,7 @@ class MapStore:
         """Write new poses of the whole track, and of all nodes in `odom` and along the chain, in place of the earlier ones.
 
         Args:
-            track: as read from this file, with other poses.
+            track: as read from this file, with other poses; its anchors are not written.
             experiences: the map, with the nodes of this file.
         """
         moved = np.column_stack([track.deltas, track.poses_odom]).tolist()
@@ -246,7 +246,7 @@ class MapStore:
     @property
     @_reading
     def primary(self) -> str:
-        """Name of the primary back-end: as the run recorded it, else the first one of the configuration."""
+        """Name of the primary back-end: as the run recorded it, else the first of the configuration, else of the solutions."""
         recorded = self.info("primary_backend")
         if recorded is not None:
             return str(recorded)
@@ -266,7 +266,7 @@ class MapStore:
 
     @_reading
     def map(self) -> ExperienceMap:
-        """The experience map: its nodes and edges in the order in which they were made."""
+        """A new experience map with the nodes and edges of the file, in the order in which they were made."""
         experiences, version = ExperienceMap(), int(self._one("PRAGMA user_version", ()))
         codes = {row[0]: schema.Packed(*row[1:]) for row in self._arrays(_CODE)}
         for number, row in enumerate(self._rows("SELECT * FROM nodes ORDER BY number")):
@@ -293,7 +293,7 @@ class MapStore:
 
     @_reading
     def track(self) -> Track:
-        """Where the robot was at each stamp, seen from nodes, and the frames registered to the final map."""
+        """Where the robot was at each stamp, seen from nodes, and the frames registered to the final map; it may be empty."""
         rows = self._rows("SELECT * FROM track ORDER BY stamp_ns")
         values = _near(np.array([row[2:] for row in rows], dtype=np.float64).reshape(-1, 6))
         ends = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2)
@@ -322,7 +322,7 @@ class MapStore:
 
     @_reading
     def solutions(self) -> dict[str, Solution]:
-        """Poses and report of every back-end, by name, in the order in which they were written."""
+        """Poses and report of every back-end, by name, in the order in which they were first written."""
         rows = self._rows("SELECT backend, poses, report FROM solutions ORDER BY position")
         nodes = self._one("SELECT COUNT(*) FROM nodes", ())
         found = {

@@ -116,7 +116,11 @@ def open_read_only(path: Path) -> sqlite3.Connection:
 
 
 def finish(connection: sqlite3.Connection) -> None:
-    """Commit, merge the write-ahead log into the file and close. One file is left, unless another process is reading it."""
+    """Commit, merge the write-ahead log into the file and close. One file is left, unless another process is reading it.
+
+    Raises:
+        sqlite3.Error: the file cannot be written.
+    """
     with closing(connection):
         connection.commit()
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
@@ -134,7 +138,14 @@ _ZLIB_LEVEL = 1
 
 @dataclass(frozen=True, slots=True)
 class Packed:
-    """An array as the map file keeps it: little-endian bytes (`zlib`) or an image (`png`)."""
+    """An array as the map file keeps it: little-endian bytes (`zlib`) or an image (`png`).
+
+    Attributes:
+        dtype: numpy's name of the type, such as `<f4`.
+        shape: JSON list.
+        codec: `zlib` or `png`.
+        data: compressed bytes.
+    """
 
     dtype: str
     shape: str
@@ -159,12 +170,12 @@ def unpack(packed: Packed) -> NDArray[Any]:
     """Return the array that `pack` packed.
 
     Raises:
-        StoreError: the bytes are damaged.
+        ValueError: the bytes are damaged.
     """
     try:
         return _unpack(packed)
     except (zlib.error, ArithmeticError, LookupError, TypeError, ValueError) as error:
-        raise StoreError(f"map file: an array in it is damaged: {error}; map the source again") from None
+        raise ValueError(f"an array cannot be unpacked: {error}") from None
 
 
 _MOST_BYTES = 1 << 28
@@ -190,12 +201,16 @@ def _is_image(array: NDArray[Any]) -> bool:
 
 
 def pack_floats(values: NDArray[np.float64]) -> bytes:
-    """Little-endian float64 bytes."""
+    """Return the values as little-endian float64 bytes, row by row; the shape is not kept."""
     return np.ascontiguousarray(values, dtype="<f8").tobytes()
 
 
 def unpack_floats(data: bytes, columns: int) -> NDArray[np.float64]:
-    """Return the array that `pack_floats` packed, as float64 of shape (-1, columns)."""
+    """Return the array that `pack_floats` packed, as float64 of shape (-1, columns).
+
+    Raises:
+        ValueError: the bytes are no whole rows.
+    """
     return np.frombuffer(data, "<f8").astype(np.float64).reshape(-1, columns)
 
 
@@ -239,7 +254,10 @@ def record_to_json(edge: Edge) -> str:
 def record_from_json(text: str, reason: str, version: int = VERSION) -> dict[str, Any]:
     """The fields of an edge that `record_to_json` wrote, by name.
 
-    A file of a version before 3 has only measured values and the `reason` in words.
+    Args:
+        text: the JSON object.
+        reason: the reason in words. A file of a version before 3 has only this and measured values.
+        version: of the file.
     """
     fields: dict[str, Any] = json.loads(text)
     carried_m = fields.pop("carried_m", None)

@@ -135,10 +135,10 @@ class SessionFolder:
             log.warning("%s: %s", self.path, self._why_unended())
 
     def require_map(self) -> None:
-        """Check that the folder holds a session, whether or not its run ended.
+        """Check that the folder holds a session, whether or not its run ended. The map is not opened.
 
         Raises:
-            StoreError: the folder is missing or holds no map, or the map is damaged.
+            StoreError: the folder is missing or holds no map.
         """
         if not self.map_db.is_file():
             what = "holds no session (no map.db)" if self.path.is_dir() else "no such session folder"
@@ -172,7 +172,7 @@ class SessionFolder:
         write_text(self.metrics_json, to_json(head, metrics) + "\n")
 
     def read_metrics(self) -> MetricsFile:
-        """Read `metrics.json`; empty if the file does not exist.
+        """Read `metrics.json`; without metrics and other keys if the file does not exist.
 
         Raises:
             StoreError: the file is damaged.
@@ -191,7 +191,7 @@ class SessionFolder:
         return MetricsFile(tree, metrics)
 
     def merge_metrics(self, metrics: Iterable[Metric]) -> None:
-        """Put metrics into `metrics.json`: a new metric replaces the one of the same name, others stay; the order is kept.
+        """Put metrics into `metrics.json`: one replaces that of the same name in its place, others are added at the end.
 
         If the file cannot be written, it stays as it is and a warning says so.
 
@@ -215,7 +215,7 @@ class SessionFolder:
         write_tum(self.groundtruth, trajectory)
 
     def trajectories(self) -> dict[str, Trajectory]:
-        """Every estimated trajectory of the session, by name, sorted."""
+        """Every estimated trajectory of the session, by the name under which it was written, sorted; empty if there is none."""
         return {path.stem: read_tum(path) for path in sorted(self.trajectory.glob("*.tum"))}
 
 

@@ -43,7 +43,7 @@ class Track:
 
 
 def trajectory_of(track: Track, poses: Array) -> Trajectory:
-    """Poses of the robot at every stamp of the track, given those of the nodes.
+    """Poses of the robot in `map` at every stamp of the track, given those of the nodes.
 
     Poses are known at nodes and anchors. Between two of these, the pose propagated from the first and that propagated back
     from the second are blended along the SE(2) geodesic by the share of the way, so that the trajectory is continuous.
@@ -57,8 +57,9 @@ def trajectory_of(track: Track, poses: Array) -> Trajectory:
     """
     if len(track) == 0:
         raise StoreError("track: holds no pose; nothing was mapped")
-    if track.nodes.max() >= len(poses) or track.nodes.min() < 0:
-        raise StoreError(f"track: names node {int(track.nodes.max())}, expected less than {len(poses)}")
+    unknown = track.nodes[(track.nodes >= len(poses)) | (track.nodes < 0)]
+    if len(unknown):
+        raise StoreError(f"track: names node {int(unknown.max())}, expected 0 to {len(poses) - 1}")
     made = np.flatnonzero(np.diff(track.nodes, prepend=track.nodes[0] - 1))
     at, anchored = _anchored(track, poses, made)
     knots = np.union1d(made, at)

@@ -289,6 +289,17 @@ def test_a_rig_that_no_run_wrote_is_one_error(tmp_path):
             _ = store.rig
 
 
+def test_an_array_that_is_damaged_is_an_error_that_names_the_file(tmp_path):
+    folder = write_session(tmp_path / "session", ring_map(1.2))
+    with sqlite3.connect(folder.path / "map.db") as database:
+        database.execute("UPDATE arrays SET data = x'00'")
+    with MapStore.open(folder.path) as store:
+        for read in (store.map, lambda: store.keyframe(0)):
+            with pytest.raises(StoreError, match="damaged") as caught:
+                read()
+            assert str(caught.value).startswith(str(folder.path / "map.db"))
+
+
 @pytest.mark.parametrize(
     "text",
     [

@@ -74,6 +74,9 @@ def test_empty_track_and_unknown_node_are_refused():
     track, _, _ = make_track()
     with pytest.raises(StoreError, match="names node 10"):
         trajectory_of(track, np.zeros((3, 3)))
+    below = Track(np.arange(2) * SECOND, np.array([-1, 0]), np.zeros((2, 3)), np.zeros((2, 3)))
+    with pytest.raises(StoreError, match="names node -1"):
+        trajectory_of(below, np.zeros((1, 3)))
 
 
 def make_anchored(every: int = 10, skip: int = 3) -> tuple[Track, np.ndarray, np.ndarray]:
