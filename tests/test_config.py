@@ -200,8 +200,9 @@ def test_a_setting_of_a_billion_is_refused_before_anything_is_made_of_it(key):
 
 
 def test_a_mounting_without_rotation_and_a_lens_of_three_numbers_are_refused():
-    with pytest.raises(ConfigError, match="quaternion"):
-        Config.load(None, {"sensors.camera_mounting": {"translation_m": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 0]}})
+    for quaternion, said in (([0, 0, 0, 0], "length 0$"), ([0, 0, 0, 5000], "found length 5000; divide it by its length")):
+        with pytest.raises(ConfigError, match=said):
+            Config.load(None, {"sensors.camera_mounting": {"translation_m": [0, 0, 0], "quaternion_xyzw": quaternion}})
     intrinsics = {"width_px": 8, "height_px": 6, "fx_px": 5, "fy_px": 5, "cx_px": 4, "cy_px": 3, "distortion": [0.1, 0.2, 0.3]}
     with pytest.raises(ConfigError, match="distortion"):
         Config.load(None, {"sensors.camera_intrinsics": intrinsics})

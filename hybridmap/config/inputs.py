@@ -32,9 +32,9 @@ class CameraMounting(Section):
     """Pose of the camera's OPTICAL frame (x right, y down, z forward) on the robot's base; replaces the recording's pose."""
 
     translation_m: tuple[float, float, float]
-    """Origin of the optical frame in the base, m."""
+    """Origin x, y, z of the optical frame in the base, m."""
     quaternion_xyzw: tuple[float, float, float, float] = (-0.5, 0.5, -0.5, 0.5)
-    """Rotation of the optical frame in the base; the default looks forward and level.
+    """Rotation of the optical frame in the base, quaternion x, y, z, w; the default looks forward and level.
 
     Watch: an error of 1 degree in the tilt makes the floor look like a ramp."""
 
@@ -42,14 +42,16 @@ class CameraMounting(Section):
     @classmethod
     def _near(cls, translation: tuple[float, float, float]) -> tuple[float, float, float]:
         if max(map(abs, translation)) > _FARTHEST_M:
-            raise ValueError(f"expected at most {_FARTHEST_M:g} m, found {max(map(abs, translation)):g} m")
+            raise ValueError(f"expected x, y, z of at most {_FARTHEST_M:g} m, found {max(map(abs, translation)):g} m")
         return translation
 
     @field_validator("quaternion_xyzw")
     @classmethod
     def _rotates(cls, quaternion: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-        if not _LEAST_NORM <= hypot(*quaternion) <= 1.0 / _LEAST_NORM:
-            raise ValueError(f"expected a quaternion, of length 1, found one of length {hypot(*quaternion):g}")
+        length = hypot(*quaternion)
+        if not _LEAST_NORM <= length <= 1.0 / _LEAST_NORM:
+            advice = "; divide it by its length" if length > 0.0 else ""
+            raise ValueError(f"expected a quaternion x, y, z, w of length 1, found length {length:g}{advice}")
         return quaternion
 
 
@@ -69,7 +71,7 @@ class CameraIntrinsics(Section):
     cy_px: float = Field(ge=-1e6, le=1e6)
     """Principal point, y, pixels."""
     distortion: tuple[float, ...] = ()
-    """Lens distortion k1, k2, p1, p2[, k3[, k4, k5, k6]]; empty: none."""
+    """Lens distortion k1, k2, p1, p2[, k3[, k4, k5, k6]], or 12 or 14 coefficients, in OpenCV's order; empty: none."""
 
     @field_validator("distortion")
     @classmethod
@@ -97,7 +99,7 @@ class SensorsConfig(Section):
     groundtruth_topic: str | None = None
     """Topic of nav_msgs/Odometry that holds the true pose of the base."""
     odometry_file: str | None = None
-    """File of a TUM folder with the odometry; None: `odometry.txt`."""
+    """Name of the file with the odometry in a TUM folder; None: `odometry.txt`."""
     odom_frame: str = "odom"
     """Parent frame of the odometry in /tf, used if there is no Odometry topic."""
     base_frame: str | None = None

@@ -110,7 +110,8 @@ class NeuralConfig(Section):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.spacing_min_m > self.spacing_max_m:
-            raise ValueError("spacing_min_m must not exceed spacing_max_m")
+            found = f"{self.spacing_min_m:g} and {self.spacing_max_m:g}"
+            raise ValueError(f"expected spacing_min_m not above spacing_max_m, found {found}")
         return self
 
 

@@ -138,6 +138,7 @@ def read_mapping(path: Path, error: type[HybridMapError] = ConfigError) -> dict[
         error: class of the exception to raise.
 
     Raises:
+        OSError: there is no such file, or it cannot be opened.
         HybridMapError: of the class `error`: the file is not YAML (the message names the line), or holds no mapping.
     """
     size = path.stat().st_size
@@ -167,7 +168,7 @@ def mapping_of(text: str, origin: str, error: type[HybridMapError] = ConfigError
 
 
 def value_of(text: str, origin: str, error: type[HybridMapError] = ConfigError) -> Any:
-    """Read one YAML value.
+    """Read one YAML value; an empty text gives None.
 
     Args:
         text: the YAML text.
