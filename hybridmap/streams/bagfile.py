@@ -66,7 +66,13 @@ class RawMessage:
 
 
 class BagFile:
-    """A bag that can be read. The file is closed between readings, so several readings can run at once."""
+    """A bag that can be read. The file is closed between readings, so several readings can run at once.
+
+    Attributes:
+        path: of the bag.
+        is_ros1: whether it is a ROS 1 bag.
+        topics: its topics, sorted by name; one with messages of two types is there twice.
+    """
 
     def __init__(self, path: Path) -> None:
         """Open the bag once and read its topics.
@@ -93,7 +99,7 @@ class BagFile:
         self._types = {topic.name: topic.msgtype for topic in self.topics}
 
     def raw(self, names: Collection[str]) -> Iterator[RawMessage]:
-        """Messages of the named topics in recorded order.
+        """Messages of the named topics in recorded order; a name that the bag lacks gives none.
 
         Raises:
             StreamError: the file is damaged.
@@ -117,7 +123,11 @@ class BagFile:
                 yield RawMessage(connection.topic, number, bytes(data))
 
     def stamp_ns(self, message: RawMessage) -> int:
-        """Header stamp of a message whose first field is a header, without decoding the rest, ns."""
+        """Header stamp of a message whose first field is a header, without decoding the rest, ns.
+
+        Raises:
+            StreamError: the message is too short.
+        """
         data = message.data
         try:
             if self.is_ros1:

@@ -49,10 +49,10 @@ class PoseTrack:
     poses: list[tuple[float, float, float]] = field(default_factory=list)
 
     def add(self, stamp_ns: int, position: Any, orientation: Any, what: str) -> None:
-        """Append the planar part of a pose, given by ROS position and orientation; `what` names it in the error.
+        """Append the planar part of a pose, given by ROS position and orientation; `what` (file, topic) names it in errors.
 
         Raises:
-            StreamError: NaN, Inf or a position that is none, or a quaternion that is no rotation.
+            StreamError: NaN or Inf, a position too far away, or a quaternion of length 0 or infinity.
         """
         q = (orientation.x, orientation.y, orientation.z, orientation.w)
         pose = (float(position.x), float(position.y), float(yaw_from_quaternion(*q)))
@@ -78,7 +78,7 @@ class PoseTrack:
             pose_child_base: (3,) pose in the child frame of a frame fixed to it; if given, the poses are those of that frame.
 
         Raises:
-            StreamError: the stamps are out of order by more than one message.
+            StreamError: the stamps are out of order by more than one message, or all equal.
         """
         stamps = np.asarray(self.stamps_ns, dtype=np.int64)
         order = sorted_order(stamps, what)
@@ -89,7 +89,7 @@ class PoseTrack:
         """The poses as a trajectory in order of time; of poses with equal stamps the first is kept.
 
         Raises:
-            StreamError: the stamps are out of order by more than one message.
+            StreamError: the stamps are out of order by more than one message, or all equal.
         """
         stamps, poses = self.sorted(what)
         first = np.concatenate([[True], np.diff(stamps) > 0])
@@ -119,7 +119,7 @@ class BagIndex:
     tf_tracks: dict[tuple[str, str], PoseTrack] = field(default_factory=dict)
 
     def frame_of(self, topic: str) -> str:
-        """Frame in the header of the first message of a topic."""
+        """Frame in the header of the first message of a topic; empty if it has none."""
         return clean_frame(self.first[topic].header.frame_id) if topic in self.first else ""
 
 
@@ -227,7 +227,7 @@ def select(
     frame_of: Callable[[str], str],
     source: str,
 ) -> Selection:
-    """Choose the topics of a bag to use.
+    """Choose the topics of a bag to use; those without messages are left out.
 
     Args:
         topics: all topics of the bag.
@@ -260,7 +260,7 @@ class TopicChooser:
         self.remarks: list[str] = []
 
     def of(self, types: Iterable[str]) -> list[Topic]:
-        """All topics of the given message types."""
+        """All topics of the given message types, in the order of the bag's."""
         return [topic for topic in self._topics if topic.msgtype in types]
 
     def named(self, setting: str, types: tuple[str, ...]) -> str | None:
@@ -285,8 +285,8 @@ class TopicChooser:
     def best(self, types: tuple[str, ...], names: Sequence[str], keep: Callable[[str], bool] = lambda _: True) -> str | None:
         """The most likely topic of these types; None if there is none.
 
-        The order of the usual `names` (regular expressions) counts first, then the number of messages. `keep` tells which
-        topics may be chosen.
+        The order of the usual `names` (regular expressions) counts first, then the number of messages, then the order of
+        `types`. `keep` tells by its name whether a topic may be chosen. A choice among several adds a remark.
         """
         candidates = [topic for topic in self.of(types) if keep(topic.name)]
         if not candidates:

@@ -116,12 +116,12 @@ class Planned:
 
 
 class Decoder(Protocol):
-    """Makes an observation from its messages, and counts irregularities."""
+    """Makes an observation from its messages, and counts irregularities in `counts`: name -> number."""
 
     counts: dict[str, int]
 
     def __call__(self, stamp_ns: int, parts: tuple[Any, ...]) -> Observation:
-        """Decode the messages of one observation."""
+        """Make the observation of this stamp from its decoded messages, in the order of `Planned.needs`."""
 
 
 @dataclass(slots=True)
@@ -131,7 +131,7 @@ class SensorPlan:
     Attributes:
         rig: the sensor, with its mounting.
         planned: the observations, in order of stamp.
-        decode: (stamp, decoded messages) -> observation.
+        decode: (stamp, decoded messages) -> observation; None if there is nothing to decode.
         losses: name -> number of messages that no observation uses.
         remarks: assumptions that were made, for the user.
     """
@@ -212,7 +212,7 @@ class StreamReport:
     lost: dict[str, tuple[int, int]] = field(default_factory=dict)
 
     def lose(self, name: str, total: int) -> None:
-        """Count one lost message of a topic or list that has `total` of them."""
+        """Count one lost message of a topic or list that has `total` messages in all."""
         gone, stated = self.lost.get(name, (0, total))
         self.lost[name] = (gone + 1, stated)
 
@@ -245,7 +245,7 @@ class Stream(Protocol):
 
     @property
     def report(self) -> StreamReport:
-        """What the last iteration over the stream found."""
+        """What the last iteration over the stream found, as far as it went."""
 
     def __iter__(self) -> Iterator[Sample]:
         """Yield the samples.

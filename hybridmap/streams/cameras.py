@@ -114,7 +114,7 @@ def mounted(mounting: CameraMounting) -> Array:
 
 
 def clean_depth(depth_m: DepthImage, config: SensorsConfig) -> DepthImage:
-    """Depth with every value that is not finite, not positive or outside the configured limits set to 0."""
+    """A copy of depth (H, W), m, with every value not finite, not positive or outside the configured limits set to 0."""
     with np.errstate(invalid="ignore"):
         valid = np.isfinite(depth_m) & (depth_m > 0)
         if config.depth_min_m is not None:
@@ -162,7 +162,7 @@ class DepthRegistration:
         self._rays = np.stack([*np.meshgrid(x, y), np.ones((len(y), len(x)))], axis=-1)
 
     def __call__(self, depth_m: DepthImage) -> DepthImage:
-        """(H, W) depth in the colour camera, m; 0 for pixels without depth."""
+        """From depth (H, W) in the depth camera to depth (H, W) of the colour camera's size, m; 0 for pixels without depth."""
         fine = depth_m.repeat(self._split, axis=0).repeat(self._split, axis=1).astype(np.float64)
         valid = fine > 0
         points = self._rays[valid] * fine[valid][:, None] @ self._T[:3, :3].T + self._T[:3, 3]
@@ -179,7 +179,7 @@ class DepthRegistration:
 
 
 def check_size(picture: NDArray[Any], calibration: Calibration, what: str) -> None:
-    """Check that an image has the size of its calibration; `what` names it in the error.
+    """Check that an image has the size of its calibration; `what` (file and topic) names it in the error.
 
     Raises:
         StreamError: the sizes differ; the message names both.
@@ -196,7 +196,7 @@ def decode_color(message: Any, what: str) -> ColorImage:
     """(H, W, 3) uint8 RGB of an Image or CompressedImage message; grey images repeat their channel.
 
     Raises:
-        StreamError: an encoding without colour, or truncated data.
+        StreamError: an encoding without colour, or truncated data; `what` (file and topic) names it.
     """
     if hasattr(message, "encoding"):
         layout = _layout_of(message.encoding, _COLOR, "colour", what)
@@ -240,10 +240,12 @@ def _pixels(message: Any, layout: _Layout, what: str) -> NDArray[Any]:
     step = (int(message.step) if height > 1 else 0) or row_bytes
     data = np.asarray(message.data, dtype=np.uint8)
     needed = step * (height - 1) + row_bytes
-    if height < 1 or width < 1 or step < row_bytes or len(data) < needed:
-        raise StreamError(
-            f"{what}: a {width}x{height} picture with rows of {step} bytes holds {len(data)} bytes, expected {max(needed, 1)}"
-        )
+    if height < 1 or width < 1:
+        raise StreamError(f"{what}: found a picture of {width}x{height} pixels, expected at least 1x1")
+    if step < row_bytes:
+        raise StreamError(f"{what}: a {width}x{height} picture has rows of {step} bytes, expected at least {row_bytes}")
+    if len(data) < needed:
+        raise StreamError(f"{what}: a {width}x{height} picture holds {len(data)} bytes, expected at least {needed}")
     rows = np.zeros((height, step), dtype=np.uint8)
     rows.ravel()[: min(len(data), step * height)] = data[: step * height]
     packed = np.ascontiguousarray(rows[:, :row_bytes]).view(dtype)
@@ -256,6 +258,9 @@ def decode_picture(data: bytes, flags: int) -> NDArray[Any]:
     Args:
         data: PNG, JPEG or another format that OpenCV reads.
         flags: OpenCV's, such as `cv2.IMREAD_UNCHANGED`.
+
+    Returns:
+        (H, W), or (H, W, C) with the channels in OpenCV's order, blue first.
 
     Raises:
         ValueError: it is empty, damaged, of an unknown kind, or its header claims more than `MOST_PIXELS`.
@@ -316,6 +321,11 @@ def _decompress_depth(message: Any, units_per_m: float, what: str) -> DepthImage
 def calibration_of(info: Any, image_topic: str, what: str) -> Calibration:
     """Calibration of a CameraInfo message; of a rectified image, the projection matrix without distortion.
 
+    Args:
+        info: CameraInfo of ROS 1 or ROS 2; its binning is taken into account.
+        image_topic: topic of the images; `rect` in the last part of its name says that they are rectified.
+        what: file and topic, for errors.
+
     Raises:
         StreamError: the camera is not calibrated, or its distortion model is unknown.
     """
@@ -326,7 +336,9 @@ def calibration_of(info: Any, image_topic: str, what: str) -> Calibration:
     if _RECTIFIED.search(image_topic) and P[0, 0] > 0:
         K, distortion = P[:, :3], ()
     if not (K[0, 0] > 0 and K[1, 1] > 0 and (np.abs(K) <= _LARGEST_PX).all()):
-        raise StreamError(f"{what}: found focal lengths {K[0, 0]}, {K[1, 1]}; the camera is not calibrated")
+        found = f"focal lengths {K[0, 0]:g}, {K[1, 1]:g} and principal point {K[0, 2]:g}, {K[1, 2]:g}"
+        expected = f"positive focal lengths, and at most {_LARGEST_PX:g} px"
+        raise StreamError(f"{what}: found {found}, expected {expected}; the camera is not calibrated")
     if any(distortion) and model not in ("plumb_bob", "rational_polynomial", "equidistant", "fisheye", ""):
         raise StreamError(f"{what}: found distortion model {model!r}, expected plumb_bob, rational_polynomial or equidistant")
     fisheye = model in ("equidistant", "fisheye")

@@ -36,14 +36,14 @@ class Part:
 
     @property
     def span_s(self) -> tuple[float, float] | None:
-        """First and last stamp, s; None if unknown."""
+        """Earliest and latest stamp, s; None if unknown."""
         if not len(self.stamps_ns):
             return None
         return float(self.stamps_ns.min() / NS_PER_S), float(self.stamps_ns.max() / NS_PER_S)
 
     @property
     def duration_s(self) -> float:
-        """Last minus first stamp, s; 0 if unknown."""
+        """Latest minus earliest stamp, s; 0 if unknown."""
         return int(self.stamps_ns.max() - self.stamps_ns.min()) / NS_PER_S if len(self.stamps_ns) else 0.0
 
     @property

@@ -33,7 +33,7 @@ class Laser:
     """Planar range finder.
 
     Attributes:
-        bearings_rad: (B,) float64, bearing of each beam in the laser's frame, counter-clockwise positive.
+        bearings_rad: (B,) float64, bearing of each beam in the laser's frame, counter-clockwise positive, ascending.
         range_min_m, range_max_m: limits of valid ranges.
         pose_base_laser: (3,) pose in `base_link`, m and rad (a laser mounted upside down has its bearings negated).
     """
@@ -50,14 +50,20 @@ class LaserScan(Observation):
 
     Attributes:
         stamp_ns: header stamp, ns.
-        ranges_m: (B,) float32; NaN without a valid return (the reader applies REP-117 and the range limits).
+        ranges_m: (B,) float32, in the order of `Laser.bearings_rad`; NaN without a valid return (the reader applies REP-117
+            and the range limits).
     """
 
     ranges_m: NDArray[np.float32]
 
 
 class ScanDecoder:
-    """Resamples every scan of a topic to the beams of its first one, counter-clockwise in the base."""
+    """Resamples every scan of a topic to the beams of its first one, counter-clockwise in the base.
+
+    Attributes:
+        laser: beams, limits and mounting.
+        counts: name of an irregularity (`scans with other beams`) -> number so far.
+    """
 
     def __init__(self, first: Any, pose_base_laser: Array, upside_down: bool, config: SensorsConfig, what: str) -> None:
         """Read the beams of the first message.
@@ -86,7 +92,11 @@ class ScanDecoder:
         self.counts: dict[str, int] = {}
 
     def __call__(self, stamp_ns: int, parts: tuple[Any, ...]) -> LaserScan:
-        """Decode one message; beams without a valid return become NaN."""
+        """Decode one message, the only one of `parts`; beams without a valid return become NaN.
+
+        Raises:
+            StreamError: the angles of its beams are not finite.
+        """
         (message,) = parts
         ranges = np.array(message.ranges, dtype=np.float32)
         low, high = self._limits(message)

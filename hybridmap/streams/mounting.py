@@ -19,7 +19,7 @@ def clean_frame(frame: str) -> str:
 
 
 def matrix(translation: tuple[float, float, float], quaternion_xyzw: tuple[float, float, float, float]) -> Array:
-    """(4, 4) pose of the child frame in the parent frame, m."""
+    """(4, 4) pose of the child frame in the parent frame, from translation, m, and quaternion x, y, z, w (normalised here)."""
     T = np.eye(4)
     T[:3, :3] = rotation_from_quaternion(quaternion_xyzw)
     T[:3, 3] = translation
@@ -53,7 +53,11 @@ class TransformTree:
         self._edges: dict[tuple[str, str], _Edge] = {}
 
     def add(self, parent: str, child: str, T_parent_child: Array, *, static: bool) -> None:
-        """Add the pose (4, 4) of `child` in `parent`; a static one replaces a moving one, and a newer static one an older."""
+        """Add the pose (4, 4) of `child` in `parent`, m.
+
+        A static one replaces whatever is there. Of others the first stays; if a later one differs, the transform counts as
+        moving and gives no mounting.
+        """
         key = (clean_frame(parent), clean_frame(child))
         edge = self._edges.get(key)
         if edge is None or static:
@@ -91,8 +95,14 @@ class TransformTree:
     def require(self, base: str, sensor: str, what: str, setting: str) -> Array:
         """(4, 4) pose of the sensor's frame in the base, m, along constant transforms.
 
+        Args:
+            base: name of the frame of the base.
+            sensor: name of the frame of the sensor.
+            what: file and topic, for the error.
+            setting: the setting that can replace the transform, for the error.
+
         Raises:
-            StreamError: there is no such path; the message names both frames and the setting that can replace it.
+            StreamError: there is no such path; the message names both frames and the setting.
         """
         found = self.between(base, sensor)
         if found is not None:

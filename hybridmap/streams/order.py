@@ -17,7 +17,7 @@ Stamps = NDArray[np.int64]
 
 
 def sorted_order(stamps_ns: Stamps, what: str) -> NDArray[np.intp]:
-    """Indices that sort the stamps; a message may be swapped with its direct successor, no further.
+    """Indices (N,) that sort the stamps, stably; a message may be swapped with its direct successor, no further.
 
     Args:
         stamps_ns: (N,) header stamps in recorded order, ns.
@@ -65,6 +65,9 @@ def pair_nearest(color_ns: Stamps, depth_ns: Stamps, tolerance_s: float) -> Pair
         color_ns: (C,) sorted stamps, ns.
         depth_ns: (D,) sorted stamps, ns.
         tolerance_s: largest difference, s.
+
+    Returns:
+        Indices into both lists, row by row of one pair, in the order of `color_ns`; and the numbers of images left over.
     """
     tolerance_ns = round(tolerance_s * NS_PER_S)
     candidates: list[tuple[int, int, int]] = []
@@ -92,6 +95,9 @@ class Window:
 
     Attributes:
         start_s, end_s: seconds from the first stamp, both inclusive; None: no limit.
+
+    Raises:
+        StreamError: a limit is negative, not finite or over 1e9 s, or the end lies before the start.
     """
 
     start_s: float | None = None
@@ -112,7 +118,11 @@ class Window:
 
 
 def check_overlap(motion_ns: Stamps, observation_ns: Stamps, what: str) -> None:
-    """Refuse observations that share no time with the self-motion, with a tolerance of one second.
+    """Refuse observations that share no time with the self-motion, with a tolerance of one second; empty ones pass.
+
+    Args:
+        motion_ns, observation_ns: stamps, ns, ascending.
+        what: the source, for the error.
 
     Raises:
         StreamError: there is no common time; the message names both spans.
@@ -146,7 +156,10 @@ class ReorderBuffer:
         self._arrivals = 0
 
     def push(self, sample: Sample) -> list[Sample]:
-        """Add one sample; returns the samples that have waited long enough, in order."""
+        """Add one sample; returns the samples that have waited long enough, in order.
+
+        A sample that comes later than the latency allows is returned at once, after newer ones.
+        """
         heapq.heappush(self._heap, (sort_key(sample), self._arrivals, sample))
         self._arrivals += 1
         newest = sample.stamp_ns if self._newest_ns is None else max(self._newest_ns, sample.stamp_ns)
@@ -165,5 +178,5 @@ class ReorderBuffer:
 
 
 def merge(*sources: Iterable[Sample]) -> Iterator[Sample]:
-    """Merge sorted streams by stamp, then by precedence, so that motion comes first."""
+    """Merge sorted streams, lazily, by stamp, then by precedence, so that motion comes first."""
     return heapq.merge(*sources, key=sort_key)

@@ -51,7 +51,7 @@ class Camera:
 
     Attributes:
         width_px, height_px: image size.
-        fx_px, fy_px, cx_px, cy_px: focal lengths and principal point.
+        fx_px, fy_px, cx_px, cy_px: focal lengths and principal point, pixels; (0, 0) is the middle of the first pixel.
         T_base_camera: (4, 4) pose of the camera OPTICAL frame (x right, y down, z forward) in `base_link`, m.
     """
 
@@ -80,7 +80,7 @@ class RgbdFrame(Observation):
 
 
 def pinhole(calibration: Calibration, T_base_camera: Array) -> Camera:
-    """The camera that undistorted images of this calibration have."""
+    """The camera of the undistorted images of a calibration; `T_base_camera` (4, 4) is its optical frame in `base_link`, m."""
     K = calibration.K
     return Camera(
         calibration.width_px,
@@ -157,10 +157,27 @@ def _plan(topics: Mapping[str, str], index: BagIndex, base_frame: str, config: S
 
 
 class FrameDecoder:
-    """Makes one frame from a colour and a depth message: undistorted, depth registered to the colour image and limited."""
+    """Makes one frame from a colour and a depth message: undistorted, depth registered to the colour image and limited.
+
+    Attributes:
+        camera: the camera of the frames.
+        remarks: assumptions that were made, for the user.
+        counts: irregularities; always empty.
+    """
 
     def __init__(self, topics: Mapping[str, str], index: BagIndex, base_frame: str, config: SensorsConfig, source: str) -> None:
-        """Read sizes, calibration and mounting from the first messages."""
+        """Read sizes, calibration and mounting from the first messages.
+
+        Args:
+            topics: role -> topic: `color` and `depth`, and `color_info` and `depth_info` where there are such.
+            index: of the bag.
+            base_frame: frame of the robot.
+            config: what replaces calibration and mounting; limits of depth.
+            source: path of the bag, for errors.
+
+        Raises:
+            StreamError: calibration or mounting is missing, or sizes contradict each other.
+        """
         self._config = config
         self._what_color, self._what_depth = f"{source}: {topics['color']}", f"{source}: {topics['depth']}"
         self.remarks: list[str] = []
@@ -181,7 +198,11 @@ class FrameDecoder:
         self.camera = pinhole(self._color, T)
 
     def __call__(self, stamp_ns: int, parts: tuple[Any, ...]) -> RgbdFrame:
-        """Decode one pair."""
+        """Decode one pair, `parts` being the colour and the depth message.
+
+        Raises:
+            StreamError: a picture is damaged, or of another size than its calibration.
+        """
         color = decode_color(parts[0], self._what_color)
         depth = self._depth_m(parts[1])
         check_size(color, self._color, self._what_color)

@@ -43,6 +43,12 @@ class BagStream:
 
     Samples have header stamps. The rig holds the sensor to map with: `vision.sensor`, or, for `auto`, the first kind of the
     table that the bag has.
+
+    Attributes:
+        selection: topics that were chosen.
+        remarks: choices and assumptions, for the user.
+        losses: name -> number of messages that no observation uses (`unmatched color`).
+        lost: topic -> (messages that cannot be read, messages that the bag states), without those skipped while iterating.
     """
 
     def __init__(self, path: Path, config: Config, window: Window | None = None, *, skip_damaged: bool = False) -> None:
@@ -87,7 +93,7 @@ class BagStream:
 
     @property
     def groundtruth(self) -> Trajectory | None:
-        """True poses of the base, from an Odometry topic whose name suggests ground truth; None if there is none."""
+        """True poses of `sensors.groundtruth_topic`, else of an Odometry topic whose name or frame suggests them; else None."""
         topic = self.selection.groundtruth
         return None if topic is None else self._index.odometry[topic].trajectory(f"{self._bag.path}: {topic}")
 

@@ -38,26 +38,26 @@ def kinds() -> tuple[SensorKind, ...]:
 
 
 def wanted(sensor: str) -> tuple[SensorKind, ...]:
-    """The kinds of sensors for a value of `vision.sensor`: one for its name, none for `none`, all for any other value."""
+    """The kinds of sensors for a value of `vision.sensor`: one for its name, none for `none`, all for any other (`auto`)."""
     if sensor == "none":
         return ()
     return tuple(kind for kind in kinds() if kind.name == sensor) or kinds()
 
 
 def carried(rig: Rig) -> Iterator[tuple[SensorKind, Any]]:
-    """Kind and sensor, for every sensor of a rig."""
+    """Kind and sensor, for every sensor of a rig whose kind is known, in the order of the table."""
     for kind in kinds():
         if kind.sensor_name in rig.sensors:
             yield kind, rig.sensors[kind.sensor_name]
 
 
 def kind_of(observation: Observation) -> SensorKind:
-    """The kind of sensor that made an observation."""
+    """The kind of sensor that made an observation; it must be one of the table."""
     return next(kind for kind in kinds() if isinstance(observation, kind.sample))
 
 
 def rig_of(config: SensorsConfig) -> Rig:
-    """The rig described by a configuration alone, for users who feed the mapper themselves."""
+    """The rig of those sensors that a configuration alone describes, for users who feed the mapper themselves."""
     return Rig(**{kind.sensor_name: kind.configured(config) for kind in kinds()})
 
 
@@ -67,7 +67,7 @@ def message_types() -> tuple[str, ...]:
 
 
 def words(rig: Rig) -> list[str]:
-    """Short description of each sensor of a rig, for people."""
+    """Short description of each sensor of a rig, for people, such as `RGB-D, 320x240 pixels`."""
     return [kind.words(sensor) for kind, sensor in carried(rig)]
 
 

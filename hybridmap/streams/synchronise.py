@@ -26,8 +26,8 @@ class Ready:
 
     Attributes:
         stamp_ns: stamp at the end of the step, ns.
-        delta_robot: (3,) displacement since the previous step, in the robot's frame at that step, m and rad.
-        dt_s: time since the previous step, s.
+        delta_robot: (3,) pose of the robot in its own frame at the previous step, m and rad; zeros for the first step.
+        dt_s: time since the previous step, s; 0 for the first.
         pose_odom_robot: (3,) pose in `odom` at the stamp (velocities: integrated from the identity), m and rad.
         observation: the observation at the stamp; None for a step of self-motion alone.
         odometry_ns: stamp of the self-motion before any `retime`, ns; None for a step with an observation.
@@ -49,8 +49,9 @@ class Synchroniser:
     first counts; of velocities the last, since each is valid until the next.
 
     The samples of a recording come in order, and `latency_s` is 0. A live robot's messages arrive out of order across topics:
-    each sample waits `latency_s`, so that earlier ones can still come. An observation that comes later than that is dropped
-    and counted.
+    each sample waits `latency_s`, so that earlier ones can still come. An observation older than the last step, or than the
+    first odometry, is dropped and counted in `report`, without an error. Self-motion that comes later than that is an error,
+    and so is an observation older than one that waits for its odometry.
     """
 
     def __init__(self, latency_s: float = 0.0, odometry_delay_s: float = 0.0) -> None:
@@ -58,8 +59,7 @@ class Synchroniser:
 
         Args:
             latency_s: samples are held until the newest stamp is this much later, s; 0 for sorted streams.
-            odometry_delay_s: added to the stamps of self-motion, to put them on the clock of the observations.
-            max_hold_s: at the end, observations later than the last odometry by more than this are dropped, s.
+            odometry_delay_s: added to the stamps of self-motion, to put them on the clock of the observations, s.
         """
         self.report = StreamReport()
         self._arrived = ReorderBuffer(latency_s + abs(odometry_delay_s))
@@ -84,7 +84,7 @@ class Synchroniser:
             self._last = self._last[0] + self._later_ns, self._last[1]
 
     def push(self, sample: Sample) -> Iterator[Ready]:
-        """Add a sample, and yield the steps that have become ready. The sample is only taken in as the steps are consumed.
+        """Add a sample, and yield the steps that have become ready. It is taken in only when the steps are iterated over.
 
         Raises:
             StreamError: stamps out of order, self-motion that is not finite, or odometry mixed with velocities.
@@ -97,7 +97,7 @@ class Synchroniser:
     def flush(self) -> Iterator[Ready]:
         """End of the stream: yield the steps of all samples that still wait.
 
-        Observations shortly after the last odometry get its pose; later ones are dropped and counted.
+        Observations up to 1 s after the last odometry get its pose; later ones are dropped and counted.
         """
         for arrived in self._arrived.flush():
             yield from self._align(arrived)

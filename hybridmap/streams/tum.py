@@ -46,7 +46,8 @@ class _Pair:
 class TumStream:
     """A folder in the TUM RGB-D format as a stream.
 
-    It holds `rgb/` and `depth/` with their lists or `associations.txt`, `odometry.txt` (poses of base_link), and `camera.yaml`.
+    It holds `rgb/` and `depth/` with their lists or `associations.txt`, `odometry.txt` (poses of base_link), and `camera.yaml`
+    unless the configuration has its content.
     """
 
     def __init__(self, folder: Path, config: Config, window: Window | None = None, *, skip_damaged: bool = False) -> None:
@@ -178,6 +179,10 @@ def _stamp_ns(text: str, path: Path, number: int) -> int:
         raise StreamError(f"{path}:{number}: {error}") from None
 
 
+_LINES = {2: "`stamp file`", 4: "`stamp file stamp file`", 8: "`stamp x y z qx qy qz qw`"}
+"""Number of fields of a line -> its format."""
+
+
 def _read_lines(path: Path, fields: int) -> list[tuple[int, list[str]]]:
     """(line number, fields) of a list file without comments."""
     if not path.is_file():
@@ -186,22 +191,26 @@ def _read_lines(path: Path, fields: int) -> list[tuple[int, list[str]]]:
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
         words = line.split("#", 1)[0].split()
         if words and len(words) < fields:
-            raise StreamError(f"{path}:{number}: expected {fields} fields, found {len(words)}")
+            raise StreamError(f"{path}:{number}: expected {fields} fields {_LINES[fields]}, found {len(words)}")
         if words:
             lines.append((number, words))
     if not lines:
-        raise StreamError(f"{path}: names no picture; expected one line per picture")
+        raise StreamError(f"{path}: names no picture; expected one line {_LINES[fields]} per picture")
     return lines
 
 
 def read_picture_list(path: Path, stamp_column: int = 0) -> tuple[NDArray[np.int64], list[list[str]]]:
     """Read the list of images `rgb.txt`, `depth.txt` or `associations.txt`.
 
-    Returns the stamps (N,), ns, ascending, and in the same order all fields of each line. `stamp_column` is the column of the
-    stamp; `associations.txt` has two. Two neighbouring lines may be swapped in the file.
+    Args:
+        path: of the list.
+        stamp_column: column of the stamp to sort by, from 0; `associations.txt` has two, 0 and 2.
+
+    Returns:
+        Stamps (N,), ns, ascending, and in the same order all fields of each line.
 
     Raises:
-        StreamError: the file is missing, empty or damaged, or its stamps are out of order.
+        StreamError: the file is missing, empty or damaged, or its stamps are out of order by more than one line.
     """
     lines = _read_lines(path, 4 if path.name == "associations.txt" else 2)
     stamps = np.array([_stamp_ns(words[stamp_column], path, number) for number, words in lines], dtype=np.int64)

@@ -20,7 +20,7 @@ _FASTEST = 1000.0  # m/s and rad/s; no robot comes near it
 
 
 class VelocityStream:
-    """A velocity table as a stream. Its ground truth is the file `<name>_groundtruth.tum` next to it, if there is one."""
+    """A velocity table `stamp_s,v_m_s,omega_rad_s` as a stream; `<name>_groundtruth.tum` next to it is its ground truth."""
 
     def __init__(self, path: Path, config: Config, window: Window | None = None, *, skip_damaged: bool = False) -> None:
         """Read the table. There are no observations in it to be skipped.

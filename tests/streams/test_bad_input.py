@@ -383,6 +383,21 @@ def test_a_single_row_with_a_huge_step_takes_no_memory():
     assert decode_color(message, "x").shape == (1, 2, 3)
 
 
+@pytest.mark.parametrize(
+    ("layout", "said"),
+    [
+        ({"width": 0}, "0x2 pixels, expected at least 1x1"),
+        ({"step": 3}, "rows of 3 bytes, expected at least 4"),
+        ({"data": np.zeros(7, np.uint8)}, "holds 7 bytes, expected at least 8"),
+    ],
+)
+def test_a_picture_whose_layout_cannot_be(layout, said):
+    sound = {"height": 2, "width": 4, "step": 4, "encoding": "mono8", "is_bigendian": 0, "data": np.zeros(8, np.uint8)}
+    assert decode_color(SimpleNamespace(**sound), "x").shape == (2, 4, 3)
+    with pytest.raises(StreamError, match=said):
+        decode_color(SimpleNamespace(**(sound | layout)), "x")
+
+
 def test_a_colour_camera_that_cannot_be_finer_than_that():
     depth = Calibration(8, 6, np.diag([1e-3, 1e-3, 1.0]))
     with pytest.raises(StreamError, match="focal lengths"):
