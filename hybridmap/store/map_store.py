@@ -165,7 +165,7 @@ class MapStore:
         self._write(f"INSERT OR REPLACE INTO track VALUES ({_marks(len(row))})", row)
 
     def replace_odometry(self, track: Track, experiences: ExperienceMap) -> None:
-        """Write new poses of the whole track, and of all nodes in `odom` and along the chain, in place of the earlier ones.
+        """Write new poses of the whole track, and of all nodes in `odom` and along odometry edges, over the earlier ones.
 
         Args:
             track: as read from this file, with other poses; its anchors are not written.
