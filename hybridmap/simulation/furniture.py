@@ -19,7 +19,7 @@ def _beside(at: Spot, yaw_deg: float, forward_m: float, left_m: float) -> Spot:
 
 
 def table(at: Spot, yaw_deg: float, size: tuple[float, float], height_m: float = 0.74) -> list[Facet]:
-    """Surfaces of a table at (x, y), m: `size` is its depth and width, and it stands on four legs."""
+    """Surfaces of a table on four legs at (x, y), m: `size` is its depth (along `yaw_deg`) and width, m."""
     out = box(at, (*size, 0.04), paints.wood((168, 126, 84)), bottom_m=height_m - 0.04, yaw_deg=yaw_deg)
     leg = paints.metal((88, 90, 96))
     for forward in (-0.5 * size[0] + 0.05, 0.5 * size[0] - 0.05):

@@ -53,7 +53,7 @@ def drive(legs: Sequence[Array], limits: DriveLimits, dt_s: float) -> Array:
         dt_s: time step, s.
 
     Returns:
-        True poses (N, 3), m and rad, one per time step.
+        True poses (N, 3), m and rad, one per time step; the first at the first way point, towards the second.
     """
     first = legs[0][1] - legs[0][0]
     state = _State(float(legs[0][0, 0]), float(legs[0][0, 1]), math.atan2(first[1], first[0]))
@@ -145,7 +145,7 @@ class KidnappedDrive:
         first, last: indices of the poses at which the robot is picked up and put down.
         distance_m: straight distance between the two, m.
         truth: (N, 3) true poses, including the kidnapping, m and rad.
-        felt: (N, 3) poses according to the wheels, which stand still while the robot is carried.
+        felt: (N, 3) poses that wheels without errors measure, m and rad; they stand still while the robot is carried.
     """
 
     first: int
@@ -259,5 +259,5 @@ def wheel_odometry(true_poses: Array, errors: WheelErrorConfig, rng: np.random.G
 
 
 def as_transmitted(yaw_rad: Array) -> Array:
-    """Round headings (N,), rad, as messages and files do, which store them as quaternions."""
+    """Headings (N,), rad, wrapped and rounded as by messages and files, which store them as quaternions."""
     return yaw_from_quaternion(*quaternion_from_yaw(wrap_angle(yaw_rad)).T)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
+from inspect import signature
 from typing import Concatenate, ParamSpec
 
 import cv2
@@ -22,6 +23,8 @@ Rng = np.random.Generator
 Shape = tuple[int, int]
 """Height and width, texels."""
 P = ParamSpec("P")
+_DRAWN_WITH = 3
+"""Parameters of a paint: generator, shape, texels per metre."""
 
 
 def smooth_noise(rng: Rng, shape: Shape, cell_px: float) -> Field:
@@ -32,41 +35,50 @@ def smooth_noise(rng: Rng, shape: Shape, cell_px: float) -> Field:
 
 
 def tint(color: Color, tone: Field) -> Image:
-    """Fill a texture with a colour whose brightness is multiplied by `tone` (H, W); 1 gives the colour itself."""
+    """A texture (H, W, 3) uint8 of a colour whose brightness is multiplied by `tone` (H, W); 1 gives the colour itself."""
     return np.asarray(np.clip(tone[..., None] * np.asarray(color, dtype=np.float32), 0, 255).astype(np.uint8))
 
 
 def vary(rng: Rng, color: Color, spread: int = 20) -> Color:
-    """A random colour near another one: each channel differs by at most `spread`."""
+    """A random colour near another one: each channel differs by at most `spread`, within 0..255."""
     drawn = np.clip(np.asarray(color) + rng.integers(-spread, spread + 1, 3), 0, 255)
     return int(drawn[0]), int(drawn[1]), int(drawn[2])
 
 
 def any_color(rng: Rng, low: int = 20, high: int = 235) -> Color:
-    """A random colour, with each channel between `low` and `high`."""
+    """A random colour, with each channel from `low` to `high` - 1."""
     drawn = rng.integers(low, high, 3)
     return int(drawn[0]), int(drawn[1]), int(drawn[2])
 
 
 def material(draw: Callable[Concatenate[Rng, Shape, float, P], Image]) -> Callable[P, Paint]:
-    """Decorator: turns a function that draws a texture into one that takes its options (colours, sizes) and returns a paint."""
+    """Decorator: a function that draws a texture takes its options alone (colours, sizes) from then on, and returns a paint.
+
+    `plain((90, 90, 90))` is a paint, for instance. The renderer calls it with generator, shape and texels per metre.
+    """
 
     @wraps(draw)
     def with_options(*args: P.args, **options: P.kwargs) -> Paint:
         return lambda rng, shape, px_per_m: draw(rng, shape, px_per_m, *args, **options)
 
+    whole = signature(draw)
+    options = list(whole.parameters.values())[_DRAWN_WITH:]
+    vars(with_options)["__signature__"] = whole.replace(parameters=options, return_annotation="Paint")  # what `help` shows
     return with_options
 
 
 @material
 def plain(_rng: Rng, shape: Shape, _px_per_m: float, color: Color) -> Image:
-    """Texture of a featureless wall: a single colour."""
+    """`plain(color)` is a paint of a single colour: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
     return np.full((*shape, 3), color, dtype=np.uint8)
 
 
 @material
 def plaster(rng: Rng, shape: Shape, px_per_m: float, color: Color) -> Image:
-    """Texture of a painted wall: faint clouds, a mark every two metres, and a skirting board."""
+    """`plaster(color)` is a paint of a wall with faint clouds: (h, w, 3) uint8 RGB for `shape` (h, w), texels.
+
+    It has a mark every two metres on average, and a skirting board if it is higher than 1.5 m.
+    """
     tone = 1.0 + 0.012 * smooth_noise(rng, shape, 0.6 * px_per_m) + 0.012 * smooth_noise(rng, shape, 0.03 * px_per_m)
     image = tint(color, tone)
     for _ in range(rng.poisson(0.5 * shape[1] / px_per_m)):
@@ -81,7 +93,7 @@ def plaster(rng: Rng, shape: Shape, px_per_m: float, color: Color) -> Image:
 
 @material
 def carpet(rng: Rng, shape: Shape, px_per_m: float, color: Color) -> Image:
-    """Texture of carpet tiles of half a metre: each has its own tone, and there are a few stains."""
+    """`carpet(color)` is a paint of carpet tiles of half a metre: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
     tile_px = max(2, round(0.5 * px_per_m))
     rows, columns = -(-shape[0] // tile_px), -(-shape[1] // tile_px)
     tones = 1.0 + 0.05 * rng.standard_normal((rows, columns), dtype=np.float32)
@@ -97,7 +109,10 @@ def carpet(rng: Rng, shape: Shape, px_per_m: float, color: Color) -> Image:
 
 @material
 def wood(rng: Rng, shape: Shape, px_per_m: float, color: Color = (150, 108, 70), *, plank_m: float = 0.0) -> Image:
-    """Texture of wood, its grain parallel to the surface's edge `along`; with `plank_m` > 0 it has planks of that width."""
+    """`wood(color)` is a paint of wood: (h, w, 3) uint8 RGB for `shape` (h, w), texels.
+
+    Its grain is parallel to the surface's edge `along`; with `plank_m` > 0 it has planks of that width.
+    """
     stretched = smooth_noise(rng, (shape[0], max(2, shape[1] // 12)), 0.02 * px_per_m)
     grain = cv2.resize(stretched, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
     rings = np.sin(4.0 * smooth_noise(rng, shape, 0.35 * px_per_m) + 2.0 * grain)
@@ -116,7 +131,7 @@ def wood(rng: Rng, shape: Shape, px_per_m: float, color: Color = (150, 108, 70),
 
 @material
 def bricks(rng: Rng, shape: Shape, px_per_m: float) -> Image:
-    """Texture of a brick wall; every brick has its own tone."""
+    """`bricks()` is a paint of a wall of bricks, each of its own tone: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
     image = np.full((*shape, 3), (178, 170, 160), dtype=np.uint8)
     height, width = max(3, round(0.077 * px_per_m)), max(6, round(0.25 * px_per_m))
     gap = max(1, round(0.012 * px_per_m))
@@ -130,7 +145,7 @@ def bricks(rng: Rng, shape: Shape, px_per_m: float) -> Image:
 
 @material
 def ceiling_tiles(rng: Rng, shape: Shape, px_per_m: float) -> Image:
-    """Texture of a suspended ceiling: tiles of 60 cm with seams and pinholes."""
+    """`ceiling_tiles()` is a paint of ceiling tiles of 60 cm: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
     tone = 1.0 - 0.10 * (rng.random(shape, dtype=np.float32) > 0.985)
     tile_px = max(2, round(0.6 * px_per_m))
     tones = 1.0 + 0.012 * rng.standard_normal((-(-shape[0] // tile_px), -(-shape[1] // tile_px)), dtype=np.float32)
@@ -142,14 +157,17 @@ def ceiling_tiles(rng: Rng, shape: Shape, px_per_m: float) -> Image:
 
 @material
 def fabric(rng: Rng, shape: Shape, px_per_m: float, color: Color) -> Image:
-    """Texture of woven cloth with a stripe or two."""
+    """`fabric(color)` is a paint of woven, mottled cloth: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
     tone = 1.0 + 0.05 * rng.standard_normal(shape, dtype=np.float32) + 0.06 * smooth_noise(rng, shape, 0.1 * px_per_m)
     return tint(color, tone)
 
 
 @material
 def metal(rng: Rng, shape: Shape, px_per_m: float, color: Color = (150, 154, 158), *, drawers: int = 0) -> Image:
-    """Texture of sheet metal, with drawers, handles and name plates if `drawers` > 0."""
+    """`metal(color)` is a paint of sheet metal: (h, w, 3) uint8 RGB for `shape` (h, w), texels.
+
+    With `drawers` > 0 it has so many of them, with handles and name plates.
+    """
     image = tint(color, 1.0 + 0.02 * smooth_noise(rng, shape, 0.2 * px_per_m))
     dark = vary(rng, (70, 72, 76), 10)
     for index in range(drawers):

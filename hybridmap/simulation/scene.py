@@ -36,7 +36,7 @@ class Hits:
 
 
 class Caster:
-    """Casts rays at a list of rectangular surfaces."""
+    """Casts rays at a list of rectangular surfaces; they are numbered in the order of the list."""
 
     def __init__(self, surfaces: Sequence[Facet]) -> None:
         corner = np.array([s.corner for s in surfaces])
@@ -67,7 +67,7 @@ class Caster:
         return Hits(hit, length, triangle >> 1, across, np.float32(1.0) - height)
 
     def blocked(self, rays: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Whether each ray `(..., 6)` (origin, direction) hits a surface before the end of its direction vector."""
+        """Whether each ray (..., 6), float32, origin and direction, m, hits a surface before its direction vector ends."""
         return np.asarray(self._scene.test_occlusions(o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=0.999).numpy())
 
 
@@ -114,7 +114,7 @@ class Scene:
 
 
 def texture_size(surface: Facet) -> tuple[int, int]:
-    """Height and width of a surface's texture, texels."""
+    """Height and width of a surface's texture, texels, at least 3 each."""
     height, width = (float(np.linalg.norm(edge)) * surface.px_per_m for edge in (surface.up, surface.along))
     return max(3, round(height)), max(3, round(width))
 
@@ -146,7 +146,7 @@ class TextureAtlas:
         down: NDArray[np.float32],
         footprint_texels: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Colour (H, W, 3) float32 where a ray hit a surface; trilinear between the two nearest resolutions.
+        """Colour (H, W, 3) float32, RGB 0..255, where a ray hit a surface; trilinear between the two nearest resolutions.
 
         Args:
             surface: (H, W) index of the surface hit.
@@ -173,7 +173,11 @@ class TextureAtlas:
 
 
 def build_atlas(textures: list[Image]) -> TextureAtlas:
-    """Pack textures (h, w, 3) uint8 and their copies at half, quarter, ... resolution into one image."""
+    """Pack textures and their copies at half, quarter, ... resolution into one image.
+
+    Args:
+        textures: (h, w, 3) uint8, one per surface, in the order of the surfaces, RGB, with the light on them already.
+    """
     pyramids = [_pyramid(texture) for texture in textures]
     stride = max(len(pyramid) for pyramid in pyramids)
     rows = [(index * stride + level, image) for index, pyramid in enumerate(pyramids) for level, image in enumerate(pyramid)]
@@ -214,19 +218,27 @@ _AMBIENT, _DIRECT = 0.78, 0.9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightMap:
-    """Brightness factors (h, w) float32 on a coarse grid over one surface, row 0 at the top."""
+    """Brightness `factors` (h, w) float32 on a coarse grid over one surface, row 0 at the top; 1 leaves a colour as it is."""
 
     factors: NDArray[np.float32]
 
     def apply(self, texture: Image) -> Image:
-        """The texture (H, W, 3) multiplied by the brightness factors."""
+        """A copy of a texture (H, W, 3) uint8 multiplied by the brightness factors, interpolated to its size."""
         height, width = texture.shape[:2]
         smooth = cv2.resize(self.factors, (width, height), interpolation=cv2.INTER_LINEAR)
         return np.asarray(np.clip(texture * smooth[..., None], 0, 255), dtype=np.uint8)
 
 
 def bake(surfaces: Sequence[Facet], caster: Caster) -> list[LightMap]:
-    """Compute the light on every surface; light sources have full brightness. A world without lamps is lit evenly."""
+    """Compute the light on every surface; light sources have full brightness. A world without lamps is lit evenly.
+
+    Args:
+        surfaces: all surfaces of the world.
+        caster: of those that cast shadows.
+
+    Returns:
+        One map per surface, in their order.
+    """
     lamps = [s for s in surfaces if s.glow > 0.0]
     if not lamps:
         return [LightMap(np.ones((1, 1), dtype=np.float32)) for _ in surfaces]

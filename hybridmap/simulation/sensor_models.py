@@ -66,6 +66,15 @@ class CameraModel:
     """Renders frames of a simulated RGB-D camera in one scene."""
 
     def __init__(self, scene: Scene, config: CameraConfig, rng: np.random.Generator, noise: float = 1.0) -> None:
+        """Prepare the rays of the pixels, and draw how the exposure changes over the drive.
+
+        Args:
+            scene: the surfaces in view.
+            config: image size and field of view.
+            rng: random generator for the exposure alone.
+            noise: factor on the noise of depth and colour, the holes and the change of exposure. With 0 there is none of these,
+                but depth is still lost at random at edges and on surfaces seen at a grazing angle.
+        """
         self._scene = scene
         self._config = config
         self._level = noise
@@ -173,6 +182,7 @@ class LaserModel:
     """Simulates scans of a planar laser in one scene, in a plane parallel to the floor."""
 
     def __init__(self, scene: Scene, config: LaserScannerConfig, noise: float = 1.0) -> None:
+        """Take a scene and a laser; `noise` is a factor on the noise of ranges and on the lost beams, 0: none."""
         self._scene = scene
         self._noise = noise
         self.laser = laser_of(config)

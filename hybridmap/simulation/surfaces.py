@@ -116,7 +116,7 @@ def box(
         size: extent along its own x (front to back), y and z, m.
         paint: paint of every face that `faces` does not name.
         bottom_m: height of its lower face; a box on the floor (0) has none.
-        yaw_deg: direction of its own x axis.
+        yaw_deg: direction of its own x axis, from the x axis of the world, counter-clockwise.
         faces: paints of `front` (+x), `back`, `left` (+y), `right`, `top`, `bottom`.
         px_per_m: texels per metre.
         foliage_m: how far a laser beam gets into it at most, m.
@@ -154,7 +154,7 @@ def panel(
 
     Args:
         middle: x, y and height of the middle of its lower edge on the wall, m.
-        yaw_deg: direction that it faces.
+        yaw_deg: direction that it faces, from the x axis of the world, counter-clockwise.
         size: width and height, m.
         paint: paint of its front.
         px_per_m: texels per metre.

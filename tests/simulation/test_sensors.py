@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from functools import cache
+from inspect import signature
 
 import cv2
 import numpy as np
 import pytest
 
 from hybridmap.config.inputs import CameraConfig, LaserScannerConfig
-from hybridmap.simulation import sensor_models
+from hybridmap.simulation import pictures, sensor_models
 from hybridmap.simulation.scene import Scene, build_atlas
 from hybridmap.simulation.sensor_models import CameraModel, LaserModel
 from hybridmap.simulation.worlds import build_world
@@ -133,3 +134,10 @@ def test_far_textures_come_from_smaller_copies():
     assert near.std() > 30
     np.testing.assert_allclose(far, 127.5, atol=2.0)
     np.testing.assert_allclose(atlas.sample(surface + 1, across, down, np.ones((8, 8), np.float32)), 40.0)
+
+
+def test_a_paint_is_made_from_its_options_alone_as_its_signature_says():
+    assert list(signature(pictures.books).parameters) == ["shelves"]
+    drawn = pictures.books(3)(np.random.default_rng(0), (90, 60), 100.0)
+    assert drawn.shape == (90, 60, 3)
+    assert drawn.dtype == np.uint8

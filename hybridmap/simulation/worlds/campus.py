@@ -38,7 +38,7 @@ _GREY = paints.plain((150, 150, 150))
 
 
 def campus(seed: int) -> World:
-    """The campus of a seed."""
+    """The campus of a seed, which determines everything in it: road, buildings, trees, cars, people and drive."""
     rng = np.random.default_rng([seed, 0xCA])
     road = _road(rng)
     buildings = _buildings(rng, road)

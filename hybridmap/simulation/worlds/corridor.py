@@ -13,14 +13,14 @@ DRIVE_M = 16.8
 
 
 def corridor() -> World:
-    """The featureless corridor: one colour a wall, even light."""
+    """The featureless corridor: one colour a wall, even light; driven there, back and there again."""
     wall = paints.plain((206, 202, 192))
     shell = _shell(wall, paints.plain((120, 118, 114)), paints.plain((228, 227, 222)), ends=wall)
     return World("corridor", tuple(shell), _there_and_back_and_there(), texture_seed=31)
 
 
 def corridor_landmarks() -> World:
-    """The same corridor with doors, posters and boxes under lamps."""
+    """The corridor of `corridor` and the same drive, with doors, posters and boxes under lamps."""
     floor, ceiling = paints.carpet((104, 108, 116)), paints.ceiling_tiles()
     shell = _shell(paints.plaster((208, 202, 188)), floor, ceiling, ends=paints.bricks())
     world = (*shell, *_lamps(), *_doors(), *_pictures(), *_things())

@@ -48,10 +48,10 @@ def write_rosbag1(stream: Stream, path: Path, *, overwrite: bool = False, progre
         stream: with poses as self-motion.
         path: of the `.bag` file.
         overwrite: replace a bag that is there.
-        progress: told of every scan or frame.
+        progress: called after every scan or frame with the number written, and that expected, None if unknown.
 
     Returns:
-        Number of messages a topic.
+        Topic -> number of messages written.
 
     Raises:
         OutputError: the place is taken or cannot be written to.
@@ -86,10 +86,10 @@ def write_rosbag2(
         path: of the folder or file.
         storage: format of the messages' file.
         overwrite: replace a bag that is there.
-        progress: told of every scan or frame.
+        progress: called after every scan or frame with the number written, and that expected, None if unknown.
 
     Returns:
-        Number of messages a topic.
+        Topic -> number of messages written.
 
     Raises:
         OutputError: the place is taken or cannot be written to.

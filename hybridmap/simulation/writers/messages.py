@@ -24,7 +24,7 @@ TF_TYPE = "tf2_msgs/msg/TFMessage"
 _MM_PER_M = 1000.0
 
 Progress = Callable[[int, int | None], None]
-"""Called with the observations written so far and their number."""
+"""Called with the number of observations written so far, and that of all, None if unknown."""
 
 
 def silent(done: int, total: int | None) -> None:
@@ -90,7 +90,7 @@ class MessageFactory:
         return self._image(frame.stamp_ns, millimetres(frame.depth_m), "16UC1")
 
     def camera_info(self, stamp_ns: int, camera: Camera) -> Any:
-        """sensor_msgs/CameraInfo of an undistorted camera."""
+        """sensor_msgs/CameraInfo of an undistorted camera (no distortion, no rectification)."""
         fx, fy, cx, cy = camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px
         K = np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
         P = np.array([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0])
@@ -113,7 +113,7 @@ class MessageFactory:
         )
 
     def mounting(self, stamp_ns: int, camera: Camera | None, laser: Laser | None) -> Any:
-        """tf2_msgs/TFMessage from `base_link` to each sensor."""
+        """tf2_msgs/TFMessage with the pose of each sensor in `base_link`; a sensor that is None is left out."""
         transforms = []
         if camera is not None:
             T = camera.T_base_camera
@@ -137,7 +137,7 @@ def millimetres(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
 
 
 def twist_between(before: SelfMotion | None, after: SelfMotion) -> Array:
-    """Mean velocity (3,), m/s and rad/s in the robot's frame, from one odometry sample to the next."""
+    """Mean velocity (3,), m/s and rad/s in the robot's frame, from one odometry sample to the next; zeros for the first."""
     if before is None or after.stamp_ns <= before.stamp_ns:
         return np.zeros(3)
     step = log(between(before.pose_odom_robot, after.pose_odom_robot))
@@ -155,7 +155,7 @@ def quaternion_of_rotation(rotation: Array) -> Array:
     snapped = np.round(quaternion * 2.0**40) / 2.0**40
     quaternion = snapped / np.linalg.norm(snapped)
     if np.abs(rotation_from_quaternion(quaternion) - rotation).max() > 1e-6:
-        raise StreamError("the camera's mounting: expected a rotation matrix")
+        raise StreamError(f"the camera's mounting: expected a rotation matrix, found {np.round(rotation, 4).tolist()}")
     return quaternion if quaternion[3] >= 0.0 else -quaternion
 
 

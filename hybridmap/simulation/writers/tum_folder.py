@@ -36,10 +36,10 @@ def write_tum(stream: Stream, folder: Path, *, overwrite: bool = False, progress
         stream: with poses as self-motion and a camera.
         folder: to be made.
         overwrite: replace a recording that is there.
-        progress: told of every frame.
+        progress: called after every frame with the number written, and that of all observations, None if unknown.
 
     Returns:
-        Number of poses, of frames, and of scans that such a folder cannot hold and that were left out.
+        Numbers by name: `odometry` (poses), `frames`, and `scans left out`, which such a folder cannot hold, if there are any.
 
     Raises:
         OutputError: the place is taken or cannot be written to.
