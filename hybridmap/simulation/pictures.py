@@ -74,7 +74,7 @@ def painting(rng: Rng, shape: Shape, px_per_m: float) -> Image:
 
 @material
 def door(rng: Rng, shape: Shape, px_per_m: float, color: Color = (142, 104, 72)) -> Image:
-    """`door(color)` is a paint of a closed door with frame, handle and plate: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`door(color)` is a paint of a closed door with handle and plate: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
     height, width = shape
     turned = wood(vary(rng, color, 14))(rng, (width, height), px_per_m)
     image = np.ascontiguousarray(np.rot90(turned))

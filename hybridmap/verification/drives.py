@@ -31,7 +31,13 @@ class ExactDrive:
 
 
 def wander(rng: np.random.Generator, distance_m: float, hz: float) -> ExactDrive:
-    """A random drive through a 10 x 3 m room at 0.3 to 1.1 m/s that turns away from the walls."""
+    """A random drive of `distance_m` through a 10 x 3 m room at 0.3 to 1.1 m/s that turns away from the walls.
+
+    Args:
+        rng: random generator of speeds and turns.
+        distance_m: the drive ends with the step that reaches it.
+        hz: steps per second.
+    """
     half = np.array(_ROOM_M) / 2 - _MARGIN_M
     dt = 1.0 / hz
     x = y = yaw = omega = driven = 0.0
@@ -53,7 +59,7 @@ def wander(rng: np.random.Generator, distance_m: float, hz: float) -> ExactDrive
 
 
 def corridor(rng: np.random.Generator, hz: float) -> ExactDrive:
-    """A drive of 16.8 m down a corridor at 0.5 m/s, swaying a little."""
+    """A drive of 16.8 m down a corridor at 0.5 m/s, swaying a little from a random phase; `hz` steps per second."""
     steps = round(16.8 / 0.5 * hz)
     sway = 0.05 * np.sin(np.arange(steps + 1) / hz * 2.0 * np.pi / 6.0 + rng.uniform(0.0, 2.0 * np.pi))
     return _along(np.stack([np.full(steps, 0.5 / hz), np.diff(sway)], axis=1), hz)

@@ -29,7 +29,7 @@ def write_verification(place: Held, head: dict[str, Any], rows: Sequence[Metric]
 
     Args:
         place: the folder, locked against other writers.
-        head: facts about the run.
+        head: facts about the run, by name; they become keys of `metrics.json` and the head of the page.
         rows: the metrics in the table.
         result: results of the experiments, for the pictures.
 
@@ -138,7 +138,7 @@ def phase_figure(result: CellVerification) -> str:
 
 
 def module_figure(drives: Sequence[PathErrors], spacings_m: Any) -> str:
-    """Draw the phase error of each grid module over distance. Returns a `data:` URI."""
+    """Draw the phase error of each grid module over distance, on the first of the drives. Returns a `data:` URI."""
     with style.figure(style.PAGE_WIDTH_IN, 2.6) as picture:
         axes = picture.subplots()
         colours = np.linspace(0.0, 0.9, len(spacings_m))

@@ -23,8 +23,8 @@ class PathErrors:
     Attributes:
         distance_m: (S,) distance driven.
         module: (S, M) phase error of each of the M grid modules, as a share of its spacing.
-        position_m: (S,) error of the position decoded from all modules together.
-        heading_rad: (S,) error of the decoded heading.
+        position_m: (S,) distance of the position decoded from all modules together from the true one.
+        heading_rad: (S,) error of the decoded heading, never negative.
     """
 
     distance_m: Array
@@ -39,7 +39,7 @@ def path_errors(config: NeuralConfig, drive: ExactDrive, rng: np.random.Generato
     Args:
         config: settings of the cells.
         drive: motion and exact poses.
-        rng: random generator for the neuron noise; None without noise.
+        rng: random generator for `config.neuron_noise`; None: one with a fixed seed.
     """
     integrator = PathIntegrator(config, rng)
     dt, next_m = 1.0 / drive.hz, 0.0
@@ -88,7 +88,7 @@ def noise_errors(
     Args:
         drive_seed, noise_seed: seeds of the drive and of the noise.
         settings: settings of the cells (`NeuralConfig`).
-        noise: standard deviation of the noise.
+        noise: standard deviation of the noise, as a share of the rate.
         distance_m: length of the drive.
     """
     drive = wander(np.random.default_rng(drive_seed), distance_m, 30.0)
@@ -119,8 +119,8 @@ def head_direction(seed: np.random.SeedSequence, settings: dict[str, object], st
     """Turn a ring of head-direction cells by random turns, in float32 and in float64; compare its heading with their sum.
 
     Args:
-        seed: of the turns.
-        settings: the section `neural` of a configuration.
+        seed: seed of the turns.
+        settings: settings of the cells (`NeuralConfig`).
         steps: number of turns.
     """
     turns = np.random.default_rng(seed).normal(0.002, 0.02, steps)
@@ -155,7 +155,13 @@ class StandstillResult:
 
 
 def standstill(seed: np.random.SeedSequence, settings: dict[str, object], steps: int) -> StandstillResult:
-    """Drive two metres, then stand still: once with the path integrator as it is, once with its dynamics kept running."""
+    """Drive two metres, then stand still: once with the path integrator as it is, once with its dynamics kept running.
+
+    Args:
+        seed: seed of the drive.
+        settings: settings of the cells (`NeuralConfig`); both rectifiers are tried.
+        steps: steps at standstill; a twentieth of them with the dynamics kept running.
+    """
     drive = wander(np.random.default_rng(seed), 2.0, 30.0)
     ungated, change = {}, 0.0
     for rectifier in ("relu", "softplus"):

@@ -21,7 +21,7 @@ class Stripe:
     """The strongest plane wave of a rate map.
 
     Attributes:
-        orientation_rad: direction in which the rate changes, in [0, pi).
+        orientation_rad: direction in which the rate changes, from the first axis of the map to the second, in [0, pi).
         period_m: distance between two stripes.
     """
 
@@ -101,7 +101,14 @@ def _inner_peaks(correlation: Array) -> tuple[Array, float]:
 def ideal_map(
     side: int, spacing_bins: float, angle_rad: float = 0.0, metric: Literal["hexagonal", "square"] = "hexagonal"
 ) -> Array:
-    """An ideal rate map (side, side): the sum of three (hexagonal) or two (square) plane waves, from 0 to 1."""
+    """An ideal rate map (side, side): the sum of three (hexagonal) or two (square) plane waves, from 0 to 1.
+
+    Args:
+        side: bins along a side.
+        spacing_bins: distance of two neighbouring peaks, bins.
+        angle_rad: direction of the first wave, from the first axis to the second.
+        metric: lattice of the peaks.
+    """
     period = spacing_bins * (np.sqrt(3.0) / 2.0 if metric == "hexagonal" else 1.0)
     angles = angle_rad + np.radians((0.0, 60.0, 120.0) if metric == "hexagonal" else (0.0, 90.0))
     x, y = np.meshgrid(np.arange(side), np.arange(side), indexing="ij")
@@ -111,7 +118,7 @@ def ideal_map(
 
 
 def stripe_of(rates: Array, pitch_m: float) -> Stripe:
-    """Orientation and period of the strongest plane wave of a rate map (H, W), by its Fourier transform, interpolated."""
+    """Strongest plane wave of a rate map (H, W) with bins of `pitch_m`, by its Fourier transform, interpolated."""
     from scipy import optimize
 
     height, width = rates.shape

@@ -90,7 +90,7 @@ class PlaceMaps:
 
     Attributes:
         examples: (E, H, W) rate maps of some cells.
-        fields: (C,) number of fields of every cell that fires.
+        fields: (C,) number of fields, by `field_counts`, of every cell that fires.
     """
 
     examples: NDArray[np.float32]
@@ -98,7 +98,7 @@ class PlaceMaps:
 
     @property
     def single(self) -> float:
-        """Share of the cells that fire which have exactly one field."""
+        """Share of the cells that fire which have exactly one field; NaN if none fires."""
         return float((self.fields == 1).mean()) if len(self.fields) else float("nan")
 
 
@@ -173,12 +173,13 @@ class PrintedRule:
     """
 
     def __init__(self, rng: np.random.Generator, cells: int, inputs: int, learning_rate: float) -> None:
+        """Draw the weights (cells, inputs) with `rng`; `learning_rate` is that of the strongest cell in each step."""
         weights = np.maximum(rng.normal(size=(cells, inputs)), 0.0).astype(np.float32)
         self.weights: NDArray[np.float32] = weights / np.linalg.norm(weights, axis=1, keepdims=True)
         self._rate = np.float32(learning_rate)
 
     def respond(self, drive: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The rates of the place cells, (cells,) or (cells, P), to inputs (inputs,) or (inputs, P)."""
+        """Return the rates of the place cells, (cells,) or (cells, P), to inputs (inputs,) or (inputs, P)."""
         received = self.weights @ drive
         return np.asarray(np.maximum(received - np.quantile(received, 0.98, axis=0), 0.0), dtype=np.float32)
 
@@ -210,7 +211,10 @@ def _onto_sheet(learnt: NDArray[np.float32], bumps: NDArray[np.float32], rates: 
 
 
 def settled_sheets(integrator: PathIntegrator, shown: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Activity (S, P) of the attractor sheet after its cells have competed, starting from each of P inputs (S, P)."""
+    """Activity (S, P) of the integrator's attractor after its cells have competed, starting from each of P inputs (S, P).
+
+    The attractor is left in the last of these states; zero inputs give zeros.
+    """
     attractor = integrator.attractor
     settled = np.zeros_like(shown)
     for pixel in np.flatnonzero(shown.sum(axis=0) > 0.0):
@@ -221,7 +225,7 @@ def settled_sheets(integrator: PathIntegrator, shown: NDArray[np.float32]) -> ND
 
 
 def one_bump_share(activity: NDArray[np.float32]) -> float:
-    """Share of the places at which the sheet holds exactly one bump of activity; places without activity do not count.
+    """Share of the places at which the sheet holds exactly one bump; places without activity do not count; NaN if none has any.
 
     A bump is a cell above 20 % of the highest activity that no other cell within two cells exceeds.
 

@@ -154,7 +154,7 @@ def place_rows(result: CellVerification) -> list[Metric]:
 
 
 def recurrence_rows(result: CellVerification) -> list[Metric]:
-    """Rows on the effect of recurrent competition on the attractor sheet of the place cells."""
+    """Rows on recurrent competition in the attractor sheet: places with one bump, cells with one field, with and without."""
     rows, place = [], result.place
     for learnt, cells in _LEARNT.items():
         for stage, how in (("input", "without competition"), ("settled", "after settled competition")):
@@ -168,7 +168,7 @@ def recurrence_rows(result: CellVerification) -> list[Metric]:
 
 
 def recurrence_verdict(place: PlaceResult) -> str:
-    """One sentence on the effect of recurrent competition on the attractor sheet of the place cells."""
+    """Sentences on the effect of recurrent competition on the attractor sheet, for each kind of place cells, on one line."""
     sentences = []
     for learnt, cells in _LEARNT.items():
         before, after = (100.0 * place.sheet[learnt, stage].single for stage in ("input", "settled"))
@@ -182,7 +182,7 @@ def recurrence_verdict(place: PlaceResult) -> str:
 
 
 def verb_of_change(percent: float) -> str:
-    """The verb that describes a change (such as `raises` or `lowers`), given in per cent of all cells."""
+    """The verb for a change in per cent of all cells: `does not change`, `hardly changes`, `raises` or `lowers`."""
     if abs(percent) < 0.5:
         return "does not change"
     return "hardly changes" if abs(percent) < 5.0 else "raises" if percent > 0.0 else "lowers"
@@ -228,7 +228,7 @@ class NoiseCurve:
 
 
 def noise_curve(drives: Sequence[PathErrors], what: Literal["position_m", "heading_rad"] = "position_m") -> NoiseCurve:
-    """Statistics of the position errors, m, or heading errors, rad, of drives with the same noise."""
+    """Statistics of the position errors, m, or heading errors, rad, of drives with the same noise, as far as all of them go."""
     count = min(len(drive.distance_m) for drive in drives)
     errors = np.array([getattr(drive, what)[:count] for drive in drives])
     rms = np.sqrt((errors**2).mean(axis=0))

@@ -100,7 +100,7 @@ def _positions_after(config: NeuralConfig, drive: ExactDrive, cells: Cells | Non
 
 
 def overwrite(integrator: PathIntegrator, cells: Cells, way_m: Array) -> None:
-    """Shift the activity of some cells to that of a robot displaced by `way_m` (2,), m."""
+    """Shift the activity of some of the integrator's cells to that of a robot displaced by `way_m` (2,), m."""
     shift = integrator.bands.wave_vectors @ way_m
     if cells != "sheets":
         integrator.bands.activity = integrator.bands.rates_at(integrator.bands.phases() + shift)

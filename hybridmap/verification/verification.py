@@ -30,13 +30,15 @@ class Scale:
     """Size of the experiments. The limits in the table hold for the defaults.
 
     Attributes:
-        paths: number of drives through the room, each of `distance_m`, at each step rate with each rectifier.
+        paths, distance_m: number and length of the drives through the room, at each step rate with each rectifier.
         heading_steps, still_steps: number of turns of the head-direction ring, and of steps at standstill.
         overwrites: number of shifts of the activity that are decoded at once.
         overwritten_drives: number of directions in which activity is shifted before driving on.
-        arena_m, lattice_pitch_m, lattice_cells: side and pixel of the grid cells' arena, sampled cells per module.
+        arena_m: side of the arena of all rate maps.
+        lattice_pitch_m, lattice_cells: pixel of the maps of band and grid cells; sampled grid cells per module.
         place_pitch_m, place_cells, place_epochs: pixel of the place cells' maps; cells and passes of the paper's rule.
-        noise: standard deviations of the neuron noise; `noise_repeats` drives of `noise_distance_m` for each.
+        noise: standard deviations of the neuron noise, as a share of the rate; `noise_repeats` drives of `noise_distance_m`
+            for each.
         workers: number of processes; None: one per core.
     """
 
