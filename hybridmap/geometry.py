@@ -116,7 +116,7 @@ def log(pose: ArrayLike) -> Array:
 
 
 def exp(twist: ArrayLike) -> Array:
-    """Return the SE(2) exponential `(..., 3)` of a twist (m, m, rad)."""
+    """Return the SE(2) exponential `(..., 3)` of a twist (m, m, rad): a pose, yaw wrapped to [-pi, pi)."""
     t = np.asarray(twist, dtype=np.float64)
     yaw = t[..., 2]
     small = np.abs(yaw) < 1e-6

@@ -111,7 +111,10 @@ class Mapper:
         return [self.step(ready) for ready in self._synchroniser.push(sample)]
 
     def step(self, ready: Ready) -> Update:
-        """One step of the algorithm, called by `add`: path integration, view, new node, loop closure, correction of the map."""
+        """One step of the algorithm, called by `add`: path integration, view, new node, loop closure, correction of the map.
+
+        `ready` is the motion since the step before, with the observation at its end, if there is one.
+        """
         self._path_integrate(ready)
         view = self._look(ready)
         if view is None and self.vision is not None:

@@ -327,12 +327,12 @@ class Ensemble:
         return extend(graph, solution.poses if solution is not None else graph.initial[:1])
 
     def update(self, graph: PoseGraph) -> None:
-        """Let every back-end follow the graph."""
+        """Let every back-end follow the graph; `solutions` and `failures` say how that went."""
         for name, backend in self._backends.items():
             self._run(name, backend, graph, final=False)
 
     def finish(self, graph: PoseGraph) -> None:
-        """Let every back-end compute its final solution."""
+        """Let every back-end compute its final solution; `solutions` and `failures` say how that went."""
         for name, backend in self._backends.items():
             self._run(name, backend, graph, final=True)
 

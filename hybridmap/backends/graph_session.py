@@ -168,7 +168,7 @@ class GraphSession:
         self._backend = self._fresh()
 
     def fix(self, node: int) -> None:
-        """Hold this node fixed at its present pose from now on, instead of the present one.
+        """Hold this node fixed at its latest pose from now on, instead of the one that was fixed before.
 
         Raises:
             BackendError: there is no such node, or it has no pose yet.
@@ -180,7 +180,7 @@ class GraphSession:
         self._state = replace(self._state, fixed=node)
 
     def step(self, budget: int = 1) -> Solution:
-        """Solve the changed graph: run up to `budget` updates of the back-end, fewer if it converges; returns the last one.
+        """Solve the changed graph by up to `budget` updates of the back-end, fewer if it converges; returns the last solution.
 
         Raises:
             GraphError: the graph is malformed.

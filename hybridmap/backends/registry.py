@@ -89,5 +89,5 @@ def create(backend: str | Backend, config: BackendsConfig | None = None) -> Back
 
 
 def is_sequential(name: str) -> bool:
-    """Whether the back-end of this name solves a graph by one sequence of iterations or sweeps on one objective."""
+    """Whether the back-end of this name is one of ours that iterates on one objective from start to end, in steps or sweeps."""
     return name in _OURS and name not in _NOT_SEQUENTIAL

@@ -126,7 +126,7 @@ class Headings:
     travel_m: Array
 
     def turns(self, first_s: Array, last_s: Array, offset_s: float) -> tuple[Array, Array]:
-        """Turn (R,) rad and way (R,) m between times on the views' clock, if that is `offset_s` late."""
+        """Turn (R,) rad and way (R,) m between times (R,) on the views' clock, s, if that is `offset_s` late."""
         ends = [np.interp(at - offset_s, self.stamps_s, of) for of in (self.yaw_rad, self.travel_m) for at in (first_s, last_s)]
         return ends[1] - ends[0], ends[3] - ends[2]
 

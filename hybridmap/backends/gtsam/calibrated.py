@@ -49,7 +49,7 @@ class _Found:
 
 
 def with_calibrated_odometry(graph: PoseGraph, gains: Gains) -> PoseGraph:
-    """Copy of the graph with calibrated odometry edges.
+    """Copy of the graph with the odometry edges from a node to the next calibrated; other edges stay.
 
     Their noise grows with the gains; otherwise a smaller map would always fit better.
     """

@@ -338,7 +338,7 @@ def _least_squares(graph: PoseGraph, config: BackendsConfig, why: str) -> Outcom
 
 
 def attempts(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> dict[str, Callable[[], Truncated | None]]:
-    """Name -> function that makes the attempt, for the configured attempts in the order in which they are tried.
+    """Name -> function that makes the attempt, or returns None if it gives up, in the order in which they are tried.
 
     Args:
         graph: the graph.

@@ -33,8 +33,8 @@ def best_start(graph: PoseGraph, given: Array) -> Array:
 def trusted_start(graph: PoseGraph, given: Array, bound: float) -> Array:
     """Initial poses (N, 3) for back-ends that must not trust loops.
 
-    They are the given ones (N, 3), or the chain of the most certain consecutive edges, whichever have the lower chi2 with
-    loops truncated at `bound`. In a map `initial` is odometry alone, and registrations are more accurate.
+    They are the given ones (N, 3), or those composed along the best edges (`extend`), whichever have the lower chi2 with the
+    squared residuals of loops truncated at `bound`. In a map `initial` is odometry alone, and registrations are more accurate.
     """
     chained = extend(graph, graph.initial[:1])
     return min((given, chained), key=lambda poses: truncated_cost(graph, poses, bound))

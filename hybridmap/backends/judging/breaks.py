@@ -33,19 +33,19 @@ LOOSE_M, LOOSE_RAD = 0.5, float(np.deg2rad(10.0))
 
 
 def is_group(graph: PoseGraph, edges: Indices) -> bool:
-    """Whether loops, given by indices (L,), are enough, from enough newer nodes, to be believed together."""
+    """Whether loops, given by indices (L,), are at least `LEAST_LOOPS` from at least `LEAST_NODES` newer nodes."""
     newer = np.maximum(graph.sources[edges], graph.targets[edges])
     return len(edges) >= LEAST_LOOPS and len(np.unique(newer)) >= LEAST_NODES
 
 
 def moves(motion: Array, poses: Array, place: int) -> bool:
-    """Whether a transform (3,) of the map moves a node by more than the noise of a solution."""
+    """Whether a transform (3,) of the map, m and rad, moves the node `place` by more than `SAME_M` or `SAME_DEG`."""
     shift_m, shift_deg = shift(motion, poses, place)
     return shift_m > SAME_M or shift_deg > SAME_DEG
 
 
 def shift(motion: Array, poses: Array, place: int) -> tuple[float, float]:
-    """How far a transform (3,) of the map moves a node: distance, m, and turn, degrees."""
+    """How far a transform (3,) of the map, m and rad, moves the node `place`: distance, m, and turn, degrees, 0 or more."""
     off = between(poses[place], compose(motion, poses[place]))
     return float(np.hypot(off[0], off[1])), float(np.rad2deg(abs(off[2])))
 
@@ -117,7 +117,8 @@ def freed(graph: PoseGraph, poses: Array, solved: Array, place: int, gate: float
         solved: (N, 3) solution of the loosened graph.
         place: the node.
         gate: squared residual beyond which a loop is an outlier, at which its cost is truncated.
-        clear: (E,) edges that may be lost. A loop that is measured by views from both sides of the place fits neither map.
+        clear: (E,) false for loops that are measured by views from both sides of the place. They fit neither map, and do not
+            count if they are lost.
     """
     before, after = squared_norms(graph, poses), squared_norms(graph, solved)
     loops, motion_edges = graph.is_loop, graph.is_motion & ~leads_across(graph, place)
