@@ -112,7 +112,7 @@ def log(pose: ArrayLike) -> Array:
     a = np.where(small, 1.0 - half * half / 3.0, safe / np.tan(safe))
     x = a * p[..., 0] + half * p[..., 1]
     y = -half * p[..., 0] + a * p[..., 1]
-    return np.stack([x, y, yaw], axis=-1)
+    return _stacked(x, y, yaw)
 
 
 def exp(twist: ArrayLike) -> Array:
@@ -125,7 +125,7 @@ def exp(twist: ArrayLike) -> Array:
     b = np.where(small, 0.5 * yaw, (1.0 - np.cos(safe)) / safe)
     x = a * t[..., 0] - b * t[..., 1]
     y = b * t[..., 0] + a * t[..., 1]
-    return np.stack([x, y, wrap_angle(yaw)], axis=-1)
+    return _stacked(x, y, wrap_angle(yaw))
 
 
 def adjoint(pose: ArrayLike) -> Array:

@@ -1,5 +1,6 @@
 """Five places ask whether loops agree through the chain; all of them ask `graph.agreement`."""
 
+from dataclasses import replace
 from itertools import count
 
 import numpy as np
@@ -76,3 +77,10 @@ def test_where_no_ring_closes_no_loops_agree(agree, monkeypatch):
     assert agree()
     monkeypatch.setattr(Ring, "distance", property(lambda ring: np.full(len(ring.error), np.inf)))
     assert not agree()
+
+
+def test_rgbd_support_does_not_search_covariances_where_loops_agree_as_if_the_map_were_exact():
+    support, belief = Support(), replace(BELIEF, covariance_from=lambda node: pytest.fail(f"covariances from node {node}"))
+    for key, node in enumerate(LOOPS[:2]):
+        filed = support.file(MeasuredLoop(edge(node, key), SEEN), belief)
+    assert [proposal.status for proposal in filed] == [Status.ACCEPTED] * 2

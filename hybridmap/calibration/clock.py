@@ -252,10 +252,10 @@ class _Fit:
         design = np.column_stack([turn, way]) / self._sigma[:, None]
         missing = wrap_angle(t.turn_rad - turn) / self._sigma
         fitted: Array = np.zeros(2)
-        kernel = _CAUCHY * self._scale
+        kernel, prior = _CAUCHY * self._scale, np.diag(self._precision) * self._scale**2
         for _ in range(_ITERATIONS):
             weighted = design / (1.0 + ((missing - design @ fitted) / kernel) ** 2)[:, None]
-            normal = weighted.T @ design + np.diag(self._precision) * self._scale**2
+            normal = weighted.T @ design + prior
             fitted = np.asarray(np.linalg.solve(normal, weighted.T @ missing), dtype=np.float64)
         residuals = missing - design @ fitted
         cost = 0.5 * _CAUCHY**2 * np.sum(np.log1p((residuals / kernel) ** 2)) + 0.5 * np.sum(self._precision * fitted**2)

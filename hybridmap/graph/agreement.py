@@ -18,7 +18,8 @@ from hybridmap.geometry import Array, RelativePose, between, compose_relative, i
 
 Indices = NDArray[np.int64]
 Ways = Callable[[Indices, Indices], RelativePose]
-"""Poses of nodes (P,) seen from nodes (P,), by the chain. Not finite where unknown."""
+"""From nodes (P,), or one for all (1,), and nodes (P,) to the poses of the latter seen from the former, by the chain. Not
+finite where unknown."""
 
 
 def chi2_quantile(probability: float) -> float:
@@ -93,7 +94,7 @@ class Ring:
 
 
 def ring(first: Loops, second: Loops, ways: Ways) -> Ring:
-    """Errors of the P rings that pair each of `first` with the same one of `second`.
+    """Errors of the P rings that pair each of `first`, or its only one, with the same one of `second`.
 
     A ring compares two ways: the first loop and the chain between the newer nodes, and the chain between the older nodes
     and the second loop. `ways` gives the chains. The four parts count as independent, although the chains may overlap.
@@ -107,7 +108,7 @@ def ring(first: Loops, second: Loops, ways: Ways) -> Ring:
 
 def agrees(loops: Loops, one: int, others: Indices, ways: Ways, bound: float = BOUND) -> NDArray[np.bool_]:
     """Which (P,) of the loops with indices `others` (P,) agree with the loop of index `one`; see `agreement` for the rest."""
-    return np.asarray(ring(loops[np.full(len(others), one)], loops[others], ways).distance <= bound)
+    return np.asarray(ring(loops[np.array([one])], loops[others], ways).distance <= bound)
 
 
 def agreement(loops: Loops, ways: Ways, bound: float = BOUND, known: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:

@@ -95,7 +95,10 @@ class Chain:
     breaks: Indices
 
     def ways(self, first: Indices, second: Indices) -> RelativePose:
-        """The poses of nodes `second` (P,) in the frames of nodes `first` (P,), with covariances, infinite across a break."""
+        """The poses of nodes `second` (P,) in the frames of nodes `first` (P,), or of one (1,), with covariances.
+
+        The covariances are infinite across a break.
+        """
         back = adjoint(inverse(self.poses[second]))
         sign = np.where(second >= first, 1.0, -1.0)[:, None, None]
         covariance = back @ (sign * (self.covariance[second] - self.covariance[first])) @ back.transpose(0, 2, 1)

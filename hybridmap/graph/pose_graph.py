@@ -15,7 +15,6 @@ from hybridmap.graph.edges import EdgeKind
 _FARTHEST = 1e9  # m and rad: beyond it metres have no millionths left
 _LOOSEST, _TIGHTEST = 1e-9, 1e15  # information of standard deviations of some 30 km and 30 nm: beyond, solvers stand still
 _UPPER, _LOWER = ([0, 0, 1], [1, 2, 2]), ([1, 2, 2], [0, 0, 1])
-_WEAK = 0.5  # squared correlations of an information matrix: with a sum below, its determinant is at least a third
 _CLEAR = 1e-6  # determinant of correlations from which rounding cannot make it positive
 
 
@@ -132,20 +131,19 @@ class PoseGraph:
             self._judge()
 
     def _plainly_sound(self) -> bool:
-        """A quick test for each update: true for valid edges without strong correlations."""
+        """A quick test for each update: true for valid edges, if their information is exactly symmetric."""
         if self.n_nodes == 0 or self.n_edges == 0:
             return False
         flat = self.information.reshape(-1, 9)
         own, upper, lower = flat[:, ::4], flat[:, [1, 2, 5]], flat[:, [3, 6, 7]]
         ends = np.stack([self.sources, self.targets])
-        if not (own.min() >= _LOOSEST and own.max() <= _TIGHTEST and (upper == lower).all()):
+        if not (own.min() >= _LOOSEST and np.abs(flat).max() <= _TIGHTEST and (upper == lower).all()):
             return False
         if not (ends.min() >= 0 and ends.max() < self.n_nodes and (ends[0] != ends[1]).all()):
             return False
-        with np.errstate(over="ignore"):
-            squared = upper**2 / (own[:, [0, 0, 1]] * own[:, [1, 2, 2]])
-        weak = squared.sum(axis=1).max() <= _WEAK
-        return bool(weak and np.abs(self.deltas).max() <= _FARTHEST and np.abs(self.initial).max() <= _FARTHEST)
+        if not (np.abs(self.deltas).max() <= _FARTHEST and np.abs(self.initial).max() <= _FARTHEST):
+            return False
+        return bool(_positive_definite(self.information).all())
 
     def _judge(self) -> None:
         if self.n_nodes == 0:

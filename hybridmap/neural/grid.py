@@ -86,7 +86,7 @@ def combine_bands(cycles: NDArray[np.float64]) -> NDArray[np.float64]:
     Least squares under phi60 = phi0 + phi120: the misfit, wrapped, is shared equally. The result is not wrapped.
     """
     misfit = cycles[:, 1] - cycles[:, 0] - cycles[:, 2]
-    misfit = (misfit - np.round(misfit)) / 3.0
+    misfit = (misfit - np.rint(misfit)) / 3.0
     return cycles[:, ::2] + misfit[:, None]
 
 
@@ -223,8 +223,8 @@ class GridModules:
     def band_phases(self) -> NDArray[np.float64]:
         """Return phi0, phi60, phi120 (M, 3): phases of the activity's modes (1,0), (1,1), (0,1), cycles in [-0.5, 0.5]."""
         modes, k = self.modes.forward(self._stack), self._centre
-        first = modes[[k + 1, k + 1, k], :, [0, 1, 1]].T
-        return np.asarray(-np.angle(first.astype(np.complex128)) / (2.0 * np.pi))
+        first = modes[[k + 1, k + 1, k], :, [0, 1, 1]].T.astype(np.complex128)
+        return np.asarray(-np.arctan2(first.imag, first.real) / (2.0 * np.pi))
 
     def phases(self) -> NDArray[np.float64]:
         """Return the sheets' decoded phases (M, 2), cycles in [0, 1), of the first and the last band."""
@@ -297,11 +297,11 @@ class PhaseDecoder:
 
     def _refine(self, phases: NDArray[np.float64], start_m: Array) -> Decoded:
         """Take whole cycles from a start (2,), solve for the position, and again until the whole cycles stay the same."""
-        wraps = np.round(phases - self._waves @ start_m)
+        wraps = np.rint(phases - self._waves @ start_m)
         for _ in range(4):
             position = self._solve @ (phases - wraps)
             offset = phases - self._waves @ position
-            before, wraps = wraps, np.round(offset)
+            before, wraps = wraps, np.rint(offset)
             if (before == wraps).all():
                 break
         residual = offset - wraps

@@ -37,15 +37,23 @@ class Belief:
     travel_m: Array
     covariance_from: Callable[[int], Array]
 
-    def ways(self, first: Indices, second: Indices) -> RelativePose:
-        """Return the poses of nodes `second` (P,) in the frames of nodes `first` (P,), with covariances (0 for a node itself).
+    def exact_ways(self, first: Indices, second: Indices) -> RelativePose:
+        """Return what `ways` does, as if the map were exact: with covariances of 0."""
+        delta = between(self.poses_map_node[first], self.poses_map_node[second])
+        return RelativePose(delta, np.zeros((len(delta), 3, 3)))
 
-        Costs a shortest-path search of the graph for each distinct node in `first` that is not seen from itself alone.
+    def ways(self, first: Indices, second: Indices) -> RelativePose:
+        """Return the poses of nodes `second` (P,) in the frames of nodes `first` (P,), or of one (1,).
+
+        The covariance of a node seen from itself is 0. Costs a shortest-path search of the graph for each distinct node in
+        `first` that is not seen from itself alone.
         """
-        covariance = np.zeros((len(first), 3, 3))
-        for node in np.unique(first[first != second]).tolist():
-            covariance[first == node] = self.covariance_from(node)[second[first == node]]
-        return RelativePose(between(self.poses_map_node[first], self.poses_map_node[second]), covariance)
+        out = self.exact_ways(first, second)
+        for node in set(first.tolist()):
+            seen = np.flatnonzero((first == node) & (second != node))
+            if len(seen):
+                out.covariance[seen] = self.covariance_from(node)[second[seen]]
+        return out
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,8 +66,7 @@ class Support:
         Returns the edge of the new loop, then those whose status changed.
         """
         near = [h for h in self._beside(new) if h.proposal.status in (Status.PENDING, Status.ACCEPTED)]
-        loops = Loops.measured([(h.source, h.target, h.relative) for h in (new, *near)])
-        agreeing = [near[i] for i in np.flatnonzero(agrees(loops, 0, np.arange(1, len(near) + 1), belief.ways)).tolist()]
+        agreeing = _agreeing(new, near, belief)
         waiting = [h for h in agreeing if h.proposal.status is Status.PENDING]
         asked = checks.of_support(len(agreeing))
         self._of_source[new.source].append(new)
@@ -102,3 +101,16 @@ class Support:
         reach = SUPPORT_NODES
         sources = (source for source in range(new.source - reach, new.source + reach + 1) if source != new.source)
         return [h for source in sources for h in self._of_source.get(source, ()) if abs(h.target - new.target) <= reach]
+
+
+def _agreeing(new: MeasuredLoop, near: list[MeasuredLoop], belief: Belief) -> list[MeasuredLoop]:
+    """Which of the loops `near` agree with a new one.
+
+    The covariance of the map only makes more of them agree. So its search is spared if all do as if the map were exact.
+    """
+    loops = Loops.measured([(h.source, h.target, h.relative) for h in (new, *near)])
+    others = np.arange(1, len(loops.older))
+    agree = agrees(loops, 0, others, belief.exact_ways)
+    if not agree.all():
+        agree[~agree] = agrees(loops, 0, others[~agree], belief.ways)
+    return [h for h, yes in zip(near, agree.tolist(), strict=True) if yes]
