@@ -168,7 +168,9 @@ class GraphSession:
         self._backend = self._fresh()
 
     def fix(self, node: int) -> None:
-        """Hold this node fixed at its latest pose from now on, instead of the one that was fixed before.
+        """Hold this node fixed from now on, instead of the one that was fixed before.
+
+        It stays at its latest pose: that of the last solution, or as given to `add_node`.
 
         Raises:
             BackendError: there is no such node, or it has no pose yet.

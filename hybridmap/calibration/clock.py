@@ -97,7 +97,7 @@ class ClockOffset:
 
     @property
     def left_s(self) -> float:
-        """What of a known offset was not corrected, s; NaN if none is known."""
+        """`offset_s` less `used_s`, s, positive if views are still stamped later; NaN if unknown, rough with `TIME_BASE`."""
         return self.offset_s - self.used_s
 
     def __str__(self) -> str:

@@ -208,7 +208,8 @@ class Problem:
     def evaluate(self, variable: Array) -> tuple[Array, Array]:
         """Displacements (E, 3) of all odometry terms, m and rad, and their derivatives (E, 3, 4) by the calibration.
 
-        Both are kept for the next call with the same calibration `variable` (4,).
+        A displacement is in the frame of its start. Its derivatives are right perturbations, in the frame of its end. Both are
+        kept for the next call with the same calibration `variable` (4,).
         """
         mark = variable.tobytes()
         if self._evaluated is None or self._evaluated[0] != mark:

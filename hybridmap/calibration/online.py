@@ -102,7 +102,12 @@ class SensorClock:
         return self.offset.used_s
 
     def finish(self, experiences: ExperienceMap) -> bool:
-        """Estimate the offset from the whole drive; returns whether all its odometry must be computed again with `used_s`."""
+        """Estimate the offset from the whole drive, at its end.
+
+        Returns:
+            Whether all odometry of the drive must be computed again, by `poses_at`, with the offset that is now in
+            `offset.used_s`; never if the settings give the delay.
+        """
         before, self.offset = self.offset, self._estimated(experiences, wide=True)
         if not self.offset.known and before.known:
             self.offset = before

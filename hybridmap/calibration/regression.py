@@ -102,8 +102,8 @@ def regress(sightings: Sequence[Sighting], leg_m: float | None = None) -> Estima
     count = sum(len(drive.legs) for drive in drives)
     if total < 4.0 * length or count < 8:
         raise EvaluationError(
-            f"calibration: found {total:.1f} m of odometry between known poses, expected at least {4.0 * length:.1f} m; "
-            f"give a longer drive, or a smaller --leg"
+            f"calibration: found {count} pieces of {length:.1f} m in {total:.1f} m of odometry between known poses, "
+            f"expected at least 8 pieces and {4.0 * length:.1f} m; give a longer drive, or a smaller --leg"
         )
     return _solve(drives, length, total)
 

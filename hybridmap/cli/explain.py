@@ -28,16 +28,17 @@ def explain(
         float | None,
         typer.Option(
             metavar="T",
-            help="Explain the decisions at the frame nearest to this time: seconds from the start of the recording, or, from"
-            " 1e6 on, a stamp in seconds. Not with --node.",
+            help="Explain the decisions at the message (odometry, frame or scan) nearest to this time: seconds from the start"
+            " of the recording, or, from 1e6 on, a stamp in seconds. Not with --node.",
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Explain the decisions at a node or a frame: why a node was made or not, and why each loop was closed or not.
+    """Explain the decisions at a node or a time: why a node was made or not, and why each loop was closed or not.
 
-    Give exactly one of --node and --frame. Shows the candidates, each check with its value and limit (m, deg), whether the
-    loop was accepted, and what would have changed that. Reads the session's map file; writes nothing.
+    Give exactly one of --node and --frame. At a time without a node it says why none was made. At a node it shows the
+    candidates, each check with its value and limit (m, deg), whether the loop was accepted, and what would have changed that.
+    Reads the session's map file; writes nothing.
     """
     from hybridmap.evaluate.explain import Explainer
     from hybridmap.metrics import to_json

@@ -135,7 +135,7 @@ class FrameStory:
     """The decisions made at one time of a recording.
 
     Attributes:
-        stamp_ns, time_s: time in the map file nearest to the one asked for: stamp, and seconds since the first stamp.
+        stamp_ns, time_s: stamp of a message (odometry or a view) nearest to the time asked for, and seconds since the first.
         at_node: the last node made until then.
         moved: distance (m) and turn (deg) since that node.
         made: whether a node was made at this time.
@@ -236,10 +236,13 @@ class Explainer:
         )
 
     def frame(self, time_s: float) -> FrameStory:
-        """The decisions at the frame nearest to a time: seconds since the start of the recording, or from 1e6 on a stamp, s.
+        """The decisions at the stamp of a message, of odometry or a view, nearest to a time.
+
+        Args:
+            time_s: seconds since the start of the recording, or from 1e6 on a stamp, s.
 
         Raises:
-            EvaluationError: the time is farther from every frame than the longest gap between frames (at least 1 s).
+            EvaluationError: the time is farther from every stamp than the longest gap between them (at least 1 s).
         """
         track = self._store.track()
         stamps = track.stamps_ns

@@ -145,7 +145,11 @@ def unobserved(experiences: ExperienceMap, poses: Array) -> Unobserved | None:
 
 
 def free_lengths(experiences: ExperienceMap) -> Array:
-    """Path length (N,) to each node from the one before it where odometry alone knows the motion, m; elsewhere 0."""
+    """Path length (N,) to each node from the one before it where odometry alone knows the motion, m; elsewhere 0.
+
+    That is where nothing was registered, or the registration leaves one direction free (see `unobserved`). At a kidnapping
+    the edge that re-attaches the chain counts as the registration, so such a step is seldom 0.
+    """
     free = np.zeros(len(experiences))
     for step in _free_steps(experiences):
         free[step.node] = step.length_m if step.blind or step.direction_rad is not None else 0.0

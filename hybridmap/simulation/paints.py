@@ -69,14 +69,18 @@ def material(draw: Callable[Concatenate[Rng, Shape, float, P], Image]) -> Callab
 
 @material
 def plain(_rng: Rng, shape: Shape, _px_per_m: float, color: Color) -> Image:
-    """`plain(color)` is a paint of a single colour: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`plain(color)` returns a paint that draws a single colour.
+
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
+    """
     return np.full((*shape, 3), color, dtype=np.uint8)
 
 
 @material
 def plaster(rng: Rng, shape: Shape, px_per_m: float, color: Color) -> Image:
-    """`plaster(color)` is a paint of a wall with faint clouds: (h, w, 3) uint8 RGB for `shape` (h, w), texels.
+    """`plaster(color)` returns a paint that draws a wall with faint clouds.
 
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
     It has a mark every two metres on average, and a skirting board if it is higher than 1.5 m.
     """
     tone = 1.0 + 0.012 * smooth_noise(rng, shape, 0.6 * px_per_m) + 0.012 * smooth_noise(rng, shape, 0.03 * px_per_m)
@@ -93,7 +97,10 @@ def plaster(rng: Rng, shape: Shape, px_per_m: float, color: Color) -> Image:
 
 @material
 def carpet(rng: Rng, shape: Shape, px_per_m: float, color: Color) -> Image:
-    """`carpet(color)` is a paint of carpet tiles of half a metre: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`carpet(color)` returns a paint that draws carpet tiles of half a metre.
+
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
+    """
     tile_px = max(2, round(0.5 * px_per_m))
     rows, columns = -(-shape[0] // tile_px), -(-shape[1] // tile_px)
     tones = 1.0 + 0.05 * rng.standard_normal((rows, columns), dtype=np.float32)
@@ -109,8 +116,9 @@ def carpet(rng: Rng, shape: Shape, px_per_m: float, color: Color) -> Image:
 
 @material
 def wood(rng: Rng, shape: Shape, px_per_m: float, color: Color = (150, 108, 70), *, plank_m: float = 0.0) -> Image:
-    """`wood(color)` is a paint of wood: (h, w, 3) uint8 RGB for `shape` (h, w), texels.
+    """`wood(color)` returns a paint that draws wood.
 
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
     Its grain is parallel to the surface's edge `along`; with `plank_m` > 0 it has planks of that width.
     """
     stretched = smooth_noise(rng, (shape[0], max(2, shape[1] // 12)), 0.02 * px_per_m)
@@ -131,7 +139,10 @@ def wood(rng: Rng, shape: Shape, px_per_m: float, color: Color = (150, 108, 70),
 
 @material
 def bricks(rng: Rng, shape: Shape, px_per_m: float) -> Image:
-    """`bricks()` is a paint of a wall of bricks, each of its own tone: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`bricks()` returns a paint that draws a wall of bricks, each of its own tone.
+
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
+    """
     image = np.full((*shape, 3), (178, 170, 160), dtype=np.uint8)
     height, width = max(3, round(0.077 * px_per_m)), max(6, round(0.25 * px_per_m))
     gap = max(1, round(0.012 * px_per_m))
@@ -145,7 +156,10 @@ def bricks(rng: Rng, shape: Shape, px_per_m: float) -> Image:
 
 @material
 def ceiling_tiles(rng: Rng, shape: Shape, px_per_m: float) -> Image:
-    """`ceiling_tiles()` is a paint of ceiling tiles of 60 cm: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`ceiling_tiles()` returns a paint that draws ceiling tiles of 60 cm.
+
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
+    """
     tone = 1.0 - 0.10 * (rng.random(shape, dtype=np.float32) > 0.985)
     tile_px = max(2, round(0.6 * px_per_m))
     tones = 1.0 + 0.012 * rng.standard_normal((-(-shape[0] // tile_px), -(-shape[1] // tile_px)), dtype=np.float32)
@@ -157,15 +171,19 @@ def ceiling_tiles(rng: Rng, shape: Shape, px_per_m: float) -> Image:
 
 @material
 def fabric(rng: Rng, shape: Shape, px_per_m: float, color: Color) -> Image:
-    """`fabric(color)` is a paint of woven, mottled cloth: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`fabric(color)` returns a paint that draws woven, mottled cloth.
+
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
+    """
     tone = 1.0 + 0.05 * rng.standard_normal(shape, dtype=np.float32) + 0.06 * smooth_noise(rng, shape, 0.1 * px_per_m)
     return tint(color, tone)
 
 
 @material
 def metal(rng: Rng, shape: Shape, px_per_m: float, color: Color = (150, 154, 158), *, drawers: int = 0) -> Image:
-    """`metal(color)` is a paint of sheet metal: (h, w, 3) uint8 RGB for `shape` (h, w), texels.
+    """`metal(color)` returns a paint that draws sheet metal.
 
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
     With `drawers` > 0 it has so many of them, with handles and name plates.
     """
     image = tint(color, 1.0 + 0.02 * smooth_noise(rng, shape, 0.2 * px_per_m))

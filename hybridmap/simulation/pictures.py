@@ -46,7 +46,10 @@ def _photo(rng: Rng, shape: Shape) -> Image:
 
 @material
 def poster(rng: Rng, shape: Shape, px_per_m: float) -> Image:
-    """`poster()` is a paint of a poster, title, picture and text: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`poster()` returns a paint that draws a poster, title, picture and text.
+
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
+    """
     height, width = shape
     paper = vary(rng, (235, 230, 215), 20) if rng.random() < 0.6 else any_color(rng, 60, 220)
     image = _blank(shape, paper)
@@ -65,7 +68,10 @@ def poster(rng: Rng, shape: Shape, px_per_m: float) -> Image:
 
 @material
 def painting(rng: Rng, shape: Shape, px_per_m: float) -> Image:
-    """`painting()` is a paint of a framed picture: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`painting()` returns a paint that draws a framed picture.
+
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
+    """
     frame = max(2, round(0.04 * px_per_m))
     image = _blank(shape, any_color(rng, 20, 110))
     image[frame:-frame, frame:-frame] = _photo(rng, (shape[0] - 2 * frame, shape[1] - 2 * frame))
@@ -74,7 +80,10 @@ def painting(rng: Rng, shape: Shape, px_per_m: float) -> Image:
 
 @material
 def door(rng: Rng, shape: Shape, px_per_m: float, color: Color = (142, 104, 72)) -> Image:
-    """`door(color)` is a paint of a closed door with handle and plate: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`door(color)` returns a paint that draws a closed door with handle and plate.
+
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
+    """
     height, width = shape
     turned = wood(vary(rng, color, 14))(rng, (width, height), px_per_m)
     image = np.ascontiguousarray(np.rot90(turned))
@@ -101,7 +110,10 @@ def door(rng: Rng, shape: Shape, px_per_m: float, color: Color = (142, 104, 72))
 
 @material
 def books(rng: Rng, shape: Shape, px_per_m: float, shelves: int = 5) -> Image:
-    """`books(shelves)` is a paint of a book case with so many shelves: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`books(shelves)` returns a paint that draws a book case with so many shelves.
+
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
+    """
     height, width = shape
     image = _blank(shape, (46, 38, 32))
     board = max(2, round(0.025 * px_per_m))
@@ -128,7 +140,10 @@ def books(rng: Rng, shape: Shape, px_per_m: float, shelves: int = 5) -> Image:
 
 @material
 def window(rng: Rng, shape: Shape, px_per_m: float) -> Image:
-    """`window()` is a paint of a window with a view of sky and houses: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`window()` returns a paint that draws a window with a view of sky and houses.
+
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
+    """
     height, width = shape
     fall = np.linspace(1.0, 1.12, height, dtype=np.float32)[:, None] + 0.03 * smooth_noise(rng, shape, 0.4 * px_per_m)
     image = np.ascontiguousarray(tint((178, 202, 226), fall))
@@ -152,7 +167,10 @@ def window(rng: Rng, shape: Shape, px_per_m: float) -> Image:
 
 @material
 def whiteboard(rng: Rng, shape: Shape, px_per_m: float) -> Image:
-    """`whiteboard()` is a paint of a white board with writing and a diagram: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`whiteboard()` returns a paint that draws a white board with writing and a diagram.
+
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
+    """
     height, width = shape
     image = _blank(shape, (238, 240, 240))
     inks: tuple[Color, ...] = ((30, 60, 160), (170, 40, 40), (30, 110, 60), (30, 30, 35))
@@ -172,7 +190,10 @@ def whiteboard(rng: Rng, shape: Shape, px_per_m: float) -> Image:
 
 @material
 def notice_board(rng: Rng, shape: Shape, px_per_m: float) -> Image:
-    """`notice_board()` is a paint of a cork board with pinned papers: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`notice_board()` returns a paint that draws a cork board with pinned papers.
+
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
+    """
     height, width = shape
     image = tint((176, 134, 88), 1.0 + 0.08 * rng.standard_normal(shape, dtype=np.float32))
     image = np.ascontiguousarray(image)
@@ -193,7 +214,10 @@ def notice_board(rng: Rng, shape: Shape, px_per_m: float) -> Image:
 
 @material
 def screen(rng: Rng, shape: Shape, px_per_m: float) -> Image:
-    """`screen()` is a paint of a computer screen: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`screen()` returns a paint that draws a computer screen.
+
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
+    """
     height, width = shape
     image = _blank(shape, any_color(rng, 20, 90))
     for _ in range(3):
@@ -209,7 +233,10 @@ def screen(rng: Rng, shape: Shape, px_per_m: float) -> Image:
 
 @material
 def parcel(rng: Rng, shape: Shape, px_per_m: float) -> Image:
-    """`parcel()` is a paint of the side of a cardboard box: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`parcel()` returns a paint that draws the side of a cardboard box.
+
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
+    """
     height, width = shape
     image = np.ascontiguousarray(tint(vary(rng, (176, 136, 92), 14), 1.0 + 0.04 * smooth_noise(rng, shape, 0.05 * px_per_m)))
     tape = max(2, round(0.05 * px_per_m))
@@ -225,7 +252,10 @@ def parcel(rng: Rng, shape: Shape, px_per_m: float) -> Image:
 
 @material
 def leaves(rng: Rng, shape: Shape, px_per_m: float) -> Image:
-    """`leaves()` is a paint of the foliage of a pot plant: (h, w, 3) uint8 RGB for `shape` (h, w), texels."""
+    """`leaves()` returns a paint that draws the foliage of a pot plant.
+
+    Called with a generator, a shape (h, w) in texels and texels per metre, the paint returns (h, w, 3) uint8 RGB.
+    """
     image = _blank(shape, (28, 52, 26))
     for _ in range(int(260 * shape[0] * shape[1] / px_per_m**2) + 8):
         center = (int(rng.integers(shape[1])), int(rng.integers(shape[0])))

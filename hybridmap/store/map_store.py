@@ -67,7 +67,7 @@ class MapStore:
             folder: the session folder, or the path of the file itself if it ends in `.db`.
             config_yaml: the resolved configuration.
             rig: the sensors of the stream.
-            source: name of what is mapped, for people.
+            source: name of what is mapped (`Stream.name`), for people.
 
         Raises:
             StoreError: a map exists there, or it cannot be written.
@@ -240,7 +240,7 @@ class MapStore:
 
     @property
     def source(self) -> str:
-        """Name of what was mapped."""
+        """Name of the file or folder mapped, without its path, or of the simulated world; not to open it again."""
         return str(self.info("source"))
 
     @property

@@ -229,7 +229,7 @@ class Stream(Protocol):
 
     @property
     def name(self) -> str:
-        """Name of the file or simulated world, for reports."""
+        """Name of the file or folder without its path, or of the simulated world; for reports, not to open it again."""
 
     @property
     def rig(self) -> Rig:

@@ -182,7 +182,10 @@ def _laser_pose(T_base_laser: Array, what: str) -> tuple[Array, bool]:
     up = T_base_laser[2, 2]
     if abs(up) < _MOST_TILT_COS:
         tilt = np.degrees(np.arccos(np.clip(abs(up), 0.0, 1.0)))
-        raise StreamError(f"{what}: the laser leans by {tilt:.0f} deg; expected a level one; check sensors.laser_mounting")
+        raise StreamError(
+            f"{what}: by the recording's transforms the laser leans by {tilt:.0f} deg; expected a level one; "
+            "if they are wrong, give sensors.laser_mounting, which replaces them"
+        )
     return planar(T_base_laser), bool(up < 0)
 
 

@@ -33,11 +33,11 @@ BAR_COLUMNS = (
 
 
 def cells_csv(cells: Sequence[Cell], results: Mapping[str, CellResult], measures: Iterable[str]) -> str:
-    """The text of `cells.csv`: one line per cell, in order; numbers with all digits, empty for a missing figure.
+    """The text of `cells.csv`: a header, then one line per cell, in order; numbers with all digits, empty for a missing figure.
 
     Args:
         cells: the rows.
-        results: `Cell.key` -> result.
+        results: `Cell.key` -> result, for every cell.
         measures: names of the figures that get a column, before the counts of the graph.
     """
     names = tuple(dict.fromkeys((*measures, *_COUNTS)))

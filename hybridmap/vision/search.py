@@ -19,7 +19,8 @@ Bytes = NDArray[np.uint8]
 BLOCK = 4096
 """Rows of a block; a full block is followed by another one, without copies."""
 HALF_RANGE = 4.0
-"""Values beyond +- this are clipped: standard deviations of a z-normalised profile, means of a mean-normalised one."""
+"""Values beyond +- this are clipped in bands of the largest weight, in one of weight w beyond w_max/w times that. The unit is
+the standard deviation of a z-normalised profile, the mean of a mean-normalised one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,9 +116,9 @@ class ProfileIndex:
         return len(self._rows) - 1
 
     def quantised(self, profile: Profile) -> Bytes:
-        """The bytes of a profile (bands, width), column by column: (width * n,) for the n bands of positive weight.
+        """Bytes (width * n,) of a profile (bands, width), column by column, for the n bands of positive weight.
 
-        Values are clipped to +-4.
+        The weight w of a band is in them: 127/4 w/w_max steps a unit about 128, so values are clipped at +-4 w_max/w.
         """
         steps = np.asarray(profile)[self._bands].T * self._steps
         return np.asarray(np.clip(np.rint(steps) + 128.0, 1.0, 255.0).astype(np.uint8).ravel())

@@ -48,7 +48,10 @@ def lone_loops(graph: PoseGraph) -> NDArray[np.int64]:
 
 
 def loops_of(graph: PoseGraph, edges: NDArray[np.int64]) -> Loops:
-    """The edges of a graph with indices `edges` (L,), as loops."""
+    """The edges of a graph with indices `edges` (L,), as loops with covariance, in this order.
+
+    Each is turned to lead from its older to its newer node. Whether they are loops is not checked.
+    """
     covariance: Array = np.asarray(np.linalg.inv(graph.information[edges]))
     return Loops.of(graph.sources[edges], graph.targets[edges], RelativePose(graph.deltas[edges], covariance))
 

@@ -319,14 +319,15 @@ class GlobalLocalisation:
         return [*(replace(b.registration, broken_by=()) for b in breaks), *dismissed]
 
     def probed(self, node: int, hypotheses: Sequence[Hypothesis], belief: Belief) -> None:
-        """Note from a node's loop hypotheses whether it recognised its place; not after a break, nor by an ambiguous fit."""
+        """Note whether a node recognised its place, from its loop hypotheses; after a break nothing is noted.
+
+        Yes if one passed. No if none fits and its scans contradict the map at `belief`. Otherwise nothing is noted.
+        """
         if self._broken_at is not None:
             return
         if any(h.passed for h in hypotheses):
             self._whereabouts.recognised()
-        elif any(h.fits for h in hypotheses):
-            return
-        elif self._continuity.contradicted(node, belief):
+        elif not any(h.fits for h in hypotheses) and self._continuity.contradicted(node, belief):
             if not self._whereabouts.lost:
                 self._lost_m = self._atlas.travel_m[node] - FROM_M
             self._whereabouts.unrecognised()
@@ -366,15 +367,14 @@ class GlobalLocalisation:
 
     def most_similar(self, node: int, anchors: list[int]) -> list[int]:
         """Of the nodes `anchors`, ascending, the 100 with the views most similar to that of `node`, ascending; or all."""
-        most = SUBMAPS
-        if len(anchors) <= most:
+        if len(anchors) <= SUBMAPS:
             return anchors
         for profile in self._profiles[len(self._views.store) :]:
             self._views.add(profile)
         stop = anchors[-1] + 1
         ranked = self._views.best(self._profiles[node], stop, np.arange(stop)).indices
         following = np.searchsorted(np.array(anchors), ranked)
-        most_similar = list(dict.fromkeys(following.tolist()))[:most]
+        most_similar = list(dict.fromkeys(following.tolist()))[:SUBMAPS]
         return [anchors[i] for i in sorted(most_similar)]
 
     def _match(self, h: Hypothesis) -> GlobalMatch:
