@@ -162,7 +162,10 @@ def transform_points(pose_a_b: ArrayLike, points_b: ArrayLike) -> Array:
 
 
 def interpolate(pose_a_i: ArrayLike, pose_a_j: ArrayLike, fraction: ArrayLike) -> Array:
-    """Interpolate along the SE(2) geodesic; `fraction` 0 gives i, 1 gives j; shapes broadcast, `fraction` `(...)`."""
+    """Interpolate between poses (..., 3) along the SE(2) geodesic; `fraction` (...) 0 gives i, 1 gives j; shapes broadcast.
+
+    A fraction below 0 or above 1 extrapolates.
+    """
     step = log(between(pose_a_i, pose_a_j))
     return compose(pose_a_i, exp(np.asarray(fraction, dtype=np.float64)[..., None] * step))
 

@@ -122,7 +122,8 @@ class Held:
 def held(folder: Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Held]:
     """Context in which a folder for an output of this kind is made if needed, and locked against other runs.
 
-    If the folder was made, and is empty at the end, it is removed with the parents made for it.
+    It gives the folder as `Held`; what a killed run left in it is repaired first. If the folder was made, and is empty at the
+    end, it is removed with the parents made for it.
 
     Args:
         folder: the folder.

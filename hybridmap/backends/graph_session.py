@@ -216,7 +216,7 @@ class GraphSession:
         return _graph(self._state).initial.copy()
 
     def edge_weights(self) -> dict[int, float]:
-        """Loop edge id -> its final weight in the latest solution; empty if the back-end has no robust kernel."""
+        """Loop edge id -> its final weight in the latest solution; empty without one or without a robust kernel."""
         solution = self._state.solution
         return {} if solution is None else dict(solution.report.weights)
 

@@ -83,7 +83,9 @@ class Estimate:
 
 
 def metrics_of(estimate: Estimate, in_use: Gains, delay_s: float = 0.0) -> list[Metric]:
-    """Each gain with its standard deviation and distance from the value in use (NaN if unobservable), and the data used.
+    """Each gain with its standard deviation, its distance from the value in use in these, the delay, and the data used.
+
+    Values that are unobservable are NaN.
 
     Args:
         estimate: what was estimated.

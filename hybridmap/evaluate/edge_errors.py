@@ -168,6 +168,8 @@ def edge_errors(
 ) -> dict[EdgeKind, EdgeErrors]:
     """Evaluate the accepted edges of a map: kind of edge -> errors; a kind without an edge that can be evaluated is left out.
 
+    The edge that leads across a kidnapping is a registration, and counts as one.
+
     Args:
         experiences: the map.
         truth: true poses of `base_link`, in any frame.
@@ -180,7 +182,10 @@ def edge_errors(
 def edge_errors_on(
     experiences: ExperienceMap, poses: Array, known: NDArray[np.bool_] | None = None, weights: Mapping[int, float] | None = None
 ) -> dict[EdgeKind, EdgeErrors]:
-    """Evaluate the accepted edges of a map, given the true poses of its nodes: kind of edge -> errors, as `edge_errors`.
+    """Evaluate the accepted edges of a map, given the true poses of its nodes: kind of edge -> errors.
+
+    As with `edge_errors`, a kind without an edge that can be evaluated is left out, and the edge that leads across a kidnapping
+    counts as a registration.
 
     Args:
         experiences: the map.

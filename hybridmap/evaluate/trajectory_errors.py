@@ -93,8 +93,9 @@ def relative_error(estimate: Trajectory, reference: Trajectory, delta: float, un
 def relative_error_of(pairs: PosePairs, delta: float, unit: Literal["m", "s"]) -> RelativeError:
     """RPE of an estimate and a reference at common stamps, over pieces of `delta` metres of the reference's path, or seconds.
 
-    A piece begins at every pose at which the reference moved on, so pieces overlap; those more than half too long are left out.
-    The errors are NaN if there is no piece.
+    A piece begins at every pose at which the reference moved on (of seconds: at every pose), so pieces overlap. It ends at the
+    first pose at least `delta` further; those more than half too long, as over a gap, are left out. The errors are NaN if there
+    is no piece.
     """
     along = travel(pairs.reference) if unit == "m" else (pairs.stamps_ns - pairs.stamps_ns[0]) / NS_PER_S
     first, last = _pieces(along, delta)

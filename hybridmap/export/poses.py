@@ -63,7 +63,8 @@ def write_lineset(view: SessionView, path: Path) -> list[Metric]:
 def write_posegraph(view: SessionView, path: Path) -> list[Metric]:
     """Write an Open3D PoseGraph: nodes hold `T_map_node`, edges the source's pose seen from the target; loops are `uncertain`.
 
-    The information out of the plane equals the largest one within it, so that Open3D's optimiser stays planar.
+    All accepted edges are written, those that the back-end rejected too. The information out of the plane equals the largest
+    one within it, so that Open3D's optimiser stays planar.
 
     Raises:
         ExportError: the graph has no edge; Open3D cannot read such a file.

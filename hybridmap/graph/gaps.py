@@ -49,7 +49,11 @@ def kidnappings(experiences: ExperienceMap) -> tuple[Kidnapping, ...]:
 
 
 def pieces(trajectory: Trajectory, experiences: ExperienceMap) -> list[Trajectory]:
-    """Split a trajectory at the kidnappings, in order of time; poses during a kidnapping and empty pieces are left out."""
+    """Split a trajectory at the kidnappings, in order of time; poses during a kidnapping and empty pieces are left out.
+
+    A kidnapping lasts from the stamp of the last node before it, whose pose is kept, to that of the first node after it, whose
+    pose is left out too.
+    """
     number, aloft = np.zeros(len(trajectory), dtype=np.int64), np.zeros(len(trajectory), dtype=bool)
     for one in kidnappings(experiences):
         down = trajectory.stamps_ns > experiences.node(one.after).stamp_ns
@@ -72,7 +76,7 @@ def kidnapping_edges(graph: PoseGraph, kidnapped: Sequence[Kidnapping]) -> NDArr
 
 
 def grounded(trajectory: Trajectory, experiences: ExperienceMap) -> Trajectory:
-    """A trajectory without the poses during kidnappings, which no sensor measures."""
+    """A trajectory without the poses during kidnappings (see `pieces`), which no sensor measures."""
     parts = pieces(trajectory, experiences)
     if len(parts) < 2:
         return trajectory

@@ -164,11 +164,11 @@ def held(graph: PoseGraph, poses: Array) -> Array:
 
 
 def write_g2o(path: Path, graph: PoseGraph, poses: Array) -> None:
-    """Write the nodes at `poses` (N, 3), m and rad, the fixed node and all edges as a g2o file; one that exists is replaced.
+    """Write the nodes at `poses` (N, 3), m and rad, and all edges as a g2o file; one that exists is replaced.
 
     Numbers have 17 significant digits; the file appears at once when it is complete. A graph that was read from a file keeps
-    the numbers of its vertices. The format has no kinds of edges: read back, every edge between non-consecutive nodes is a
-    loop.
+    the numbers of its vertices, and the line `FIX` if the file has one; else none is written. The format has no kinds of
+    edges: read back, every edge between non-consecutive nodes is a loop.
 
     Raises:
         OutputError: the file cannot be written.

@@ -226,7 +226,11 @@ def error_figure(scene: SessionScene) -> str | None:
 
 
 def draw_errors(axes: Any, scene: SessionScene, *, heading: bool) -> None:
-    """Draw the error of every trajectory over time: the heading error, deg, if `heading`, else the position error, m."""
+    """Draw the errors of `error_series` over time: the heading error, deg, if `heading`, else the position error, m.
+
+    Long series are drawn as root mean squares of intervals, on a logarithmic axis that begins at 1 mm or 0.01 deg. No line is
+    drawn across gaps.
+    """
     styles = style.line_styles(scene.backends)
     for name, errors in error_series(scene).items():
         looks = dict(styles[name.removesuffix(ONLINE)])

@@ -264,10 +264,10 @@ class TopicChooser:
         return [topic for topic in self._topics if topic.msgtype in types]
 
     def named(self, setting: str, types: tuple[str, ...]) -> str | None:
-        """The topic that a setting of the section `sensors` names; None if the user left it out.
+        """The topic that a setting of the section `sensors` names, with or without its first `/`; None if it is not set.
 
         Raises:
-            StreamError: there is no such topic of these types.
+            StreamError: there is no such topic of these types with messages.
         """
         wanted = getattr(self._config, setting)
         if wanted is None:

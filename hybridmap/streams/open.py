@@ -36,7 +36,8 @@ _SIGNS_OF_TUM = ("rgb.txt", "depth.txt", "associations.txt", "rgb", "depth")
 def world_of(source: str | Path) -> str | None:
     """Name of the simulated world that a source names (`office` or `sim:office`); None if it names none.
 
-    The name of a world takes precedence over a file of that name; write `./office` for the file.
+    In a string the name of a world takes precedence over a file of that name; write `./office` for the file. A `Path` is a
+    file, unless it begins with `sim:`.
 
     Raises:
         StreamError: `sim:` with an unknown world.

@@ -39,13 +39,16 @@ def digest(tree: Mapping[str, Any]) -> str:
 
 @cache
 def solving() -> str:
-    """Digest of everything that determines the figures of a graph: our code, versions of libraries, the kind of machine."""
+    """Digest of what determines the figures of a given graph: our code of solving, libraries, plugins, the kind of machine.
+
+    Of libraries and plugins the versions count. Changed code of mapping changes `mapping` only.
+    """
     return digest({"code": digest_of_code(solving_only=True), **_surroundings()})
 
 
 @cache
 def mapping() -> str:
-    """Hash of our code, the versions of libraries and the kind of machine; a stored drive is reused only if it is the same."""
+    """Digest as `solving`, of mapping and solving; a stored drive is reused only if it is the same."""
     return digest({"code": digest_of_code(solving_only=False), **_surroundings()})
 
 
@@ -67,7 +70,7 @@ def _version(library: str) -> str:
 
 
 def digest_of_code(*, solving_only: bool) -> str:
-    """SHA-256 of hybridmap's source text.
+    """SHA-256 of hybridmap's source text, without the modules that only show results (commands, pages, exports).
 
     Args:
         solving_only: leave out the modules that only mapping a drive uses, and not solving a graph.

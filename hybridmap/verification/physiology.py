@@ -60,7 +60,7 @@ def gridness(rates: Array) -> float:
     it falls to half) to the mean distance of the six peaks plus that radius.
 
     Returns:
-        The score, at most 2; NaN where there are no six peaks.
+        The score, at most 2; NaN where there are no six peaks, or the annulus does not fit into the autocorrelogram.
     """
     from scipy import ndimage
 

@@ -214,12 +214,12 @@ def noise_rows(result: CellVerification) -> list[Metric]:
 
 @dataclass(frozen=True, slots=True)
 class NoiseCurve:
-    """Errors of several drives over distance.
+    """Errors of several drives over distance: of position, m, or of heading, rad, as asked for (`noise_curve`).
 
     Attributes:
         distance_m: (S,) distances that all drives reach.
-        rms: (S,) root mean square over the drives.
-        quartiles: (2, S) lower and upper quartile over the drives.
+        rms: (S,) root mean square of the error over the drives.
+        quartiles: (2, S) lower and upper quartile of the error over the drives.
     """
 
     distance_m: Array

@@ -51,7 +51,7 @@ class Whereabouts:
 
     A robot is lost from each of these events on until the next loop closure: the view of a node fits none before it (the motion
     is broken); the view fits, but the motion is uncertain along a wall; or the robot fails to recognise known places several
-    times. Uncertain motion is forgotten after some nodes.
+    times. Uncertain motion is forgotten after some nodes, a break when `mended` is called.
 
     Args:
         unrecognised: failures in a row to recognise a known place after which the robot is lost; 0: they do not count.

@@ -95,8 +95,8 @@ class Freed:
 
     Attributes:
         loops: (F,) edge ids of the loops that were rejected and now fit.
-        lost: number of loops that fitted and are now rejected.
-        gain: fall of the truncated cost.
+        lost: number of loops that fitted and are now rejected, without those that are not `clear` (see `freed`).
+        gain: fall of the cost: truncated for loops, whole for edges of motion.
         motion: (3,) how the node has moved on the map against the one before it, as a transform of the map, m and rad.
         pays: whether so many loops are freed at so little cost that the chain was wrong.
     """

@@ -30,7 +30,7 @@ _POSE_HEADER = "# timestamp tx ty tz qx qy qz qw\n"
 
 
 def write_tum(stream: Stream, folder: Path, *, overwrite: bool = False, progress: Progress = silent) -> dict[str, int]:
-    """Write `rgb/`, `depth/`, their lists, `odometry.txt`, `groundtruth_base.txt` and `camera.yaml`.
+    """Write `rgb/`, `depth/`, their lists, `odometry.txt`, `camera.yaml`, and `groundtruth_base.txt` if the truth is known.
 
     Args:
         stream: with poses as self-motion and a camera.

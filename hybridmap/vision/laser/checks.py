@@ -71,7 +71,7 @@ def of_resumption(inliers: float, inliers_min: float, loosest_m: float, violatio
     Args:
         inliers: measured share of their points that fit the submap before the break, 0..1.
         inliers_min: least share that passes.
-        loosest_m: largest standard deviation of the position in any direction, m.
+        loosest_m: largest standard deviation of the position in any direction, m; the limit is `LOOSEST_MAX_M`.
         violation: measured share of the walls of both in each other's free space, 0..1; the limit is `RESUMED_VIOLATION`.
     """
     return (

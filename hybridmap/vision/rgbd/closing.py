@@ -140,7 +140,7 @@ class LoopCloser:
         return self._relocaliser.whereabouts.lost_since
 
     def note(self, node: int) -> dict[str, Array]:
-        """What the map file keeps of the search for loops of the node closed last; empty for other nodes.
+        """What the map file keeps of the search for loops of a node: the last one that was searched for; else empty.
 
         Keys: `gate` (5,), see `Gate.to_array`; `ranked` (n, 3), the candidates by profile, the best first: node, score G
         (eq. 13), shift in columns.

@@ -80,7 +80,7 @@ class Support:
         return [h.proposal for h in changed]
 
     def replace(self, proposal: Edge) -> None:
-        """Replace the edge of a loop that was measured again (found by its key); one without a pose is dropped."""
+        """Replace the edge with the key of this one, measured again; one without a pose is dropped, a new one ignored."""
         of_source = self._of_source[proposal.source]
         kept = [h for h in of_source if h.proposal.key != proposal.key]
         if proposal.relative is not None and len(kept) < len(of_source):

@@ -71,8 +71,9 @@ class Tracker:
     def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
         """Register a new node to the two before it; returns edges from these to the new node, rejected ones too.
 
-        `odometry` is the pose of the new node in the frame of node - 1 (None for the first node). The new keyframe may get a
-        stance (tilt and height of its camera) that is propagated from the one before.
+        There are none for the first node, and with `vision.tracking.enabled` off. `odometry` is the pose of the new node in the
+        frame of node - 1 (None for the first node). The new keyframe may get a stance (tilt and height of its camera) that is
+        propagated from the one before.
         """
         if odometry is None or node == 0:
             return []
