@@ -131,7 +131,7 @@ class Legs:
 def corrected(graph: PoseGraph, motion: Motion, stamps_ns: NDArray[np.int64], gains: Gains, delay_s: float = 0.0) -> PoseGraph:
     """Copy of the graph with the odometry edges from a node to the next recomputed from calibrated odometry.
 
-    Their information and all other edges are unchanged.
+    Their information, all other edges and the initial poses are unchanged.
 
     Args:
         graph: nodes and accepted edges.

@@ -62,7 +62,7 @@ class PoseGraph:
 
     @property
     def entry_nodes(self) -> NDArray[np.int64]:
-        """(E,) the newest node at the time when each edge entered the graph."""
+        """(E,) the newest node at the time when each edge entered the graph; if unknown (a file), the edge's newer node."""
         return np.maximum(self.sources, self.targets) if self.entered is None else self.entered
 
     @property

@@ -142,7 +142,8 @@ def _at_odds(facts: Facts, graph: PoseGraph) -> Iterator[Reason]:
 def alone(facts: Facts) -> Iterable[Reason]:
     """A reason if loops of a file that no other loop confirms move the map to where nothing else has it.
 
-    There is none for a drive, whose loops were verified by views.
+    There is none for a drive, whose loops were verified by views, nor if the solution gives odometry or registrations little
+    weight (`weak_edges`).
     """
     if facts.solution is None or facts.poses is None or facts.driven or facts.solution.report.weak_edges:
         return []

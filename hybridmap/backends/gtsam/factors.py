@@ -94,7 +94,7 @@ def anchor(initial: Array) -> Any:
 
 
 def factor_graph(graph: PoseGraph, models: NoiseModels) -> Any:
-    """All edges and the anchor as a `NonlinearFactorGraph`."""
+    """All edges, and the prior that holds node 0 at its initial pose, as a `NonlinearFactorGraph`."""
     return collected([*factors(graph, models), anchor(graph.initial[0])])
 
 

@@ -118,7 +118,8 @@ class LaserFrontEnd:
     def close(self, node: int, belief: Belief) -> list[Edge]:
         """Look for loops of the new node, and decide pending ones; see `FrontEnd.close`.
 
-        A lost robot is compared with the whole map; else the last metres are compared with older submaps every few metres.
+        A lost robot is compared with the whole map. Unless that localises it at this node, the last metres are compared with
+        older submaps, every few metres.
         """
         sought = self.localisation.search(node, belief)
         travel_m = self.atlas.travel_m[node]

@@ -70,7 +70,7 @@ class Hypothesis:
         quality: share of the points that have a partner, times the share of inliers among those.
         sigma_m: standard deviation of the expected position before the registration, m; 1e8 on the whole map.
         search: why the two submaps were compared.
-        checks: checks of the registration, in their order; the loop is rejected if one failed.
+        checks: checks of the registration, in their order; the loop is rejected if one failed, unless only `by_a_hair`.
         figures: further measured values of the registration, by name.
         fits: whether enough points of the scans fit, whatever the other checks say.
         misfit: share of points that do not fit, plus share of walls in the other's free space.

@@ -67,6 +67,8 @@ class Posture:
     def stance(self, grid: DepthGrid, features: Features, last: Keyframe | None) -> Stance:
         """Estimate the camera's stance at a new keyframe. Call it once for each, in order: floors seen before count.
 
+        In the mode `level` the stance is as mounted; in `auto` too, until a floor contradicts the mounting.
+
         Args:
             grid: depth of the new keyframe.
             features: its keypoints.
