@@ -87,7 +87,8 @@ class Chain:
         poses: (N, 3) m and rad.
         covariance: (N, 3, 3) of each pose relative to node 0, in the common frame of the poses; the difference of two entries
             is the covariance of the motion between the two nodes.
-        breaks: (B,) nodes without an edge of motion from the node before; across them the covariance is unknown.
+        breaks: (B,) nodes without an edge of motion from the node before; across them the covariance is unknown. A kidnapping
+            that was found is no break: the edge that leads over it counts as one of motion.
     """
 
     poses: Array

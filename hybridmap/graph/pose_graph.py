@@ -82,7 +82,7 @@ class PoseGraph:
 
     @property
     def is_motion(self) -> NDArray[np.bool_]:
-        """(E,) which edges measure motion: odometry, and registrations to the nodes just before."""
+        """(E,) which edges measure motion: odometry and registrations to the nodes just before; also over a kidnapping."""
         return np.asarray(self.kinds < EdgeKind.LOOP)
 
     def only(self, *kinds: EdgeKind) -> PoseGraph:

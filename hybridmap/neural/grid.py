@@ -355,7 +355,7 @@ class LowModes:
         return self._modes
 
     def inverse(self, modes: NDArray[np.complexfloating]) -> NDArray[np.floating]:
-        """Return the stack of sheets (N, M, N) that have these modes and no others: a new array."""
+        """Return the stack of sheets (N, M, N) that have these modes (2K+1, M, K+1) and no others: a new array."""
         self._right.dot(modes.reshape(self._modes_flat.shape), out=self._back)
         return np.asarray(self._back_real.dot(self._rows)).reshape(self.side, -1, self.side)
 

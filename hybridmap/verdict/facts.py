@@ -37,7 +37,7 @@ class Facts:
         stamps_ns: (N,) stamps of the nodes; None if unknown.
         wheels: all odometry edges but those across a kidnapping, also the contradicted ones; None if unknown.
         free_m: (N,) way to each node from the one before it on which odometry alone knows the motion, in one direction or in
-            all, m; elsewhere 0. None if unknown.
+            all, m; elsewhere 0 (see `graph.gaps.free_lengths`). None if unknown.
         breaks: nodes to which the robot seems not to have driven, without a kidnapping that was found there.
         lost_since: the first node since which the robot is lost; None if it is not.
         clock: the offset between the clocks of views and odometry; None if it was not looked for.

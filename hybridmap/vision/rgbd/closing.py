@@ -131,7 +131,10 @@ class LoopCloser:
         return out
 
     def tracked(self, node: int, steps: list[Edge]) -> None:
-        """Note the registrations (`steps`) of a new node to the ones before it: they tell whether its motion is certain."""
+        """Note the registrations (`steps`) of a new node to the ones before it: they tell whether its motion is certain.
+
+        Without `vision.relocalising.enabled` it counts as certain.
+        """
         self._relocaliser.tracked(node, chain_state(steps) if self._may_be_lost else ChainState.HOLDS, steps)
 
     @property

@@ -63,6 +63,7 @@ def working_image(frame: RgbdFrame, factor: int) -> WorkingImage:
     """Reduce a frame by a whole factor; columns and rows that are left over are cut off.
 
     Grey is averaged over areas. Depth is taken from the pixel in the middle: averaging would invent surfaces at edges.
+    Negative depth, NaN and Inf become 0 (none).
     """
     import cv2
 
