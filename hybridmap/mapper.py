@@ -135,7 +135,7 @@ class Mapper:
     def finish(self) -> list[Update]:
         """End of the drive: find more loops, solve, measure outlier loops again, and register the frames between nodes.
 
-        Call it once, after the last sample. The last of the returned updates says `end of the drive`.
+        Call it once, after the last sample. The last of the returned updates says `end of the drive`, unless no node was made.
         """
         updates = [self.step(ready) for ready in self._synchroniser.flush()]
         self._position.pose_odom = self.cells.pose_odom_robot

@@ -57,7 +57,8 @@ def run(stream: Stream, config: Config, out: Path, *, overwrite: bool = False, p
     """Map a stream into a session folder.
 
     The map file is written as the run proceeds: a run that is killed leaves a readable map up to its last node. On any
-    error what this run wrote is removed, and an overwritten session is restored.
+    error what this run wrote is removed, and an overwritten session is restored. Ctrl-C keeps what was written, unless it
+    overwrites a session.
 
     Args:
         stream: the samples.
@@ -86,7 +87,7 @@ def run(stream: Stream, config: Config, out: Path, *, overwrite: bool = False, p
 def first_look(stream: Stream, config: Config) -> ClockOffset:
     """Estimate how late the views of a stream are stamped, from its first `LOOK_M` metres at most, without writing a map.
 
-    The offset may stay unknown: see `ClockOffset.state`.
+    The offset may stay unknown: see `ClockOffset.state`. It comes on top of `sensors.odometry_delay_s`, if that is set.
 
     Raises:
         StreamError: the stream is damaged or unordered.

@@ -71,8 +71,8 @@ class GraphSession:
 
         Args:
             node: its number.
-            pose: (3,) m and rad. The first node stays there (None: at the origin). Of a later one it is only a start for
-                `solve`; None: its edges place it.
+            pose: (3,) m and rad. The first node stays there (None: at the origin) until `fix` is called. Of a later one it is
+                only a start for `solve`; None: its edges place it.
 
         Raises:
             BackendError: the node exists already.
