@@ -79,8 +79,28 @@ def test_where_no_ring_closes_no_loops_agree(agree, monkeypatch):
     assert not agree()
 
 
-def test_rgbd_support_does_not_search_covariances_where_loops_agree_as_if_the_map_were_exact():
-    support, belief = Support(), replace(BELIEF, covariance_from=lambda node: pytest.fail(f"covariances from node {node}"))
+def asked_of(broken_at=NODES):
+    """A belief whose chain has a gap before a node, and the list of nodes whose covariances were asked for."""
+    asked = []
+
+    def covariance_from(node):
+        asked.append(node)
+        unreached = (np.arange(NODES) < broken_at) != (node < broken_at)
+        return np.where(unreached[:, None, None], np.diag([np.inf] * 3), BELIEF.covariance_from(node))
+
+    return replace(BELIEF, covariance_from=covariance_from), asked
+
+
+def test_rgbd_support_asks_for_the_covariances_from_the_new_node_alone_where_loops_agree_as_if_the_map_were_exact():
+    support, (belief, asked) = Support(), asked_of()
     for key, node in enumerate(LOOPS[:2]):
         filed = support.file(MeasuredLoop(edge(node, key), SEEN), belief)
     assert [proposal.status for proposal in filed] == [Status.ACCEPTED] * 2
+    assert set(asked) == {AGAIN, AGAIN + LOOPS[1]}
+
+
+def test_rgbd_loops_on_either_side_of_a_gap_in_the_chain_do_not_support_each_other():
+    support, (belief, _) = Support(), asked_of(broken_at=AGAIN + 3)
+    for key, node in enumerate(LOOPS[:2]):
+        filed = support.file(MeasuredLoop(edge(node, key), SEEN), belief)
+    assert [proposal.status for proposal in filed] == [Status.PENDING]

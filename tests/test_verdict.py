@@ -9,6 +9,7 @@ import pytest
 
 from hybridmap import backends
 from hybridmap.backends.base import Solution, SolveStatus
+from hybridmap.backends.judging import strain
 from hybridmap.calibration.clock import ClockOffset, ClockState
 from hybridmap.geometry import RelativePose, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status, at_least
@@ -143,6 +144,11 @@ def test_odometry_that_pulls_is_a_reason_where_one_place_alone_says_so(clean):
     graph = with_drift(clean, PULLED, 0)
     few = np.flatnonzero(graph.is_loop)[-8:]
     assert "bent" in kinds_of(graph.with_edges(np.union1d(np.flatnonzero(graph.is_motion), few)))
+
+
+def test_odometry_that_pulls_is_a_reason_where_a_half_of_the_loops_finds_numbers_that_no_robot_has(clean, monkeypatch):
+    monkeypatch.setattr(strain, "calibrate", lambda *_: (np.array([1.0, 1.0, 5.0]), None))
+    assert "bent" in kinds_of(with_drift(clean, PULLED, 0))
 
 
 def test_odometry_that_errs_by_chance_is_a_reason(clean):

@@ -12,7 +12,7 @@ from hybridmap.backends.base import ODOMETRY, SolveStatus
 from hybridmap.backends.judging.breaks import SAME_DEG, SAME_M
 from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.judging.rivals import Rival, rivals, spans
-from hybridmap.backends.judging.strain import bend_of, largest_bend, lone_pull, optimum, straightened
+from hybridmap.backends.judging.strain import bend_of, largest_bend, lone_pull, optimum, recalibrated
 from hybridmap.backends.objective import SLACK, squared_norms, unit_variance
 from hybridmap.calibration.clock import MATTERS_S, TRANSPORT_S, ClockState
 from hybridmap.errors import BackendError
@@ -104,11 +104,19 @@ def strained(facts: Facts) -> Iterable[Reason]:
     if facts.solution is None or facts.poses is None:
         return []
     graph = facts.graph.with_edges(facts.in_map)
-    straight, bends = graph, _bent(facts, graph)
-    for straight in straightened(graph, facts.poses, TOGETHER) if bends else ():
-        if _bent(facts, straight):
-            return [*bends, *_at_odds(facts, graph)]
-    return [*(bends if straight is graph else ()), *_at_odds(facts, straight)]
+    bends = _bent(facts, graph)
+    straight = _straightened(facts, graph) if bends else None
+    return [*bends, *_at_odds(facts, graph)] if straight is None else list(_at_odds(facts, straight))
+
+
+def _straightened(facts: Facts, graph: PoseGraph) -> PoseGraph | None:
+    """The graph with the odometry calibrated by all loops; None if a calibration leaves the chain bent, or there is none."""
+    assert facts.poses is not None
+    straight = None
+    for straight in recalibrated(graph, facts.poses, TOGETHER):
+        if straight is None or _bent(facts, straight):
+            return None
+    return straight
 
 
 def _bent(facts: Facts, graph: PoseGraph) -> list[Reason]:

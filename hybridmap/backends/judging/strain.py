@@ -1,14 +1,13 @@
 """How far a map is from what its own edges say: where it bends the chain of motion, and how far it is from their optimum.
 
 A bent chain means wrong loops or wrong motion. One kind of wrong motion does no harm where loops hold the map: wheels that
-err alike on every metre. `straightened` tells it from the others.
+err alike on every metre. `recalibrated` tells it from the others.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +20,7 @@ from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph
 from hybridmap.backends.judging.clusters import lone_loops
 from hybridmap.backends.objective import residuals, squared_norms, unit_variance
 from hybridmap.config.backends import BackendsConfig
-from hybridmap.errors import EvaluationError
+from hybridmap.errors import BackendError, EvaluationError
 from hybridmap.geometry import Array, between, log
 from hybridmap.graph.agreement import BOUND
 from hybridmap.graph.paths import Chain, chain_of, own_odometry
@@ -97,7 +96,7 @@ def optimum(graph: PoseGraph, poses: Array) -> Array:
     return run("lm", factor_graph(graph, NoiseModels()), poses, _ITERATIONS, tolerance=_TOLERANCE).poses
 
 
-def straightened(graph: PoseGraph, poses: Array, least: int) -> Iterator[PoseGraph]:
+def recalibrated(graph: PoseGraph, poses: Array, least: int) -> Iterator[PoseGraph | None]:
     """The graph with its odometry calibrated to a map, in several ways that must all straighten its chain.
 
     Gain, turn gain and heading bias are three numbers for the whole drive. If loops of one half of the drive find numbers
@@ -111,7 +110,7 @@ def straightened(graph: PoseGraph, poses: Array, least: int) -> Iterator[PoseGra
 
     Yields:
         The graph calibrated by the steps of the map, which is quick, by the loops of the earlier half, by those of the later
-        half, and by all. Nothing if the loops cannot be halved; no more from numbers on that no robot has.
+        half, and by all. Nothing if the loops cannot be halved; None, and no more, once a way gives numbers that no robot has.
     """
     loops, travel = np.flatnonzero(graph.is_loop), _travel(chain_of(graph))
     newer = np.maximum(graph.sources, graph.targets)[loops]
@@ -119,12 +118,14 @@ def straightened(graph: PoseGraph, poses: Array, least: int) -> Iterator[PoseGra
     earlier, later = order[: len(order) // 2], order[len(order) // 2 :]
     if len(earlier) < least or travel[int(np.median(newer[later]))] - travel[int(np.median(newer[earlier]))] < APART_M:
         return
-    with suppress(EvaluationError):
+    try:
         yield with_calibrated_odometry(graph, _gains_of(graph, poses))
         for left_out in (later, earlier, order[:0]):
             kept = graph.with_edges(np.setdiff1d(np.arange(graph.n_edges), loops[left_out]))
             gains, _ = calibrate(kept, NEUTRAL.to_array(), poses, BackendsConfig())
             yield with_calibrated_odometry(graph, Gains.from_array(gains).checked("odometry"))
+    except (BackendError, EvaluationError):
+        yield None
 
 
 def _gains_of(graph: PoseGraph, poses: Array) -> Gains:

@@ -32,6 +32,8 @@ VIOLATION_MAX = 0.15
 """Largest share of points of one submap in the free space of the other, either way: people and doors give a few per cent."""
 HAIR_SIGMAS = 1.0
 """A share misses its limit by a hair if it is so near, in standard errors of the share: it may as well have kept it."""
+PIECES_MIN = 10
+"""Fewest things in sight of which a share has a standard error worth the name: two or three trees tell nothing."""
 RIVAL = 0.75
 """The best rival cluster must score less than this share of the cluster."""
 OFF_MAX_M, OFF_MAX_DEG = 1.0, 10.0
@@ -134,13 +136,13 @@ def loosened(checks: Sequence[Check], pieces: int) -> tuple[Check, ...]:
 
     Args:
         checks: of a registration of two submaps; only the limits of `near`, `fit` and `violation` move.
-        pieces: n, the number of separate things that were seen; with 0 no limit moves.
+        pieces: n, the number of separate things that were seen; with fewer than `PIECES_MIN` no limit moves.
     """
     return tuple(_by_a_hair(check, pieces) if check.figure in ("near", "fit", "violation") else check for check in checks)
 
 
 def _by_a_hair(check: Check, pieces: int) -> Check:
-    hair = HAIR_SIGMAS * math.sqrt(check.limit * (1.0 - check.limit) / pieces) if pieces else 0.0
+    hair = HAIR_SIGMAS * math.sqrt(check.limit * (1.0 - check.limit) / pieces) if pieces >= PIECES_MIN else 0.0
     return replace(check, limit=check.limit - hair if check.needs is Need.AT_LEAST else check.limit + hair)
 
 

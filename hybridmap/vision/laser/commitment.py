@@ -28,7 +28,7 @@ PROBES, SPAN_M = 3, 3.0
 GROUP_M = 16.0
 """Travel for which a hypothesis that missed a limit by a hair waits for others that kept it, m; then the group is judged."""
 HAIR_WEIGHT, HAIRS = 0.5, 2
-"""What such a hypothesis counts, and how many of them a probe may have, the best first: they bound the cost of a group."""
+"""What such a hypothesis counts, and how many of them a probe may have, the best starts first: they bound a group's cost."""
 SPAN_PER_EFOLD_M = 1.0
 """Additional travel for each factor e by which the gate is wider, m: more places then look alike."""
 
@@ -213,7 +213,7 @@ class Commitment:
         """
         out = [Settled(w.key, w.hypothesis, lack=Lack.UNSUPPORTED) for w in self._expire(travel_m)]
         out += self._queue.commit(belief, SPAN_PER_EFOLD_M)
-        return out + self._settle_group(travel_m - GROUP_M, belief, SPAN_PER_EFOLD_M, closed=any(s.accepted for s in out))
+        return out + self._settle_group(travel_m - GROUP_M, belief, SPAN_PER_EFOLD_M, [s for s in out if s.accepted])
 
     def flush(self, belief: Belief) -> list[Settled]:
         """At the end of the drive, decide all hypotheses that found no cluster, those given up before included.
@@ -230,28 +230,34 @@ class Commitment:
             self._expire(self._travel(probe))
             self._queue.waiting += group
             out += [s for s in self._queue.commit(belief, 0.0) if s.accepted or s.key in fresh]
+        together = self._settle_group(np.inf, belief, 0.0, [s for s in out if s.accepted])
+        out += [s for s in together if s.accepted or s.key in fresh]
         self._expire(np.inf)
-        out += self._settle_group(np.inf, belief, 0.0, closed=any(s.accepted for s in out))
         settled = {s.key for s in out}
         left = [w for w in self._given_up if w.key in fresh and w.key not in settled]
         return out + [Settled(w.key, w.hypothesis, lack=Lack.UNSUPPORTED) for w in left]
 
-    def _settle_group(self, until_m: float, belief: Belief, span_per_efold_m: float, *, closed: bool) -> list[Settled]:
+    def _settle_group(
+        self, until_m: float, belief: Belief, span_per_efold_m: float, closed: Sequence[Settled]
+    ) -> list[Settled]:
         """Judge hypotheses that missed a limit by a hair together with those that wait, once the oldest are from `until_m`.
 
-        Where the loop was `closed` without them, they are dropped. Returns the accepted ones; the others stay refused.
+        Those within `GROUP_M` of travel of loops accepted without them (`closed`) are dropped. Each is part of one judgement of
+        its own age, of at most `HAIRS` a probe over twice that way. Returns what was accepted, and what waited and was refused.
         """
-        if closed:
-            self._hairs = []
+        done_m = np.array([self._travel(s.hypothesis.probe) for s in closed])
+        far = [bool(np.all(np.abs(done_m - self._travel(w.hypothesis.probe)) > GROUP_M)) for w in self._hairs]
+        self._hairs = [w for w, is_far in zip(self._hairs, far, strict=True) if is_far]
         old = [w for w in self._hairs if self._travel(w.hypothesis.probe) <= until_m]
         if not old:
             return []
+        waiting = {w.key for w in self._queue.waiting}
         pool = Pool(self._travel, [*self._queue.waiting, *self._hairs])
-        accepted = [s for s in pool.commit(belief, span_per_efold_m) if s.accepted]
-        keys = {s.key for s in accepted}
-        self._hairs = [] if accepted else [w for w in self._hairs if w not in old]
-        self._queue.keep([i for i, w in enumerate(self._queue.waiting) if w.key not in keys])
-        return accepted
+        out = [s for s in pool.commit(belief, span_per_efold_m) if s.accepted or s.key in waiting]
+        decided = {s.key for s in out}
+        self._hairs = [] if any(s.accepted for s in out) else [w for w in self._hairs if w not in old]
+        self._queue.keep([i for i, w in enumerate(self._queue.waiting) if w.key not in decided])
+        return out
 
     def _expire(self, travel_m: float) -> list[Waiting]:
         """Take out what has waited too long, and remember it for the end."""

@@ -49,8 +49,8 @@ SURE_SIGMA_M = 0.8
 FLOOR_M, FLOOR_DEG = 0.004, 0.04
 """Least standard deviations of the registration of two submaps, m and degrees: submaps bend."""
 PIECE_M = 1.0
-"""Points of a probe nearer to each other than this belong to one thing, m (more where the cells are larger): a tree, a car, a
-piece of wall."""
+"""Side of the squares in which the points of a probe count as one thing, m (more where the cells are larger): a tree, a piece
+of a car or of a wall."""
 REGISTERED_POINTS = 400
 """Points of a probe that are registered."""
 UNKNOWN = 1e8

@@ -106,11 +106,14 @@ class Support:
 def _agreeing(new: MeasuredLoop, near: list[MeasuredLoop], belief: Belief) -> list[MeasuredLoop]:
     """Which of the loops `near` agree with a new one.
 
-    The covariance of the map only makes more of them agree. So its search is spared if all do as if the map were exact.
+    Where edges join all their nodes, the covariance of the map only makes more of them agree. So it is not searched for loops
+    that agree as if the map were exact.
     """
     loops = Loops.measured([(h.source, h.target, h.relative) for h in (new, *near)])
     others = np.arange(1, len(loops.older))
-    agree = agrees(loops, 0, others, belief.exact_ways)
+    joined = np.isfinite(belief.covariance_from(new.source)[:, 0, 0])
+    joined = joined[loops.older] & joined[loops.newer]
+    agree = agrees(loops, 0, others, belief.exact_ways) & joined[0] & joined[1:]
     if not agree.all():
         agree[~agree] = agrees(loops, 0, others[~agree], belief.ways)
     return [h for h, yes in zip(near, agree.tolist(), strict=True) if yes]

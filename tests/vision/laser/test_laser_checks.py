@@ -54,4 +54,4 @@ def test_a_limit_of_a_share_moves_by_the_standard_error_of_so_few_things():
     assert all(check.passed for check in few)
     assert [check.figure for check in many if not check.passed] == ["near", "fit", "violation"]
     assert [check.limit for check in few[3:]] == [checks.LOOSEST_MAX_M, checks.AMBIGUITY_MAX]
-    assert checks.loosened(asked, 0) == asked
+    assert checks.loosened(asked, 0) == checks.loosened(asked, checks.PIECES_MIN - 1) == asked

@@ -165,3 +165,32 @@ def test_an_equal_rival_blocks_a_group(commitment):
 def test_at_the_end_a_group_waits_no_longer(commitment):
     assert driven(commitment, range(200, 212, 2), near=0.45) == []
     assert [s.key for s in commitment.flush(BELIEF) if s.accepted] == list(range(200, 212, 2))
+
+
+def test_at_the_end_those_that_kept_the_limits_count_in_a_group(commitment):
+    commitment.add(0, hypothesis(198, 20))
+    assert driven(commitment, range(200, 216, 4), near=0.45) == []
+    assert {s.key for s in commitment.flush(BELIEF) if s.accepted} == {0, 200, 204, 208, 212}
+    assert commitment.flush(BELIEF) == []
+
+
+def test_a_group_refuses_what_waits_and_contradicts_it(commitment):
+    commitment.add(0, hypothesis(198, 20, where=(6.0, 5.0, 0.3)))
+    settled = driven(commitment, range(200, 236, 4), near=0.45)
+    assert [(s.key, s.lack) for s in settled if not s.accepted] == [(0, Lack.CONTRADICTED)]
+    assert len(settled) == 10
+
+
+def test_a_loop_closed_long_before_takes_no_member_from_a_group(commitment):
+    full = driven(commitment, (100, 106, 110))
+    assert all(s.accepted for s in full)
+    assert len(full) == 3
+    assert len(driven(commitment, range(200, 236, 4), near=0.45)) == 9
+
+
+def test_a_probe_gives_a_group_two_members_at_most(commitment):
+    for key, probe in enumerate(range(200, 236, 4)):
+        for n in range(3):
+            commitment.add(3 * key + n, hypothesis(probe, 20 + n, near=0.45))
+        settled = commitment.settle(TRAVEL[probe], BELIEF)
+    assert len(settled) == 18
