@@ -94,6 +94,8 @@ def _integers(fields: list[str], count: int, where: str) -> list[int]:
     given = fields[1 : 1 + count]
     try:
         numbers = [int(field) for field in given]
+        if len(numbers) < count:
+            raise ValueError
     except ValueError:
         raise GraphError(
             f"{where}: expected {count} whole number(s) after {fields[0]}, found {quoted(' '.join(given))}"

@@ -114,6 +114,8 @@ def test_vertices_may_have_any_numbers(tmp_path):
         (("1.0 0.0 0.5  10", "1.0 x 0.5 10"), r"graph\.g2o:6: expected numbers"),
         (("1.0 0.0 0.5  10", "1.0 nan 0.5 10"), r"graph\.g2o:6: found NaN or Inf"),
         (("EDGE_SE2 0 1 1.0", "EDGE_SE2 0 one 1.0"), r"graph\.g2o:6: expected 2 whole"),
+        (("FIX 0", "EDGE_SE2 0"), r"graph\.g2o:5: expected 2 whole number\(s\) after EDGE_SE2, found '0'"),
+        (("FIX 0", "VERTEX_SE2"), r"graph\.g2o:5: expected 1 whole number\(s\) after VERTEX_SE2, found ''"),
         (("EDGE_SE2 2 0", "EDGE_SE2 2 7"), r"graph\.g2o:9: edge 2 -> 7 names vertex 7, which the file does not give"),
         (("VERTEX_SE2 2 2", "VERTEX_SE2 1 2"), r"graph\.g2o:4: vertex 1 is given twice"),
         (("FIX 0", "VERTEX_SE3:QUAT 3 0 0 0 0 0 0 1"), r"graph\.g2o:5: VERTEX_SE3:QUAT is a 3-D record"),
