@@ -12,6 +12,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from hybridmap.cli import INTERRUPTED
 from hybridmap.cli.calibrate import calibrate
 from hybridmap.cli.compare import compare
 from hybridmap.cli.demo import demo
@@ -26,8 +27,7 @@ from hybridmap.cli.study import study
 from hybridmap.cli.verify import verify
 from hybridmap.errors import ConfigError, HybridMapError
 
-_INTERRUPTED = 130  # what typer makes of Ctrl-C
-_EVERY = {2: "a wrong input or an error, in one line on standard error", _INTERRUPTED: "interrupted by Ctrl-C"}
+_EVERY = {2: "a wrong input or an error, in one line on standard error", INTERRUPTED: "interrupted by Ctrl-C"}
 """Exit codes of every command."""
 
 app = typer.Typer(
@@ -104,13 +104,11 @@ for _name, (_command, _codes) in _COMMANDS.items():
     app.command(_name, epilog=f"Exit codes: {_said}.")(_command)
 
 
-def main() -> None:
-    """Run the command line on `sys.argv`; it never returns.
-
-    Every error that the user can do something about is one line on standard error, with exit code 2.
+def run() -> int:
+    """Run the command line on `sys.argv`; returns the exit code.
 
     Raises:
-        SystemExit: always, with the exit code (see the help of each command).
+        SystemExit: an error that the user can do something about, after its line on standard error; the exit code is 2.
     """
     os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")  # pictures are small: a second thread costs more than it gives
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # a damaged picture is reported by our own line
@@ -129,9 +127,7 @@ def main() -> None:
         if not hasattr(error, "format_message"):  # click's usage errors, wherever typer has them from
             raise
         _fail(" ".join(error.format_message().split()))
-    if code == _INTERRUPTED:
-        print("hybridmap: interrupted", file=sys.stderr)  # noqa: T201
-    raise SystemExit(code if isinstance(code, int) else 0)
+    return code if isinstance(code, int) else 0
 
 
 def _print_every_name() -> None:

@@ -105,3 +105,10 @@ def test_what_ends_a_command_is_one_line(monkeypatch, capsys, tmp_path, error, c
     with pytest.raises(SystemExit) as stopped:
         main()
     assert (stopped.value.code, capsys.readouterr().err) == (code, said)
+
+
+def test_ctrl_c_while_the_commands_are_loaded_is_one_line_too(tmp_path):
+    """`typer` is the first that the commands import: one that stands in its place lets Ctrl-C come at that moment."""
+    (tmp_path / "typer.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
+    done = run("map", "lab", "--out", "s", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "hybridmap: interrupted\n")
