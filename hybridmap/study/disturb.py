@@ -30,6 +30,11 @@ KIDNAPPED = "kidnapped_s"
 _Seen = TypeVar("_Seen", bound=Observation)
 
 _NEAR_DEPTH_M = 1.0  # at this depth its noise is as strong as it is told; it grows with the square of the depth
+_ANY = (-math.inf, math.inf)
+_SHARE = (0.0, 1.0)
+_EXPOSURE_S = (0.0, 10.0)  # a longer one smears a turn over the whole picture anyway
+_DELAY_S = (-1e4, 1e4)  # longer than a drive; it has to fit into a stamp
+_TIME_S = (0.0, 1e6)  # eleven days, longer than a drive
 _SLIP = (0.3, 0.05, math.radians(15.0))  # standard deviations of a slip: ahead, sideways (m), and turn (rad)
 
 
@@ -40,13 +45,13 @@ class Disturbance:
     Attributes:
         apply: (samples, strength, generator, rig) -> disturbed samples. The strength is a number, or a tuple of `count`.
         by_chance: whether the disturbance uses random numbers.
-        most: greatest strength that a study may give; with a finite one (that of a share) the least is 0.
+        bounds: least and greatest strength that a study may give.
         count: how many numbers the strength consists of.
     """
 
     apply: Callable[[Samples, Any, np.random.Generator, Rig], Iterator[Sample]]
     by_chance: bool = False
-    most: float = math.inf
+    bounds: tuple[float, float] = _ANY
     count: int = 1
 
 
@@ -86,12 +91,11 @@ def check(name: str, strength: float | tuple[float, ...], origin: str) -> None:
     numbers = (strength,) if isinstance(strength, float) else strength
     if np.any(strength) and len(numbers) != TABLE[name].count:
         raise ConfigError(f"{origin}: disturb: {name}: expected {TABLE[name].count} number(s), found {len(numbers)}")
-    most = TABLE[name].most
-    least = 0.0 if math.isfinite(most) else -most
+    least, most = TABLE[name].bounds
     beyond = next((number for number in numbers if not least <= number <= most), None)
     if beyond is not None:
         raise ConfigError(f"{origin}: disturb: {name}: expected {least:g} to {most:g}, found {beyond:g}")
-    if name == KIDNAPPED and np.any(strength) and not 0.0 <= numbers[0] < numbers[1] < numbers[2]:
+    if name == KIDNAPPED and np.any(strength) and not numbers[0] < numbers[1] < numbers[2]:
         found = ", ".join(f"{number:g}" for number in numbers)
         raise ConfigError(
             f"{origin}: disturb: {name}: expected [picked up, put down, end], ascending seconds from the first stamp,"
@@ -270,7 +274,7 @@ def _each(
     change: Callable[[_Seen, float, np.random.Generator], _Seen],
     *,
     by_chance: bool = False,
-    most: float = math.inf,
+    bounds: tuple[float, float] = _ANY,
 ) -> Disturbance:
     """Apply a function to every sample of a kind by itself."""
 
@@ -278,7 +282,7 @@ def _each(
         for sample in samples:
             yield change(sample, strength, rng) if isinstance(sample, kind) else sample
 
-    return Disturbance(apply, by_chance, most)
+    return Disturbance(apply, by_chance, bounds)
 
 
 def _ranges(change: Callable[[Ranges, float, np.random.Generator], Ranges]) -> Callable[..., LaserScan]:
@@ -304,23 +308,23 @@ def _wheels(change: Callable[[Array, float, np.random.Generator], Array], *, by_
 
 TABLE: dict[str, Disturbance] = {
     "scan_range_m": _each(LaserScan, _ranges(scan_range_m)),
-    "scan_covered": _each(LaserScan, _ranges(scan_covered), most=1.0),
+    "scan_covered": _each(LaserScan, _ranges(scan_covered), bounds=_SHARE),
     "scan_noise_m": _each(LaserScan, _ranges(scan_noise_m), by_chance=True),
-    "beams_short": _each(LaserScan, _ranges(beams_short), by_chance=True, most=1.0),
-    "beams_lost": _each(LaserScan, _ranges(beams_lost), by_chance=True, most=1.0),
-    "blur_s": Disturbance(blur_s),
-    "darker": _each(RgbdFrame, darker, most=1.0),
+    "beams_short": _each(LaserScan, _ranges(beams_short), by_chance=True, bounds=_SHARE),
+    "beams_lost": _each(LaserScan, _ranges(beams_lost), by_chance=True, bounds=_SHARE),
+    "blur_s": Disturbance(blur_s, bounds=_EXPOSURE_S),
+    "darker": _each(RgbdFrame, darker, bounds=_SHARE),
     "color_noise": _each(RgbdFrame, color_noise, by_chance=True),
     "depth_noise_m": _each(RgbdFrame, depth_noise_m, by_chance=True),
     "depth_range_m": _each(RgbdFrame, depth_range_m),
-    "depth_lost": _each(RgbdFrame, depth_lost, by_chance=True, most=1.0),
+    "depth_lost": _each(RgbdFrame, depth_lost, by_chance=True, bounds=_SHARE),
     "wheel_scale": _wheels(wheel_scale),
     "wheel_turn_scale": _wheels(wheel_turn_scale),
     "wheel_pull_deg_per_m": _wheels(wheel_pull_deg_per_m),
     "wheel_noise_deg_per_sqrt_m": _wheels(wheel_noise_deg_per_sqrt_m, by_chance=True),
     "wheel_slips_per_m": _wheels(wheel_slips_per_m, by_chance=True),
-    "views_lost": Disturbance(views_lost, most=1.0),
-    "views_late_s": Disturbance(views_late_s),
-    KIDNAPPED: Disturbance(kidnapped_s, count=3),
+    "views_lost": Disturbance(views_lost, bounds=_SHARE),
+    "views_late_s": Disturbance(views_late_s, bounds=_DELAY_S),
+    KIDNAPPED: Disturbance(kidnapped_s, bounds=_TIME_S, count=3),
 }
 """Name -> disturbance, in the order in which they are applied."""
