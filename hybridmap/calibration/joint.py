@@ -252,7 +252,9 @@ class Problem:
 def leg_error(problem: Problem, terms: OdometryTerms, index: int) -> Callable[[Any, Any, Any], Array]:
     """Make the error function of odometry term `index` for a GTSAM custom factor.
 
-    The error (3,) is the target's pose relative to its prediction by calibrated odometry, divided by standard deviations.
+    The error (3,) has unit variance: `terms.whiten[index]` times the target's pose (x, y, yaw; m, rad) relative to its
+    prediction by calibrated odometry, in the predicted frame. For a long leg only the distance along the chord and the
+    heading count, and the second number is 0; so is the first one if the chord is short against the path.
     """
     source, target = int(terms.sources[index]), int(terms.targets[index])
     whiten, key = terms.whiten[index], problem.key

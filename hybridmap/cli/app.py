@@ -77,7 +77,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], dict[int, str]]] = {
         optimize,
         {
             0: "solved, whatever the verdict",
-            1: "the back-end diverged or found the graph singular: it is shown, and no file is written",
+            1: "the back-end failed, diverged or found the graph singular: it is shown, and no file is written",
             2: f"the back-end gave up, or {_EVERY[2]}",
         },
     ),

@@ -11,11 +11,17 @@ from hybridmap.cli.options import AsJson, ReplaceFile
 from hybridmap.export import FORMATS
 
 _FORMATS = ", ".join(f"{name} ({entry.description})" for name, entry in FORMATS.items())
+_BY_SUFFIX = ", ".join(f"{name} {entry.suffix}" for name, entry in FORMATS.items() if entry.by_suffix)
 
 
 def export(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Session folder, as `hybridmap map` writes it.")],
-    format_name: Annotated[str, typer.Option("--format", metavar="F", help=_FORMATS)],
+    format_name: Annotated[
+        str,
+        typer.Option(
+            "--format", metavar="F", help=f"{_FORMATS}. Open3D reads some by the suffix, and --out must have it: {_BY_SUFFIX}."
+        ),
+    ],
     out: Annotated[
         Path,
         typer.Option(metavar="PATH", help="File to write; `grid` writes a .yaml and a .pgm of this name. See --overwrite."),

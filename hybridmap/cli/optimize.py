@@ -35,7 +35,8 @@ def optimize(
     The verdict is on the graph alone: what a drive knew beside it, such as lost messages, is in the verdict of `map`. It does
     not change the exit code.
 
-    If the back-end fails, diverges or finds the graph singular, no file is written. The graph that is read is not changed.
+    If the back-end fails, diverges or finds the graph singular, no file is written. The graph that is read is not changed,
+    unless --out names its file and --overwrite is given.
     """
     from hybridmap.backends import create
     from hybridmap.backends.comparison import Row, metrics_of

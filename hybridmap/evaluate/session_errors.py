@@ -34,7 +34,7 @@ def evaluate_session(
     Args:
         folder: the session folder.
         reference: ground truth in the TUM format; default: the session's own, if any.
-        relations: file of verified relative poses, lines `t1 t2 dx dy dyaw`.
+        relations: file of verified relative poses, lines `t1 t2 dx dy dyaw` (s, m, rad).
         loops: also evaluate how well the views tell places apart, see `evaluate_loops`.
 
     Returns:
@@ -44,8 +44,9 @@ def evaluate_session(
     Raises:
         StoreError: the folder holds no session.
         StreamError: the reference is missing or damaged.
-        EvaluationError: there is neither a reference nor a relations file, they share no stamps with the session, or `loops`
-            is set and the session stores no views.
+        EvaluationError: there is neither a reference nor a relations file, they share no stamps with the session, the
+            relations file is missing, empty or damaged, or `loops` is set and there is no ground truth or the session stores no
+            views.
     """
     session = SessionFolder(folder)
     session.require()

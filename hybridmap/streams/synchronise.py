@@ -87,7 +87,9 @@ class Synchroniser:
         """Add a sample, and yield the steps that have become ready. It is taken in only when the steps are iterated over.
 
         Raises:
-            StreamError: stamps out of order, self-motion that is not finite, or odometry mixed with velocities.
+            StreamError: self-motion goes back in time, or an observation goes back behind one that waits for odometry (both
+                after `latency_s`); self-motion is not finite; or odometry is mixed with velocities. An observation behind the
+                last step, or before the first odometry, is dropped and counted in `report`, without an error.
         """
         if self._odometry_delay_ns and isinstance(sample, SelfMotion | Velocity):
             sample = replace(sample, stamp_ns=sample.stamp_ns + self._odometry_delay_ns)

@@ -78,15 +78,18 @@ def _read_row(path: Path, number: int, row: list[str]) -> Velocity:
     try:
         values = [float(field) for field in row[1:]]
     except ValueError:
-        raise StreamError(f"{path}:{number}: expected numbers, found {quoted(','.join(row))}") from None
+        raise StreamError(f"{path}:{number}: expected numbers {','.join(COLUMNS)}, found {quoted(','.join(row))}") from None
     try:
         stamp_ns = read_stamp_ns(row[0].strip())
     except ValueError as error:
         raise StreamError(f"{path}:{number}: {error}") from None
     if len(values) != 2:
-        raise StreamError(f"{path}:{number}: expected 3 fields, found {len(row)}")
+        raise StreamError(f"{path}:{number}: expected 3 fields ({','.join(COLUMNS)}), found {len(row)}")
     if not np.isfinite(values).all():
-        raise StreamError(f"{path}:{number}: found NaN or Inf, expected finite numbers")
+        raise StreamError(f"{path}:{number}: found NaN or Inf in {' or '.join(COLUMNS[1:])}, expected finite numbers")
     if max(map(abs, values)) > _FASTEST:
-        raise StreamError(f"{path}:{number}: expected at most {_FASTEST:g} m/s and rad/s, found {quoted(','.join(row[1:]))}")
+        found = quoted(",".join(row[1:]))
+        raise StreamError(
+            f"{path}:{number}: {', '.join(COLUMNS[1:])}: expected at most {_FASTEST:g} m/s and rad/s, found {found}"
+        )
     return Velocity(stamp_ns, values[0], values[1])

@@ -34,8 +34,9 @@ def of_step(depth_inliers: float, slack_m: float, odometry_sigma: float) -> tupl
 
     Args:
         depth_inliers: measured share of the points in common view that fit, 0..1.
-        slack_m: its standard deviation in the loosest direction, m, see `Registration`; it decides whether it is certain.
-        odometry_sigma: its distance from the odometry, standard deviations.
+        slack_m: the registration's standard deviation in its loosest direction, m. The registration is certain, and the
+            odometry is not asked, if this is below `SURE_SLACK_M` and `depth_inliers` is above `SURE_INLIERS`.
+        odometry_sigma: distance of the registration from the odometry, in standard deviations.
     """
     checks = of_depth(depth_inliers)
     if not (depth_inliers > SURE_INLIERS and slack_m < SURE_SLACK_M):
