@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from hybridmap.cli.graphs import GraphSource
     from hybridmap.evaluate.session_errors import Judged
     from hybridmap.metrics import Metric
+    from hybridmap.verdict import Reason
 
 _DEFAULT = "odometry,relaxation-ratslam,gtsam-lm,gtsam-cauchy,gtsam-gnc"
 _WIDTH = 180  # columns of a table that goes into a file
@@ -93,17 +94,20 @@ def compare(
                 opened.graph, names, settings, ways=ways, certified=True, traced=out is not None, progress=advance
             )
         judged = _judged(opened, rows, reference, relations)
-        verdicts = _verdicts(opened, rows)
-        cells = _table(rows, verdicts, judged.metrics)
+        reasons = _reasons(opened, rows)
+        cells = _table(rows, reasons, judged.metrics)
         if place is not None:
             facts = (f"Back-ends on {source.name}", opened.start, opened.head, opened.graph)
             write_comparison(place, Compared(*facts, rows, cells, settings, judged.truth, opened.kidnapped))
     if as_json:
-        _emit(opened, ways, rows, verdicts, judged.metrics)
+        _emit(opened, ways, rows, reasons, judged.metrics)
     else:
         for remark in opened.head.get("remarks", ()):
             typer.echo(f"note: {remark}")
         _show(cells, rows, f"{source}: {opened.graph.n_nodes} nodes, {opened.graph.n_edges} edges; {_done(opened, ways)}")
+        for title, found in reasons.items():
+            for reason in found:
+                typer.echo(f"{title}: reason: {reason}")
 
 
 def _names(backends: str) -> list[str]:
@@ -125,26 +129,33 @@ def _judged(opened: GraphSource, rows: Sequence[Row], reference: Path | None, re
     return judge_solutions(opened.path, maps, reference, relations)
 
 
-def _verdicts(opened: GraphSource, rows: Sequence[Row]) -> dict[str, str]:
-    """Title of each row with a solution -> verdict on its map."""
-    from hybridmap.verdict import Facts, reasons_of, verdict_of
+def _reasons(opened: GraphSource, rows: Sequence[Row]) -> dict[str, Sequence[Reason]]:
+    """Title of each row with a solution -> reasons against its map."""
+    from hybridmap.verdict import Facts, reasons_of
 
     solved = {row.title: row.solution for row in rows if row.solution is not None}
-    return {title: str(verdict_of(reasons_of(Facts.of_graph(opened.graph, one)))) for title, one in solved.items()}
+    return {title: reasons_of(Facts.of_graph(opened.graph, one)) for title, one in solved.items()}
 
 
 def _emit(
-    opened: GraphSource, ways: Sequence[Way], rows: Sequence[Row], verdicts: dict[str, str], judged: Sequence[Metric]
+    opened: GraphSource,
+    ways: Sequence[Way],
+    rows: Sequence[Row],
+    reasons: dict[str, Sequence[Reason]],
+    judged: Sequence[Metric],
 ) -> None:
     from hybridmap.backends.comparison import metrics_of
     from hybridmap.cli.show import emit
+    from hybridmap.verdict import said_of
 
+    said = {title: said_of(found) for title, found in reasons.items()}
     head = opened.head | {
         "start": opened.start,
         "ways": [str(way) for way in ways],
         "backends": [row.title for row in rows],
         "status": {row.title: row.status for row in rows},
-        "verdicts": verdicts,
+        "verdicts": {title: one["verdict"] for title, one in said.items()},
+        "reasons": {title: one["reasons"] for title, one in said.items()},
         "message": {row.title: row.message for row in rows},
         "certificate": {row.title: row.certificate.message for row in rows if row.certificate is not None},
     }
@@ -166,9 +177,10 @@ def _done(opened: GraphSource, ways: Sequence[Way]) -> str:
     return ", ".join(words[way] for way in ways)
 
 
-def _table(rows: Sequence[Row], verdicts: dict[str, str], judged: Sequence[Metric]) -> list[list[str]]:
+def _table(rows: Sequence[Row], reasons: dict[str, Sequence[Reason]], judged: Sequence[Metric]) -> list[list[str]]:
     """Column titles, then one list of cells per row."""
     from hybridmap.report.page_tables import number
+    from hybridmap.verdict import verdict_of
 
     by_name = {metric.name: f"{metric.value:.4f}" if isfinite(metric.value) else "–" for metric in judged}
     errors = {name: title for name, title in _ERRORS.items() if any(key.startswith(f"{name}/") for key in by_name)}
@@ -186,7 +198,7 @@ def _table(rows: Sequence[Row], verdicts: dict[str, str], judged: Sequence[Metri
             variance,
             *against,
             row.status,
-            verdicts[row.title],
+            str(verdict_of(reasons[row.title])),
             str(report.iterations),
             f"{report.cpu_s:.2f}",
         ]

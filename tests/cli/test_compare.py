@@ -61,6 +61,7 @@ def test_json_has_a_figure_and_a_status_of_each_back_end(monkeypatch, capsys, sq
     assert told["start"] == "the poses of the file"
     assert set(told["status"]) == set(told["certificate"]) == set(names)
     assert told["verdicts"] == {name: "doubtful" if name.startswith("odometry") else "trusted" for name in names}
+    assert {name for name, reasons in told["reasons"].items() if reasons} == {"odometry"}
     assert figures["certificate_gap/gtsam-lm"] <= 1e-6
     for name in names:
         assert figures[f"chi2/{name}"] <= figures["chi2/odometry"] * (1 + 1e-9)
@@ -73,6 +74,8 @@ def test_a_folder_gets_a_picture_and_a_page_that_needs_nothing_else(monkeypatch,
     code, printed, _ = run(monkeypatch, capsys, "compare", square, "--backends", "odometry,gtsam-lm", "--out", out)
     assert code == 0
     assert "gtsam-lm" in printed
+    assert "\nodometry: reason: the map is dead reckoning" in printed
+    assert "gtsam-lm: reason" not in printed
     assert (out / "maps.png").read_bytes()[:4] == b"\x89PNG"
     page = (out / "comparison.html").read_text()
     assert page.count("data:image/") == 4  # over one another, side by side, convergence, residuals; no loop has a weight
