@@ -64,7 +64,8 @@ def read_graph(path: Path) -> PoseGraph:
             _parse(lines, fields, f"{path}:{number}")
             lines.numbers += [number] * (len(lines.ends) - len(lines.numbers))
     if not lines.ends:
-        raise GraphError(f"{path}: holds no edge (EDGE_SE2 or EDGE2 lines); is it a g2o or TORO file?")
+        vertices = {0: "no vertex", 1: "1 vertex"}.get(len(lines.vertices), f"{len(lines.vertices)} vertices")
+        raise GraphError(f"{path}: holds {vertices} and no edge; expected EDGE_SE2 or EDGE2 lines of a g2o or TORO file")
     return _assemble(lines, path)
 
 

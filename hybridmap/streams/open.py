@@ -7,6 +7,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hybridmap.config.root import Config
 from hybridmap.errors import StreamError
 from hybridmap.plugins import loaded
@@ -127,11 +129,21 @@ class WindowedStream:
         return self._stream.report
 
     def __iter__(self) -> Iterator[Sample]:
-        """Yield the samples within the window."""
+        """Yield the samples within the window.
+
+        Raises:
+            StreamError: the stream ends before the window begins.
+        """
         limits: tuple[int, int] | None = None
+        first_ns = last_ns = 0
         for sample in self._stream:
-            low, high = limits = limits or self._window.limits_ns(sample.stamp_ns)
-            if sample.stamp_ns > high:
+            if limits is None:
+                first_ns, limits = sample.stamp_ns, self._window.limits_ns(sample.stamp_ns)
+            low, high = limits
+            last_ns = sample.stamp_ns
+            if last_ns > high:
                 return
-            if sample.stamp_ns >= low:
+            if last_ns >= low:
                 yield sample
+        if limits is not None:
+            self._window.limits_over(np.array([first_ns, last_ns]), first_ns, self.name)

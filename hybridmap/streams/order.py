@@ -116,6 +116,21 @@ class Window:
         high = 2**62 if self.end_s is None else first_ns + round(self.end_s * NS_PER_S)
         return low, high
 
+    def limits_over(self, motion_ns: Stamps, first_ns: int, name: str) -> tuple[int, int]:
+        """As `limits_ns`, for the recording `name` with self-motion at the stamps (N,) `motion_ns`, ns, N > 0.
+
+        Raises:
+            StreamError: none of these stamps lies in the part.
+        """
+        low, high = self.limits_ns(first_ns)
+        if not ((motion_ns >= low) & (motion_ns <= high)).any():
+            from_s, until_s = (int(stamp - first_ns) / NS_PER_S for stamp in (motion_ns.min(), motion_ns.max()))
+            raise StreamError(
+                f"{name}: no odometry between --start and --end; the recording has it from {from_s:.3f} to {until_s:.3f} s"
+                " after its first stamp"
+            )
+        return low, high
+
 
 def check_overlap(motion_ns: Stamps, observation_ns: Stamps, what: str) -> None:
     """Refuse observations that share no time with the self-motion, with a tolerance of one second; empty ones pass.

@@ -164,10 +164,8 @@ class TumStream:
 
     def _apply(self, window: Window) -> None:
         first = min([int(self._odometry.stamps_ns[0])] + [pair.stamp_ns for pair in self._pairs[:1]])
-        low, high = window.limits_ns(first)
+        low, high = window.limits_over(self._odometry.stamps_ns, first, str(self._folder))
         inside = (self._odometry.stamps_ns >= low) & (self._odometry.stamps_ns <= high)
-        if not inside.any():
-            raise StreamError(f"{self._folder}: no odometry between --start and --end; choose times within the recording")
         self._odometry = Trajectory(self._odometry.stamps_ns[inside], self._odometry.poses[inside])
         self._pairs = [pair for pair in self._pairs if low <= pair.stamp_ns <= high]
 

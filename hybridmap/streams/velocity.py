@@ -26,15 +26,15 @@ class VelocityStream:
         """Read the table. There are no observations in it to be skipped.
 
         Raises:
-            StreamError: missing, empty, wrong columns, a value that is not a finite number, or stamps out of order.
+            StreamError: missing, empty, wrong columns, a value that is not a finite number, stamps out of order, or none
+                in the window.
         """
         self.name = path.name
         self.rig = Rig()
         samples = read_table(path)
-        low, high = (window or Window()).limits_ns(samples[0].stamp_ns)
+        stamps_ns = np.array([sample.stamp_ns for sample in samples])
+        low, high = (window or Window()).limits_over(stamps_ns, samples[0].stamp_ns, str(path))
         self._samples = [sample for sample in samples if low <= sample.stamp_ns <= high]
-        if not self._samples:
-            raise StreamError(f"{path}: no velocity between --start and --end; choose times within the recording")
         truth = path.with_name(f"{path.stem}_groundtruth.tum")
         self.groundtruth: Trajectory | None = read_tum(truth) if truth.is_file() else None
         self.expected_observations: int | None = 0

@@ -169,8 +169,12 @@ def test_the_first_fixed_vertex_is_held_and_written_again(tmp_path, caplog):
 def test_files_without_edges_and_missing_files_are_refused(tmp_path):
     with pytest.raises(GraphError, match="no such graph file"):
         read_graph(tmp_path / "nothing.g2o")
-    with pytest.raises(GraphError, match="holds no edge"):
+    with pytest.raises(GraphError, match="holds no vertex and no edge"):
+        read_graph(written(tmp_path, "# nothing\n"))
+    with pytest.raises(GraphError, match="holds 1 vertex and no edge"):
         read_graph(written(tmp_path, "VERTEX_SE2 0 0 0 0\n"))
+    with pytest.raises(GraphError, match="holds 2 vertices and no edge"):
+        read_graph(written(tmp_path, "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0 0\n"))
 
 
 def test_a_part_that_hangs_on_nothing_is_named(tmp_path):

@@ -35,6 +35,8 @@ def test_a_truth_beside_the_table_is_found_and_a_part_can_be_cut_out(tmp_path):
     path = _write(tmp_path / "drive.csv", HEADER + "".join(f"{10 + i},1,0\n" for i in range(5)))
     _write(tmp_path / "drive_groundtruth.tum", "10 1 2 0 0 0 0 1\n")
     stream = open_stream(path, Config(), start_s=1, end_s=3)
+    with pytest.raises(StreamError, match=r"the recording has it from 0.000 to \d+.000 s"):
+        open_stream(path, Config(), start_s=1e6)
     assert [sample.stamp_ns // 10**9 for sample in stream] == [11, 12, 13]
     np.testing.assert_array_equal(known(stream.groundtruth).poses, [[1, 2, 0]])
 
