@@ -23,7 +23,7 @@ _SkipDamaged = Annotated[
     typer.Option(
         "--skip-damaged",
         help="Read every scan and picture, and count the damaged ones, which `map --skip-damaged` skips. Without it, damage"
-        " inside a scan or picture is not seen here, and ends `map`.",
+        " inside a scan or picture is seen here in the first 40 m at most, and ends `map`.",
     ),
 ]
 _Strict = Annotated[
@@ -82,19 +82,29 @@ def inspect(
 
 
 def _clock(found: Inspection, config: str | None, overrides: Mapping[str, Any], *, skip_damaged: bool) -> ClockOffset | None:
-    """The offset between views and odometry by the first metres of a recording; None if there is nothing to look at."""
+    """The offset between views and odometry by the first metres of a recording; None if there is nothing to look at.
+
+    Damage that is met there, and that skipping helps against, is noted in `found`.
+    """
     if not found.mappable or not found.parts or not found.rig.sensors:
         return None
     from hybridmap.cli.choose import choose
     from hybridmap.errors import HybridMapError
     from hybridmap.session import first_look
 
-    try:
-        opened = choose(found.source, config, overrides, skip_damaged=skip_damaged)
-        return first_look(opened.stream, opened.config)
-    except HybridMapError as error:
-        found.problems.append(str(error))
-        return None
+    errors = []
+    for skipping in dict.fromkeys((skip_damaged, True)):
+        try:
+            opened = choose(found.source, config, overrides, skip_damaged=skipping)
+            clock = first_look(opened.stream, opened.config)
+        except HybridMapError as error:
+            errors.append(str(error))
+            continue
+        found.problems += errors
+        found.only_skipping = bool(errors)
+        return clock
+    found.problems += errors[:1]
+    return None
 
 
 def _head(found: Inspection, clock: ClockOffset | None) -> dict[str, Any]:
@@ -110,6 +120,7 @@ def _head(found: Inspection, clock: ClockOffset | None) -> dict[str, Any]:
         "lost": found.lost,
         "clock": None if clock is None else {"state": str(clock.state), "words": str(clock)},
         "mappable": found.mappable,
+        "only_with_skip_damaged": found.only_skipping,
         "reason": found.reason,
     }
 
@@ -144,7 +155,8 @@ def _show(found: Inspection, clock: ClockOffset | None) -> None:
     lines += [] if clock is None else [f"clock: {clock}"]
     lines += [f"note: {remark}" for remark in found.remarks]
     lines += [f"problem: {problem}" for problem in found.problems]
-    lines.append("mappable: yes" if found.mappable else f"mappable: no, because {found.reason}")
+    yes = "yes, with --skip-damaged" if found.only_skipping else "yes"
+    lines.append(f"mappable: {yes if found.mappable else f'no, because {found.reason}'}")
     sys.stdout.write("\n".join(lines) + "\n")
 
 

@@ -71,6 +71,7 @@ class Inspection:
         problems: missing or damaged parts, one line each.
         lost: topic -> (messages that cannot be read, messages in all), for the topics that mapping would use.
         reason: why the source cannot be mapped; None if it can.
+        only_skipping: whether a scan or picture was found to be damaged, so that mapping has to skip damaged ones.
     """
 
     source: str
@@ -82,6 +83,7 @@ class Inspection:
     problems: list[str] = field(default_factory=list)
     lost: dict[str, tuple[int, int]] = field(default_factory=dict)
     reason: str | None = None
+    only_skipping: bool = False
 
     @property
     def mappable(self) -> bool:

@@ -443,6 +443,18 @@ def test_inspect_counts_damaged_scans_on_request(tmp_path):
     assert CliRunner().invoke(app, ["inspect", str(path), "--skip-damaged", "--strict"]).exit_code == LOST
 
 
+def test_inspect_says_that_a_damaged_scan_has_to_be_skipped(tmp_path):
+    path = laser_drive().write(tmp_path / "a.mcap")
+    shown = CliRunner().invoke(app, ["inspect", str(path)]).stdout
+    assert shown.endswith("mappable: yes\n")
+    _damage_some(path, {"/scan": [2]})
+    shown = CliRunner().invoke(app, ["inspect", str(path)]).stdout
+    assert "problem: " in shown
+    assert shown.endswith("mappable: yes, with --skip-damaged\n")
+    shown = CliRunner().invoke(app, ["inspect", str(path), "--skip-damaged"]).stdout
+    assert shown.endswith("mappable: yes\n")
+
+
 def test_a_topic_of_damaged_scans_alone_counts_as_lost(tmp_path):
     path = laser_drive().write(tmp_path / "a.mcap")
     _damage_some(path, {"/scan": list(range(6))})
