@@ -22,6 +22,10 @@ def main() -> None:
         code = run()
     except KeyboardInterrupt:
         code = INTERRUPTED
+    except ImportError as error:
+        if not isinstance(error.__cause__, KeyboardInterrupt):  # what compiled libraries make of Ctrl-C while they load
+            raise
+        code = INTERRUPTED
     if code == INTERRUPTED:
         print("hybridmap: interrupted", file=sys.stderr)  # noqa: T201
     raise SystemExit(code)

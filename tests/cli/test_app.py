@@ -107,8 +107,19 @@ def test_what_ends_a_command_is_one_line(monkeypatch, capsys, tmp_path, error, c
     assert (stopped.value.code, capsys.readouterr().err) == (code, said)
 
 
-def test_ctrl_c_while_the_commands_are_loaded_is_one_line_too(tmp_path):
+@pytest.mark.parametrize(
+    "loaded",
+    ["import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n", "raise ImportError('failed') from KeyboardInterrupt()\n"],
+)
+def test_ctrl_c_while_the_commands_are_loaded_is_one_line_too(tmp_path, loaded):
     """`typer` is the first that the commands import: one that stands in its place lets Ctrl-C come at that moment."""
-    (tmp_path / "typer.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
+    (tmp_path / "typer.py").write_text(loaded)
     done = run("map", "lab", "--out", "s", cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "hybridmap: interrupted\n")
+
+
+def test_a_library_that_is_missing_is_no_interrupt(tmp_path):
+    (tmp_path / "typer.py").write_text("raise ImportError('no such library')\n")
+    done = run("map", "lab", "--out", "s", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "no such library" in done.stderr
