@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 INTERRUPTED = 130  # what typer makes of Ctrl-C
@@ -14,7 +15,7 @@ def main() -> None:
     Every error that the user can do something about is one line on standard error, with exit code 2.
 
     Raises:
-        SystemExit: always, with the exit code (see the help of each command).
+        SystemExit: with the exit code (see the help of each command), but where Ctrl-C stopped the loading of a library: the process ends at once.
     """
     try:
         from hybridmap.cli.app import run  # takes half a second, in which Ctrl-C may come as well
@@ -25,7 +26,13 @@ def main() -> None:
     except ImportError as error:
         if not isinstance(error.__cause__, KeyboardInterrupt):  # what compiled libraries make of Ctrl-C while they load
             raise
-        code = INTERRUPTED
+        _say_interrupted()
+        os._exit(INTERRUPTED)  # at an ordinary exit, Open3D that is loaded by half may change the code to 1
     if code == INTERRUPTED:
-        print("hybridmap: interrupted", file=sys.stderr)  # noqa: T201
+        _say_interrupted()
     raise SystemExit(code)
+
+
+def _say_interrupted() -> None:
+    print("hybridmap: interrupted", file=sys.stderr, flush=True)  # noqa: T201
+    sys.stdout.flush()
