@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import sys
 
-INTERRUPTED = 130  # what typer makes of Ctrl-C
-"""Exit code of a command that Ctrl-C ends."""
+INTERRUPTED = 130
+"""Exit code of a command that Ctrl-C ends, as typer has it."""
 
 
 def main() -> None:
@@ -15,7 +15,8 @@ def main() -> None:
     Every error that the user can do something about is one line on standard error, with exit code 2.
 
     Raises:
-        SystemExit: with the exit code (see the help of each command), but where Ctrl-C stopped the loading of a library: the process ends at once.
+        SystemExit: with the exit code (see the help of each command). Where Ctrl-C stops the loading of a library, the process
+            ends at once instead.
     """
     try:
         from hybridmap.cli.app import run  # takes half a second, in which Ctrl-C may come as well
