@@ -125,7 +125,7 @@ def test_two_configurations_have_no_common_one_to_write(monkeypatch, capsys, ses
         (("calibrate", "SESSION", "--leg", "-1"), "--leg: found -1 m, expected 0.1 m or more"),
         (("calibrate", "SESSION", "--leg", "nan"), "--leg: found nan m, expected 0.1 m or more"),
         (("calibrate", "SESSION", "--reference", "none.tum"), "none.tum: no such trajectory file"),
-        (("calibrate", "SESSION", "--leg", "100"), "expected at least 400.0 m"),
+        (("calibrate", "SESSION", "--leg", "100"), "expected at least 8 pieces and 400.0 m"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(monkeypatch, capsys, session, words, says):
