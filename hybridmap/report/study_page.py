@@ -32,7 +32,7 @@ SHOWN_M = 5e-7
 _NAMED = 4  # places or back-ends that a remark names
 _SUMMED = (
     *("relation_m", "relation_loop_m", "chi2_own", "loop_recall", "false_kept", "wrong_loops", "own_lost", "iterations"),
-    *("loop_chi2_ratio", "found_m"),
+    *("loop_chi2_ratio", "found_m", "clock_offset_s"),
 )
 
 
