@@ -18,7 +18,7 @@ from hybridmap.graph.edges import Edge, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node, Novelty
 from hybridmap.metrics import StageClock
 from hybridmap.neural.path_integrator import PathIntegrator, Reanchoring
-from hybridmap.second_look import SecondLook
+from hybridmap.second_look import SecondLook, may_part
 from hybridmap.streams.base import Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
@@ -27,6 +27,7 @@ from hybridmap.streams.synchronise import Ready, Synchroniser
 from hybridmap.trajectory import NO_ANCHORS, stamp_ns_from_s
 from hybridmap.vision import create_front_end
 from hybridmap.vision.base import Belief, DenseFrontEnd, View
+from hybridmap.vision.second_opinion import LocalisingFrontEnd, SecondOpinion
 
 
 class Mapper:
@@ -67,6 +68,8 @@ class Mapper:
         self.vision = create_front_end(config.vision, rig or rig_of(config.sensors), config.seed, self.clock)
         self.backends = Ensemble(config.backends, self.clock, backends)
         self.second_look = SecondLook(self.map, self.book, self.backends, self.vision, config)
+        witness = self.vision.witness if isinstance(self.vision, LocalisingFrontEnd) and may_part(config) else None
+        self.second_opinion = SecondOpinion(witness) if witness is not None else None
         self.anchors = NO_ANCHORS
         self._synchroniser = Synchroniser(config.sensors.latency_s, config.sensors.odometry_delay_s or 0.0)
         self.calibration = OdometryWatch(config, self.integrator, self._synchroniser)
@@ -140,7 +143,7 @@ class Mapper:
         updates = [self.step(ready) for ready in self._synchroniser.flush()]
         self._position.pose_odom = self.cells.pose_odom_robot
         if len(self.map):
-            updates += self._retime() + self._propose_again()
+            updates += self._retime() + self._conclude()
             self._correct(final=True)
             updates += self._look_again()
             self._measure_between_nodes()
@@ -184,6 +187,22 @@ class Mapper:
         graph = self.map.pose_graph()
         (self.backends.finish if final else self.backends.update)(graph)
         self._position.correct({name: self.backends.poses(graph, name) for name in self.backends.names})
+
+    def _conclude(self) -> list[Update]:
+        """Let vision propose loops at the end of the drive; anew where the robot was carried to a place that looks alike."""
+        updates = self._propose_again()
+        while edges := self._carried():
+            self._correct()
+            updates.append(self._position.update("the robot was carried to a place that looks alike", None, edges))
+            updates += self._propose_again()
+        return updates
+
+    def _carried(self) -> list[int]:
+        """Numbers of the edges that change where the robot was carried to a place that looks alike."""
+        if self.second_opinion is None:
+            return []
+        with self.clock.stage("matching"):
+            return self.book.enter(self.second_opinion.ask(self.map.edges, self.belief()))
 
     def _propose_again(self) -> list[Update]:
         """Let vision decide what is pending and propose loops on the optimised map, until none is accepted."""

@@ -28,7 +28,7 @@ from hybridmap.backends.judging.rivals import rivals, spans
 from hybridmap.backends.objective import gate_of
 from hybridmap.config import Config
 from hybridmap.edge_book import EdgeBook
-from hybridmap.geometry import Array, RelativePose, between, log
+from hybridmap.geometry import Array, RelativePose, between
 from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, at_most
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.gaps import kidnappings
@@ -36,6 +36,7 @@ from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.metrics import StageClock
 from hybridmap.vision.base import Belief, FrontEnd, PartingFrontEnd, VerifyingFrontEnd
 from hybridmap.vision.relocalising import REATTACHED_M, REATTACHED_RAD
+from hybridmap.vision.second_opinion import odometry_sigmas
 
 Indices = NDArray[np.int64]
 
@@ -81,7 +82,7 @@ class SecondLook:
         self._vision = vision
         self._gate = gate_of(config.backends)
         self._enabled = config.edges.gate != "odometry"
-        self._may_part = config.vision.relocalising.enabled and config.edges.hanging == "chain"
+        self._may_part = may_part(config)
 
     def take(self, belief: Callable[[Sequence[int]], Belief], clock: StageClock) -> Iterator[tuple[str, list[int]]]:
         """Change edges of the map in steps; the graph must be solved (`Ensemble.finish`) before the first step and after each.
@@ -138,7 +139,7 @@ class SecondLook:
 
     def _asked(self, places: Indices) -> dict[int, tuple[Check, ...]]:
         """Checks of whether the robot drove to each of some nodes: registration against wheels, and what it saw."""
-        sigmas = _odometry_sigmas(self._map)
+        sigmas = odometry_sigmas(self._map.edges)
         odd = ODD_FACTOR * float(np.percentile(list(sigmas.values()), ODD)) if sigmas else 0.0
         out: dict[int, tuple[Check, ...]] = {}
         for place in places.tolist():
@@ -199,20 +200,10 @@ class SecondLook:
         return self._book.enter_again(proposals)
 
 
-def _odometry_sigmas(experiences: ExperienceMap) -> dict[int, float]:
-    """Node -> how its registration to the node before differs from the odometry, in standard deviations of the latter."""
-    odometry: dict[int, RelativePose] = {}
-    out: dict[int, float] = {}
-    for edge in experiences.edges:
-        if edge.relative is None or edge.source != edge.target - 1 or edge.spans_kidnapping:
-            continue
-        if edge.kind is EdgeKind.ODOMETRY:
-            odometry[edge.target] = edge.relative
-        elif edge.kind is EdgeKind.REGISTRATION and edge.target in odometry:
-            wheels = odometry[edge.target]
-            error = log(between(wheels.delta, edge.relative.delta))
-            out[edge.target] = float(np.sqrt(error @ np.linalg.solve(wheels.covariance, error)))
-    return out
+def may_part(config: Config) -> bool:
+    """Whether the chain may be taken apart at the end of the drive, where the robot was carried unnoticed."""
+    edges = config.edges
+    return config.vision.relocalising.enabled and edges.hanging == "chain" and edges.gate != "odometry"
 
 
 def _oddest(asked: Mapping[int, Sequence[Check]]) -> set[int]:

@@ -54,6 +54,15 @@ def test_a_short_carry_is_found_and_the_map_is_right(named, carried_m):
     assert any(not check.passed for edge in broken for check in edge.broken_by)
 
 
+@pytest.mark.parametrize("named", ["laser", pytest.param("rgbd", marks=pytest.mark.slow)])
+def test_a_carry_to_a_place_that_looks_alike_is_found_by_the_place_that_fits_better(named):
+    stream, mapper = drive(named, "lab", 20.0)  # the other end of the room, which looks the same turned round
+    stamps = np.array([node.stamp_ns for node in mapper.map.nodes])
+    down = int(np.searchsorted(stamps, stream.groundtruth.stamps_ns[known(stream.carry).last]))
+    assert [(one.before, one.after) for one in kidnappings(mapper.map)] == [(down - 1, down)]
+    assert error_m(stream, mapper) < 0.02
+
+
 @pytest.mark.slow
 def test_a_carry_that_a_registration_measures_needs_no_break():
     stream, mapper = drive("rgbd", "lab", 0.3)

@@ -25,6 +25,7 @@ from hybridmap.vision.laser.kidnapping import Continuity, GlobalLocalisation
 from hybridmap.vision.laser.revisits import Reviser
 from hybridmap.vision.laser.submap import Atlas, violation_of_step
 from hybridmap.vision.laser.tracking import Step, Tracker, contradicts
+from hybridmap.vision.laser.witness import ScanWitness
 from hybridmap.vision.profile import laser_profile
 from hybridmap.vision.templates import ViewTemplates
 
@@ -36,12 +37,13 @@ MOST_BETWEEN = 30
 
 
 class LaserFrontEnd:
-    """Loop closure by registration of laser submaps; implements `vision.base.DenseFrontEnd`, `VerifyingFrontEnd` and
-    `PartingFrontEnd`.
+    """Loop closure by registration of laser submaps; implements `vision.base.DenseFrontEnd`, `VerifyingFrontEnd`,
+    `PartingFrontEnd` and `second_opinion.LocalisingFrontEnd`.
 
     Attributes:
         atlas: the scans of the nodes, from which submaps are made.
         localisation: whether the robot is lost, and its global localisation.
+        witness: tells where on the whole map scans fit; None if the robot is taken never to be lost.
     """
 
     def __init__(self, config: VisionConfig, laser: Laser) -> None:
@@ -58,6 +60,11 @@ class LaserFrontEnd:
         self._continuity = Continuity(config, self.atlas, laser, self._tracker)
         self.localisation = GlobalLocalisation(
             config, self.atlas, self._prober, self._continuity, self._profiles, self._next_key
+        )
+        self.witness = (
+            ScanWitness(self.atlas, self._prober, self._reviser, self.localisation, self._continuity, self._next_key)
+            if config.relocalising.enabled
+            else None
         )
         self._dense_trajectory = DenseTrajectory(self.atlas, laser)
         self._scans: list[ObservedScan] = []

@@ -144,7 +144,7 @@ class Continuity:
         there = self._old_about(poses[node], near, poses)
         return violation_both_ways(here, there, IDENTITY, self._atlas.ranges, self._laser) > MAP_VIOLATION
 
-    def kidnapped_unnoticed(self, matches: Sequence[Edge], belief: Belief) -> int | None:
+    def kidnapped_unnoticed(self, matches: Sequence[Edge], belief: Belief, known: int | None = None) -> int | None:
         """Find the first node after a kidnapping that was not noticed; None if the odometry only drifted.
 
         Scans before that node fit the map better at the poses by dead reckoning; later scans, at those by the loops. If there
@@ -153,6 +153,7 @@ class Continuity:
         Args:
             matches: loops that localised the robot and contradict dead reckoning.
             belief: the map without these loops.
+            known: scans of nodes before this one are the old scans; None: those well before each node.
         """
         found, poses = min(s.source for s in matches), belief.poses_map_node
         there = placed_by(matches, found, poses)
@@ -161,8 +162,8 @@ class Continuity:
         total, best, kidnapped_to = 0.0, 0.0, None
         for node in range(found, 0, -1):
             pose = compose(there, between(poses[found], poses[node]))
-            by_chain = max(self._fit(node, poses[node], poses), checks.INLIERS_MIN)
-            total += self._fit(node, pose, poses) - by_chain
+            by_chain = max(self._fit(node, poses[node], poses, known), checks.INLIERS_MIN)
+            total += self._fit(node, pose, poses, known) - by_chain
             if total > best:
                 best, kidnapped_to = total, node
             if total < best - DECIDED:
@@ -182,14 +183,13 @@ class Continuity:
         """First node too new to be compared with a node: nearer than a probe and half a target."""
         return int(self._atlas.along(node, LENGTH_M + TARGET_HALF_M, 0.0)[0])
 
-    def _fit(self, node: int, pose: Array, poses: Array) -> float:
+    def _fit(self, node: int, pose: Array, poses: Array, known: int | None) -> float:
         """Share of a node's scan that fits the old scans about a pose (3,) on the map; 0 where there are none."""
-        old = poses[: self._old(node)]
+        old = poses[: self._old(node) if known is None else known]
         near = np.flatnonzero(np.hypot(*(old[:, :2] - pose[:2]).T) < OLD_M)
         if len(near) == 0:
             return 0.0
-        walls = self._old_about(pose, near, poses).cloud
-        field = build_field(walls)
+        field = build_field(self._old_about(pose, near, poses).cloud)
         prior = Prior(IDENTITY, LOOSE_M, LOOSE_RAD)
         return float(align(field, self._atlas.clouds[node], IDENTITY[None], prior).inliers[0])
 
@@ -355,7 +355,7 @@ class GlobalLocalisation:
         recent = self._atlas.along(node, LENGTH_M if broken else RECENT_M, 0.0)
         anchors = self._prober.anchors_before(self.since if broken else int(recent[0]))
         found = self._prober.probe_anywhere(self._atlas.submap(node, recent), self.most_similar(node, anchors))
-        settlement = self._relocaliser.settle([self._match(h) for h in found], belief)
+        settlement = self._relocaliser.settle(self.matches(found), belief)
         return self._found(settlement, belief) if settlement.accepted else settlement
 
     def _due(self, node: int) -> bool:
@@ -376,6 +376,10 @@ class GlobalLocalisation:
         following = np.searchsorted(np.array(anchors), ranked)
         most_similar = list(dict.fromkeys(following.tolist()))[:SUBMAPS]
         return [anchors[i] for i in sorted(most_similar)]
+
+    def matches(self, found: Sequence[Hypothesis]) -> list[GlobalMatch]:
+        """Hypotheses as matches; those that passed are pending, the others rejected."""
+        return [self._match(h) for h in found]
 
     def _match(self, h: Hypothesis) -> GlobalMatch:
         """A hypothesis as a match, its mismatch relative to that of consecutive scans."""

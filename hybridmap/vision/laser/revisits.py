@@ -68,6 +68,10 @@ class Reviser:
                 found.append(self.register(int(node), other, belief.poses_map_node))
         return found
 
+    def restart(self) -> None:
+        """Begin the rounds anew: the map is another one."""
+        self._rounds, self._done = 0, set()
+
     def _grid(self) -> NDArray[np.int64]:
         """Nodes about every so many metres of travel."""
         travel = np.asarray(self._atlas.travel_m)

@@ -95,7 +95,7 @@ class LoopCloser:
         self._noted, self._gate_of_newest, self._ranking = -1, Gate(0.0, 0.0, 0, 0), np.zeros((0, 3))
         self._map_covariance = np.diag([MAP_SIGMA_M, MAP_SIGMA_M, np.deg2rad(MAP_SIGMA_DEG)]) ** 2
         self._reverification = Reverification(keyframes, verifier, self._map_covariance)
-        self._rounds_left = config.closing.revisit_rounds
+        self._most_rounds = self._rounds_left = config.closing.revisit_rounds
 
     def add_node(self, profile: Profile) -> None:
         """Store the profile (bands, width) of the next node."""
@@ -188,6 +188,19 @@ class LoopCloser:
                     out += self._try_again(node, near, belief, near if placed else ())
         out += self._relocaliser.dismiss()
         return [*out, *self.support.give_up(before=len(self._keyframes))]
+
+    def anywhere(self, node: int, targets: Indices) -> list[Edge]:
+        """Compare a node with nodes `targets` (n,), ascending, at any pose; see `GlobalSearch.search`. Nothing is kept."""
+        return self._global_search.search(node, targets)
+
+    def restart(self, changed: Sequence[Edge]) -> None:
+        """Begin the rounds of `finish` anew, as the map was corrected by new and changed loops."""
+        self._rounds_left = self._most_rounds
+        for edge in changed:
+            if edge.kind is EdgeKind.LOOP and edge.status is Status.ACCEPTED:
+                self.support.join(edge.source, edge.target)
+            elif edge.kind is EdgeKind.LOOP:
+                self.support.replace(edge)
 
     def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
         """Measure outlier loops again; `belief` is the map without them.

@@ -33,13 +33,14 @@ from hybridmap.vision.rgbd.noise_level import NoiseLevel
 from hybridmap.vision.rgbd.pnp import Verifier
 from hybridmap.vision.rgbd.posture import Posture
 from hybridmap.vision.rgbd.tracking import Tracker, odometry_sigma
+from hybridmap.vision.rgbd.witness import FeatureWitness
 from hybridmap.vision.templates import ViewTemplates
 
 
 class RgbdFrontEnd:
     """The RGB-D front-end: profiles, depth registration of consecutive nodes, loops verified by features and depth.
 
-    Implements `vision.base.VerifyingFrontEnd` and `PartingFrontEnd`.
+    Implements `vision.base.VerifyingFrontEnd`, `PartingFrontEnd` and `second_opinion.LocalisingFrontEnd`.
 
     Args:
         config: settings of the visual side.
@@ -51,6 +52,7 @@ class RgbdFrontEnd:
         keyframes: of all nodes, by node number.
         verifier: measures the relative pose of two keyframes.
         closer: finds loops.
+        witness: tells where on the whole map features fit; None if they are not compared, or the robot never counts as lost.
     """
 
     def __init__(self, config: VisionConfig, camera: Camera, seed: int, clock: StageClock | None = None) -> None:
@@ -77,6 +79,8 @@ class RgbdFrontEnd:
             keys.__next__,
             clock or StageClock(),
         )
+        verified = config.relocalising.enabled and rgbd.verify != "none"
+        self.witness = FeatureWitness(self.closer, keys.__next__) if verified else None
         self._frame: RgbdFrame | None = None
         self._image: WorkingImage | None = None
 
