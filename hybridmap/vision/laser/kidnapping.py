@@ -378,16 +378,13 @@ class GlobalLocalisation:
         return [anchors[i] for i in sorted(most_similar)]
 
     def matches(self, found: Sequence[Hypothesis]) -> list[GlobalMatch]:
-        """Hypotheses as matches; those that passed are pending, the others rejected."""
-        return [self._match(h) for h in found]
-
-    def _match(self, h: Hypothesis) -> GlobalMatch:
-        """A hypothesis as a match, its mismatch relative to that of consecutive scans."""
-        edge = h.proposed(self._new_key(), Lack.WAITING)
-        if not h.passed:
-            return GlobalMatch(edge)
-        mismatch = max(1.0, MISFIT / (self._misfits / self._steps)) * h.misfit
-        return GlobalMatch(replace(edge, figures={**h.figures, "mismatch": mismatch}), mismatch)
+        """Hypotheses as matches, pending if they passed; the mismatch is relative to that of consecutive scans."""
+        out = []
+        for h in found:
+            edge = h.proposed(self._new_key(), Lack.WAITING)
+            mismatch = max(1.0, MISFIT / (self._misfits / self._steps)) * h.misfit if h.passed else 0.0
+            out.append(GlobalMatch(replace(edge, figures={**h.figures, "mismatch": mismatch}) if h.passed else edge, mismatch))
+        return out
 
     def _found(self, settlement: Settlement, belief: Belief) -> Settlement:
         """The robot is localised. Without a break of the chain, find the node of the kidnapping."""
