@@ -379,11 +379,11 @@ class GlobalLocalisation:
 
     def matches(self, found: Sequence[Hypothesis]) -> list[GlobalMatch]:
         """Hypotheses as matches, pending if they passed; the mismatch is relative to that of consecutive scans."""
-        out = []
+        scale, out = max(1.0, MISFIT / (self._misfits / self._steps)), []
         for h in found:
-            edge = h.proposed(self._new_key(), Lack.WAITING)
-            mismatch = max(1.0, MISFIT / (self._misfits / self._steps)) * h.misfit if h.passed else 0.0
-            out.append(GlobalMatch(replace(edge, figures={**h.figures, "mismatch": mismatch}) if h.passed else edge, mismatch))
+            mismatch = {"mismatch": scale * h.misfit} if h.passed else {}
+            edge = replace(h.proposed(self._new_key(), Lack.WAITING), figures={**h.figures, **mismatch})
+            out.append(GlobalMatch(edge, **mismatch))
         return out
 
     def _found(self, settlement: Settlement, belief: Belief) -> Settlement:
