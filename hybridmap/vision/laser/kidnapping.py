@@ -190,8 +190,7 @@ class Continuity:
         if len(near) == 0:
             return 0.0
         field = build_field(self._old_about(pose, near, poses).cloud)
-        prior = Prior(IDENTITY, LOOSE_M, LOOSE_RAD)
-        return float(align(field, self._atlas.clouds[node], IDENTITY[None], prior).inliers[0])
+        return float(align(field, self._atlas.clouds[node], IDENTITY[None], Prior(IDENTITY, LOOSE_M, LOOSE_RAD)).inliers[0])
 
     def _old_about(self, pose: Array, near: NDArray[np.int64], poses: Array) -> Submap:
         """The nearest of some nodes, by their poses on the map, merged in the frame of a pose (3,)."""
