@@ -228,6 +228,13 @@ def align(poses_a: ArrayLike, poses_b: ArrayLike) -> Array:
     return np.array([*(mean_a - rotated), yaw])
 
 
+def apart_m(poses_a: ArrayLike, poses_b: ArrayLike) -> float:
+    """RMS distance in m between positions (N, 2 or 3) and the same points (N, 2 or 3), after the best SE(2) alignment."""
+    a, b = np.asarray(poses_a, dtype=np.float64)[:, :2], np.asarray(poses_b, dtype=np.float64)[:, :2]
+    off = a - transform_points(align(a, b), b)
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+
+
 def loosest_direction(covariance: Array) -> tuple[float, float]:
     """Largest standard deviation (m) of the position of a planar pose, and its direction: an axis in [-pi/2, pi/2) rad from x.
 

@@ -11,7 +11,7 @@ from hybridmap import backends
 from hybridmap.backends.base import Solution, SolveStatus
 from hybridmap.backends.judging import strain
 from hybridmap.calibration.clock import ClockOffset, ClockState
-from hybridmap.geometry import RelativePose, between, compose
+from hybridmap.geometry import RelativePose, apart_m, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status, at_least
 from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.graph.pose_graph import PoseGraph
@@ -163,26 +163,60 @@ def test_odometry_that_pulls_hides_no_wrong_edge(clean, kind):
     assert "bent" in kinds_of(replace(graph, deltas=deltas))
 
 
-@pytest.mark.parametrize(("off_m", "speaks"), [(0.0, False), (3.0, True)])
-def test_a_loop_that_no_other_confirms_is_a_reason_if_it_moves_the_map(clean, off_m, speaks):
-    noisy = replace(clean, information=clean.information / 50.0)  # a file that overstates its noise: nearly all fits
-    poses = backends.create("gtsam-lm").solve(noisy).poses
-    delta = compose(between(poses[0], poses[150]), np.array([0.0, off_m, 0.0]))
-    graph = replace(
-        noisy,
-        sources=np.append(noisy.sources, 0),
-        targets=np.append(noisy.targets, 150),
-        deltas=np.vstack([noisy.deltas, delta]),
-        information=np.concatenate([noisy.information, noisy.information[noisy.is_loop][:1]]),
-        kinds=np.append(noisy.kinds, np.int8(EdgeKind.LOOP)),
-        edge_ids=np.append(noisy.edge_ids, noisy.edge_ids[-1] + 1),
+def overstated(graph: PoseGraph) -> PoseGraph:
+    """The graph of a file that overstates its noise: nearly all fits."""
+    return replace(graph, information=graph.information / 50.0)
+
+
+def with_loops(graph: PoseGraph, poses: np.ndarray, claims: list[tuple[int, int, float]]) -> PoseGraph:
+    """The graph with a loop for each (older node, newer node, m by which it wants the newer one moved along y of the map)."""
+    deltas = [between(poses[older], compose(np.array([0.0, off_m, 0.0]), poses[newer])) for older, newer, off_m in claims]
+    return replace(
+        graph,
+        sources=np.append(graph.sources, [older for older, *_ in claims]),
+        targets=np.append(graph.targets, [newer for _, newer, _ in claims]),
+        deltas=np.vstack([graph.deltas, deltas]),
+        information=np.concatenate([graph.information, [graph.information[graph.is_loop][0]] * len(claims)]),
+        kinds=np.append(graph.kinds, np.full(len(claims), EdgeKind.LOOP, dtype=np.int8)),
+        edge_ids=np.append(graph.edge_ids, graph.edge_ids[-1] + 1 + np.arange(len(claims))),
         entered=None,
     )
+
+
+@pytest.mark.parametrize(("off_m", "speaks"), [(0.0, False), (3.0, True)])
+def test_a_loop_that_no_other_confirms_is_a_reason_if_it_moves_the_map(clean, off_m, speaks):
+    noisy = overstated(clean)
+    graph = with_loops(noisy, backends.create("gtsam-lm").solve(noisy).poses, [(0, 150, off_m)])
     facts = Facts.of_graph(graph, backends.create("gtsam-lm").solve(graph))
     found = {reason.kind: reason for reason in reasons_of(facts)}
     assert ("loops alone" in found) is speaks
     assert not speaks or (found["loops alone"].node, found["loops alone"].until, found["loops alone"].count) == (0, 150, 1)
     assert "loops alone" not in {reason.kind for reason in reasons_of(replace(facts, driven=True))}
+
+
+@pytest.mark.parametrize(("other_m", "speaks"), [(3.0, False), (-3.0, True), (4.0, True)])
+def test_two_lone_loops_confirm_each_other_if_they_say_the_same(clean, other_m, speaks):
+    noisy = overstated(clean)
+    graph = with_loops(noisy, backends.create("gtsam-lm").solve(noisy).poses, [(0, 150, 3.0), (12, 162, other_m)])
+    assert ("loops alone" in kinds_of(graph)) is speaks
+
+
+@pytest.mark.parametrize(("backend", "speaks"), [("gtsam-huber", True), ("gtsam-gnc", False)])
+def test_rejected_loops_that_pull_the_map_are_a_reason(clean, backend, speaks):
+    false = inject(clean, 0.05, "random", np.random.default_rng(0))
+    assert ("pulled" in kinds_of(false, backend)) is speaks
+
+
+@pytest.mark.parametrize(("seed", "speaks"), [(0, True), (11, False)])
+def test_true_loops_that_a_kernel_rejects_are_a_reason_only_if_the_map_is_far_worse_without_them(seed, speaks):
+    drive = laps(SyntheticConfig(nodes=240, per_lap=60), seed)
+    assert drive.graph is not None
+    assert drive.reference is not None
+    solution = backends.create("gtsam-dcs").solve(drive.graph)
+    assert len(solution.report.rejected_edge_ids) > 40
+    assert (apart_m(drive.reference, solution.poses) > 0.2) is speaks
+    kinds = {reason.kind for reason in reasons_of(Facts.of_graph(drive.graph, solution))}
+    assert kinds == ({"loops refused"} if speaks else set())
 
 
 def test_a_back_end_that_gave_nothing_has_failed():

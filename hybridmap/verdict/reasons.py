@@ -67,6 +67,12 @@ KINDS = {
     "unsettled": Kind(
         Verdict.DOUBTFUL, "m", "the map lies {value:.2f} m from where its own edges want it (at most {limit:.1f} m)"
     ),
+    "pulled": Kind(
+        Verdict.DOUBTFUL,
+        "m",
+        "loops that the back-end rejects pull the map by {value:.2f} m (at most {limit:.2f} m), this node most: they are false,"
+        " or the others are",
+    ),
     "edges contradict": Kind(
         Verdict.DOUBTFUL,
         "1",

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from hybridmap.backends.base import ODOMETRY, SolveStatus
 from hybridmap.backends.judging.breaks import SAME_DEG, SAME_M
 from hybridmap.backends.judging.clusters import rejected_clusters
-from hybridmap.backends.judging.rivals import Rival, rivals, spans
-from hybridmap.backends.judging.strain import bend_of, largest_bend, lone_pull, optimum, recalibrated
+from hybridmap.backends.judging.rivals import Rival, admitted, rivals, spans
+from hybridmap.backends.judging.strain import bend_of, largest_bend, lone_pull, optimum, recalibrated, rejected_pull
 from hybridmap.backends.objective import SLACK, squared_norms, unit_variance
 from hybridmap.calibration.clock import MATTERS_S, TRANSPORT_S, ClockState
 from hybridmap.errors import BackendError
+from hybridmap.geometry import Array
 from hybridmap.graph.agreement import BOUND
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.paths import chain_of
@@ -26,6 +27,12 @@ from hybridmap.verdict.reasons import Reason, Verdict
 TOGETHER = 4
 """Fewest refused loops that speak against a map, as many as find a lost robot; one more for each doubling of the number of
 groups, since of many false groups some fall where the map has nothing against them."""
+WRONG_TIMES = 3.0
+"""A map is wrong that is so many times as far off as it could be: refused loops that would move it by less are no reason."""
+EXPECTED_MIN = 0.5
+"""Share of refused loops that a map must expect, given its covariance, where their only fault is that they are not in it."""
+PULLED_MAX_M = 0.05
+"""Most by which rejected loops may pull a map, RMS, m: the error below which studies call a map right in any case."""
 AS_MEANT = (SolveStatus.CONVERGED, SolveStatus.WAITING, SolveStatus.MAX_ITERATIONS)
 """Statuses of a solver that ended as it should. Whether it is at an optimum is asked apart, as a relaxation may end before."""
 BENT_MAX = 10.0
@@ -74,7 +81,8 @@ def refused_together(facts: Facts) -> Iterable[Reason]:
     contradict them.
 
     A group needs `TOGETHER` loops, or some more if there are many groups, and must move the map noticeably. The loops of a
-    drive were verified by views, so that all groups of them count together. Of those in a file any share may be false.
+    drive were verified by views, so that all groups of them count together. Of those in a file any share may be false. No
+    reason are loops that the map expects and that would hardly make it better: a kernel rejects such true ones.
     """
     graph, poses = facts.graph, facts.poses
     if poses is None:
@@ -84,11 +92,25 @@ def refused_together(facts: Facts) -> Iterable[Reason]:
     if facts.driven and groups:
         groups = (tuple(edge for group in groups for edge in group),)
     least = TOGETHER + math.log2(max(len(groups), 1))
+    strong = [
+        one for one in rivals(graph, poses, groups, facts.kept) if _moves(one) and one.spanning >= max(least, one.against)
+    ]
+    if not strong or _lack_nothing(facts, poses, strong):
+        return []
     return [
         facts.reason("loops refused", one.shift_m, SAME_M, node=one.node, count=one.spanning, against=one.against)
-        for one in rivals(graph, poses, groups, facts.kept)
-        if _moves(one) and one.spanning >= max(least, one.against)
+        for one in strong
     ]
+
+
+def _lack_nothing(facts: Facts, poses: Array, groups: Iterable[Rival]) -> bool:
+    """Whether a map expects most of the refused loops of groups, and is nearly as good as it would be with them."""
+    loops = [edge for group in groups for edge in group.edge_ids]
+    try:
+        one = admitted(facts.graph, poses, facts.in_map, loops)
+    except BackendError:  # the map is too loose to be compared
+        return False
+    return one.expected >= EXPECTED_MIN and one.shift_m <= WRONG_TIMES * one.error_m
 
 
 def _moves(rival: Rival) -> bool:
@@ -145,6 +167,19 @@ def _at_odds(facts: Facts, graph: PoseGraph) -> Iterator[Reason]:
     if variance > STRAIN_MAX:
         first, last = sorted((int(graph.sources[np.argmax(squared)]), int(graph.targets[np.argmax(squared)])))
         yield facts.reason("edges contradict", variance, STRAIN_MAX, node=first, until=last)
+
+
+def pulled(facts: Facts) -> Iterable[Reason]:
+    """A reason if loops that the back-end rejects keep weight enough to pull the map away from where the others want it.
+
+    There is none if the solution gives odometry or registrations little weight (`weak_edges`), which then hold nothing.
+    """
+    if facts.solution is None or facts.poses is None or facts.solution.report.weak_edges:
+        return []
+    pull = rejected_pull(facts.graph, facts.poses, facts.in_map, facts.solution.report.weights)
+    if pull is None or pull.shift_m <= PULLED_MAX_M:
+        return []
+    return [facts.reason("pulled", pull.shift_m, PULLED_MAX_M, node=pull.node)]
 
 
 def alone(facts: Facts) -> Iterable[Reason]:
@@ -261,6 +296,7 @@ RULES: tuple[Callable[[Facts], Iterable[Reason]], ...] = (
     refused_together,
     none_kept,
     strained,
+    pulled,
     alone,
     against_wheels,
     contradicted_odometry,

@@ -17,6 +17,7 @@ from hybridmap.graph.pose_graph import PoseGraph
 
 _AT_ONCE = 64  # pairs of nodes, whose columns are dense
 _EXPECTED = 0.999  # quantile of the innovation up to which a loop is expected
+_SAMPLE = 40  # nodes on which the error of a map is predicted: their covariances are dense
 
 
 def expected_loops(
@@ -82,6 +83,28 @@ class Covariances:
             ends = np.broadcast_to(np.eye(3), carried[part].shape)
             out[part] = self._projected(ends, targets[part], carried[part], sources[part])
         return out
+
+    def position_error(self) -> float:
+        """RMS error of the positions of the nodes, m, that the covariances predict after the best SE(2) alignment to the truth.
+
+        It is computed on up to `_SAMPLE` nodes, evenly spaced by their numbers.
+        """
+        size = len(self._poses) - 1
+        nodes = np.unique(np.linspace(1, size, min(size, _SAMPLE)).round().astype(np.int64))
+        count = len(nodes)
+        if count < 2:
+            return 0.0
+        cos, sin, rows, at = np.cos(self._poses[nodes, 2]), np.sin(self._poses[nodes, 2]), 3 * (nodes - 1), np.arange(count)
+        columns = np.zeros((3 * size, 2 * count))  # the map's x and y of each node, as its own x and y
+        columns[rows, at], columns[rows + 1, at] = cos, -sin
+        columns[rows, count + at], columns[rows + 1, count + at] = sin, cos
+        covariance = columns.T @ self.solve(columns)
+        x, y = (self._poses[nodes, :2] - self._poses[nodes, :2].mean(axis=0)).T
+        one, none = np.ones(count), np.zeros(count)
+        modes = np.stack([np.concatenate(mode) for mode in ((one, none), (none, one), (-y, x))], axis=1)
+        aligned = np.linalg.qr(modes)[0]  # motions of the whole map, which the alignment takes away
+        left = np.trace(covariance) - np.trace(aligned.T @ covariance @ aligned)
+        return float(np.sqrt(max(left, 0.0) / count))
 
     def solve(self, columns: Array) -> Array:
         """Inverse of the Hessian times `columns` (3N - 3, K); the rows are x, y, yaw of each node from node 1 on."""

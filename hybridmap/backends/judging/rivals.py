@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.backends.objective import residuals
-from hybridmap.geometry import Array
+from hybridmap.backends.gtsam.covariance import Covariances, expected_loops
+from hybridmap.backends.judging.strain import optimum
+from hybridmap.backends.objective import residuals, squared_norms, unit_variance
+from hybridmap.geometry import Array, apart_m
+from hybridmap.graph.agreement import BOUND
 from hybridmap.graph.pose_graph import PoseGraph
 
 
@@ -34,6 +38,46 @@ class Rival:
     against: int
     shift_m: float
     turn_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Admitted:
+    """A map with refused loops admitted to it, compared with the map without them.
+
+    Attributes:
+        shift_m: RMS distance between the two maps, over the nodes.
+        error_m: RMS error that the covariances of the edges predict for the map with these loops.
+        expected: share of the loops that the map without them expects, given its covariance.
+    """
+
+    shift_m: float
+    error_m: float
+    expected: float
+
+
+def admitted(graph: PoseGraph, poses: Array, in_map: NDArray[np.bool_], loops: Sequence[int]) -> Admitted:
+    """Compare a map with the one that has refused loops too.
+
+    Where a file overstates its noise, all covariances are scaled by the unit variance of the map with the loops.
+
+    Args:
+        graph: the edges of the map, and the loops.
+        poses: (N, 3) poses of the map, m and rad.
+        in_map: (E,) which edges the map was made of.
+        loops: edge ids of the refused loops, at least one.
+
+    Raises:
+        BackendError: the map is singular.
+    """
+    members = np.isin(graph.edge_ids, np.array(loops, dtype=np.int64))
+    both = graph.with_edges(in_map | members)
+    without = optimum(graph.with_edges(in_map), poses)
+    best = optimum(both, without)
+    variance = min(1.0, unit_variance(both, squared_norms(both, best)))
+    among = np.flatnonzero(np.isin(both.edge_ids, graph.edge_ids[members]))
+    expected = expected_loops(both, without, among, variance, BOUND)
+    error_m = math.sqrt(variance) * Covariances(both, best).position_error()
+    return Admitted(apart_m(best, without), error_m, float(np.mean(expected)))
 
 
 def rivals(graph: PoseGraph, poses: Array, groups: Sequence[Sequence[int]], kept: NDArray[np.bool_]) -> list[Rival]:

@@ -7,7 +7,7 @@ err alike on every metre. `recalibrated` tells it from the others.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,12 +17,12 @@ from hybridmap.backends.gtsam.batch import run
 from hybridmap.backends.gtsam.calibrated import calibrate, with_calibrated_odometry
 from hybridmap.backends.gtsam.covariance import expected_loops
 from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph
-from hybridmap.backends.judging.clusters import lone_loops
+from hybridmap.backends.judging.clusters import lone_loops, loops_of
 from hybridmap.backends.objective import residuals, squared_norms, unit_variance
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError, EvaluationError
-from hybridmap.geometry import Array, between, log
-from hybridmap.graph.agreement import BOUND
+from hybridmap.geometry import Array, apart_m, between, log
+from hybridmap.graph.agreement import BOUND, QUANTILE, Loops, Ring, ring
 from hybridmap.graph.paths import Chain, chain_of, own_odometry
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.odometry_model import NEUTRAL, Gains
@@ -96,6 +96,43 @@ def optimum(graph: PoseGraph, poses: Array) -> Array:
     return run("lm", factor_graph(graph, NoiseModels()), poses, _ITERATIONS, tolerance=_TOLERANCE).poses
 
 
+@dataclass(frozen=True, slots=True)
+class Pull:
+    """What the rejected loops of a map do to it.
+
+    Attributes:
+        node: the node that they move farthest.
+        shift_m: how far they move the map, RMS over the nodes.
+    """
+
+    node: int
+    shift_m: float
+
+
+def rejected_pull(graph: PoseGraph, poses: Array, in_map: NDArray[np.bool_], weights: Mapping[int, float]) -> Pull | None:
+    """How far the loops that a robust kernel rejects pull its map: to where its other edges alone would not have it.
+
+    A kernel gives a rejected loop a small weight, but a far loop pulls by its weight times its distance. Both maps are the
+    optimum of their weighted edges, so that a solver that ended early counts as no pull.
+
+    Args:
+        graph: edges of the map, and rejected loops.
+        poses: (N, 3) poses of the map, m and rad.
+        in_map: (E,) which edges are not rejected.
+        weights: edge id -> final weight; edges that are not in it count in full.
+
+    Returns:
+        None if no rejected loop has weight.
+    """
+    weight = np.array([weights.get(edge, float(kept)) for edge, kept in zip(graph.edge_ids.tolist(), in_map, strict=True)])
+    if not np.any(~in_map & (weight > 0.0)):
+        return None
+    heavy = replace(graph, information=graph.information * weight[:, None, None])
+    without = optimum(heavy.with_edges(in_map & (weight > 0.0)), poses)
+    pulled = optimum(heavy.with_edges(weight > 0.0), poses)
+    return Pull(int(np.argmax(np.hypot(*(pulled - without)[:, :2].T))), apart_m(pulled, without))
+
+
 def recalibrated(graph: PoseGraph, poses: Array, least: int) -> Iterator[PoseGraph | None]:
     """The graph with its odometry calibrated to a map, in several ways that must all straighten its chain.
 
@@ -158,10 +195,11 @@ class LonePull:
 
 
 def lone_pull(graph: PoseGraph, poses: Array) -> LonePull | None:
-    """Find the loops of a map without a neighbour whose innovation against the map without such loops is too large.
+    """Find the loops of a map that nothing confirms and whose innovation against the map without such loops is too large.
 
     True loops mostly come in runs. A single one that says what the others say is harmless; a single one that says something
-    else may be false, and where a file overstates its noise, it fits all the same.
+    else may be false, and where a file overstates its noise, it fits all the same. Two that say the same, better than chance
+    would have it, confirm each other.
 
     Args:
         graph: the edges of the map.
@@ -175,7 +213,9 @@ def lone_pull(graph: PoseGraph, poses: Array) -> LonePull | None:
         return None
     rest = graph.with_edges(np.setdiff1d(every, lone))
     bare = optimum(rest, poses)
-    odd = lone[~expected_loops(graph, bare, lone, unit_variance(rest, squared_norms(rest, bare)), BOUND)]
+    variance = unit_variance(rest, squared_norms(rest, bare))
+    odd = lone[~expected_loops(graph, bare, lone, variance, BOUND)]
+    odd = odd[~_confirmed(loops_of(graph, odd), chain_of(rest, bare), min(1.0, variance))]
     if not len(odd):
         return None
     without = optimum(graph.with_edges(np.setdiff1d(every, odd)), bare)
@@ -183,3 +223,31 @@ def lone_pull(graph: PoseGraph, poses: Array) -> LonePull | None:
     farthest = odd[int(np.argmax(np.hypot(*residuals(graph.with_edges(odd), bare)[:, :2].T)))]
     ends = sorted((int(graph.sources[farthest]), int(graph.targets[farthest])))
     return LonePull((ends[0], ends[1]), len(odd), shift_m)
+
+
+def _confirmed(loops: Loops, chain: Chain, variance: float) -> NDArray[np.bool_]:
+    """Which (L,) of loops that contradict a map agree with another of them so well that two false ones hardly would.
+
+    Of false loops as far off as these, the share (distance of the ring / distance of the loop) ** 3, in standard deviations,
+    closes a ring as well or better: the three errors of a ring lie anywhere in a ball of that radius. With many pairs some
+    agree by chance, so the share is multiplied by their number.
+
+    Args:
+        loops: the L loops.
+        chain: the poses of the map without them, with the covariance of its motion.
+        variance: factor on all covariances.
+    """
+    confirmed = np.zeros(len(loops.older), dtype=bool)
+    first, second = np.triu_indices(len(confirmed), 1)
+    if not len(first):
+        return confirmed
+    off = log(between(loops.relative.delta, between(chain.poses[loops.older], chain.poses[loops.newer])))
+    chance = np.zeros(len(first))
+    for one, other in ((first, second), (second, first)):
+        closing = ring(loops[one], loops[other], chain.ways)
+        far = Ring(off[other], closing.covariance).distance
+        chance = np.maximum(chance, (closing.distance / np.maximum(far, 1e-12)) ** 1.5)
+        chance[closing.distance > BOUND * variance] = np.inf
+    sure = len(chance) * chance <= 1.0 - QUANTILE
+    confirmed[first[sure]] = confirmed[second[sure]] = True
+    return confirmed
