@@ -1,7 +1,8 @@
 """After the drive: was the robot carried where nobody noticed, and do the loops that the solver rejected fit after all?
 
-A short carry passes for a bad registration, and a robust back-end then rejects every true loop that contradicts it. Here the
-chain is loosened at the places that betray themselves. Where that frees many loops and costs few, the robot was kidnapped.
+A short carry passes for a bad registration, and a robust back-end then rejects every true loop that contradicts it; a longer
+one puts true loops outside the gate of the front-end. Here the chain is loosened at the places that betray themselves. Where
+that frees many loops and costs few, the robot was kidnapped; single views tell before which node.
 """
 
 from __future__ import annotations
@@ -25,27 +26,27 @@ from hybridmap.backends.judging.breaks import (
 )
 from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.judging.rivals import rivals, spans
-from hybridmap.backends.objective import gate_of
+from hybridmap.backends.objective import gate_of, squared_norms
 from hybridmap.config import Config
 from hybridmap.edge_book import EdgeBook
 from hybridmap.geometry import Array, RelativePose, between
-from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, at_most
+from hybridmap.graph.contradictions import contradictions
+from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Status, at_most
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.gaps import kidnappings
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.metrics import StageClock
 from hybridmap.vision.base import Belief, FrontEnd, PartingFrontEnd, VerifyingFrontEnd
 from hybridmap.vision.relocalising import REATTACHED_M, REATTACHED_RAD
-from hybridmap.vision.second_opinion import odometry_sigmas
 
 Indices = NDArray[np.int64]
 
-ODD, ODD_FACTOR = 98.0, 1.5
-"""A registration differs oddly from the odometry beyond this percentile of the drive's own steps times this factor."""
 TRIED = 3
 """Places that are tried for each sign of a break: those where it is strongest."""
 EQUAL = 0.5
 """A place is as good as the best one if it gains this share: which one it was, the signs say."""
+DIVISIONS = 3
+"""How often views are asked again on the map that their last answer gives."""
 MOST_CARRIES = 4
 """Kidnappings that are looked for one after the other."""
 
@@ -59,7 +60,7 @@ class _Trial:
         signs: failed checks of whether the robot drove there from the node before.
         solved: (N, 3) poses with the loose chain, m and rad.
         found: what that changes.
-        blurred: numbers of the loops that are measured by views from both sides.
+        blurred: numbers of the loops, refused ones among them, that are measured by views from both sides.
     """
 
     place: int
@@ -67,6 +68,25 @@ class _Trial:
     solved: Array
     found: Freed
     blurred: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Disputed:
+    """The loops that are against the map.
+
+    Attributes:
+        graph: the edges of the map, and the loops that were refused only because the map did not expect them.
+        poses: (N, 3) the map, m and rad.
+        outliers: (L,) indices of the loops that do not fit it.
+        claimed: nodes to whose steps groups of them point.
+        asked: node -> checks of whether the robot drove there from the node before, for the steps that many of them span.
+    """
+
+    graph: PoseGraph
+    poses: Array
+    outliers: Indices
+    claimed: set[int]
+    asked: Mapping[int, tuple[Check, ...]]
 
 
 class SecondLook:
@@ -101,12 +121,14 @@ class SecondLook:
         for _ in range(MOST_CARRIES):
             if (solution := self._solution()) is None:
                 return
-            trial = self._break(self._map.pose_graph(), solution)
+            trial = self._break(solution)
             if trial is None:
                 break
             edges = self._parted(solution.poses, trial)
-            there = replace(belief(trial.blurred), poses_map_node=trial.solved)
-            edges += self._measured(trial.blurred, there, clock)
+            refused = {number for number in trial.found.loops.tolist() if self._map.edge(number).status is Status.REJECTED}
+            again = sorted(refused.union(trial.blurred))
+            there = replace(belief(again), poses_map_node=trial.solved)
+            edges += self._measured(again, there, clock)
             yield "a kidnapping was found on the final map", edges
         if (solution := self._solution()) is None:
             return
@@ -117,45 +139,84 @@ class SecondLook:
     def _solution(self) -> Solution | None:
         return self._backends.solutions.get(self._backends.primary)
 
-    def _break(self, graph: PoseGraph, solution: Solution) -> _Trial | None:
+    def _break(self, solution: Solution) -> _Trial | None:
         """Find the place whose loosening frees the most loops; None if there is none that shows signs of a break."""
-        ids, poses = solution.report.rejected_edge_ids, solution.poses
-        outliers = np.isin(graph.edge_ids, ids) & graph.is_loop
-        if not self._may_part or np.count_nonzero(outliers) < LEAST_LOOPS:
+        disputed = self._disputed(solution)
+        if disputed is None:
             return None
-        spanned = np.flatnonzero(spans(graph, outliers) >= LEAST_LOOPS)
-        asked = self._asked(spanned)
-        groups = rejected_clusters(graph, poses, ids, self._gate)
-        places = {one.node for one in rivals(graph, poses, groups, graph.is_loop & ~outliers) if one.spanning >= LEAST_LOOPS}
-        paying = []
-        for place in sorted((places | _oddest(asked)) - {one.after for one in kidnappings(self._map)}):
-            signs = tuple(check for check in asked.get(place, ()) if not check.passed)
-            trial = self._trial(graph, poses, np.flatnonzero(outliers), place, signs)
-            if trial is not None and trial.found.pays:
-                paying.append(trial)
+        known = {one.after for one in kidnappings(self._map)}
+        trials = [self._trial(disputed, place) for place in sorted((disputed.claimed | _oddest(disputed.asked)) - known)]
+        paying = [trial for trial in trials if trial is not None and trial.found.pays]
         most = max((trial.found.gain for trial in paying), default=0.0)
-        good = [trial for trial in paying if trial.signs and trial.found.gain >= EQUAL * most]
-        return max(good, key=lambda trial: (len(trial.signs), trial.found.gain), default=None)
+        good = [trial for trial in paying if trial.found.gain >= EQUAL * most]
+        best = max(good, key=lambda trial: (len(trial.signs), trial.found.gain), default=None)
+        return None if best is None else self._divided(disputed, best)
+
+    def _disputed(self, solution: Solution) -> _Disputed | None:
+        """What the loops say that are against the map; None if they are too few, or the map may not be parted."""
+        if not self._may_part:
+            return None
+        own, poses = self._map.pose_graph().edge_ids, solution.poses
+        graph = self._map.pose_graph(also=self._unexpected())
+        refused = ~np.isin(graph.edge_ids, own)
+        outliers = graph.is_loop & np.isin(graph.edge_ids, solution.report.rejected_edge_ids)
+        outliers |= refused & (squared_norms(graph, poses) > self._gate)
+        if np.count_nonzero(outliers) < LEAST_LOOPS:
+            return None
+        asked = self._asked(np.flatnonzero(spans(graph, outliers) >= LEAST_LOOPS))
+        groups = rejected_clusters(graph, poses, tuple(graph.edge_ids[outliers].tolist()), self._gate)
+        found = rivals(graph, poses, groups, graph.is_loop & ~refused & ~outliers)
+        claimed = {one.node for one in found if one.spanning >= LEAST_LOOPS}
+        return _Disputed(graph, poses, np.flatnonzero(outliers), claimed, asked)
+
+    def _unexpected(self) -> list[int]:
+        """Numbers of the loops that were refused only because the map did not expect them."""
+        if not isinstance(self._vision, PartingFrontEnd):
+            return []
+        return [
+            number
+            for number, edge in enumerate(self._map.edges)
+            if edge.kind is EdgeKind.LOOP
+            and edge.status is Status.REJECTED
+            and edge.relative is not None
+            and self._vision.unexpected(edge)
+        ]
+
+    def _divided(self, disputed: _Disputed, trial: _Trial) -> _Trial | None:
+        """The trial before the node at which single views divide the chain; None if neither they nor the step show a break."""
+        for _ in range(DIVISIONS):
+            divided = self._vision.divided(trial.place, trial.solved) if isinstance(self._vision, PartingFrontEnd) else None
+            if divided is None or divided.evidence.passed:
+                break
+            if divided.node == trial.place:
+                return replace(trial, signs=(*trial.signs, divided.evidence))
+            there = self._trial(disputed, divided.node)
+            if there is None or not there.found.pays:
+                break
+            trial = there
+        return trial if trial.signs else None
 
     def _asked(self, places: Indices) -> dict[int, tuple[Check, ...]]:
         """Checks of whether the robot drove to each of some nodes: registration against wheels, and what it saw."""
-        sigmas = odometry_sigmas(self._map.edges)
-        odd = ODD_FACTOR * float(np.percentile(list(sigmas.values()), ODD)) if sigmas else 0.0
-        out: dict[int, tuple[Check, ...]] = {}
+        steps, out = contradictions(self._map.edges), dict[int, tuple[Check, ...]]()
         for place in places.tolist():
             way = self._vision.way(place) if isinstance(self._vision, PartingFrontEnd) else ()
-            out[place] = (at_most("odometry_sigma", sigmas.get(place, 0.0), odd), *way)
+            out[place] = (at_most("odometry_sigma", steps.sigmas.get(place, 0.0), steps.odd), *way)
         return out
 
-    def _trial(self, graph: PoseGraph, poses: Array, rejected: Indices, place: int, signs: tuple[Check, ...]) -> _Trial | None:
+    def _trial(self, disputed: _Disputed, place: int) -> _Trial | None:
         """Solve the graph with its chain loosened before a node; None if the back-end cannot."""
+        graph, poses = disputed.graph, disputed.poses
         clear = self._clear(graph, place)
-        voting = rejected[leads_across(graph, place)[rejected]]
+        voting = disputed.outliers[leads_across(graph, place)[disputed.outliers]]
+        if not len(voting):
+            return None
         motion = wanted_motion(graph, poses, voting, place)
         solved = self._backends.trial(loosened(graph.with_edges(clear), poses, place, motion))
         if solved is None:
             return None
         found = freed(graph, poses, solved.poses, place, self._gate, clear)
+        signs = tuple(check for check in disputed.asked.get(place, ()) if not check.passed)
         return _Trial(place, signs, solved.poses, found, tuple(graph.edge_ids[~clear].tolist()))
 
     def _clear(self, graph: PoseGraph, place: int) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ import pytest
 
 from hybridmap.config import Config
 from hybridmap.geometry import RelativePose, align, between, compose, inverse
-from hybridmap.graph.edges import EdgeKind, Lack, Status
+from hybridmap.graph.edges import EdgeKind, Lack, Search, Status
 from hybridmap.graph.gaps import kidnappings
 from hybridmap.mapper import Mapper
 from hybridmap.simulation import SimulatedStream
@@ -36,14 +36,19 @@ def error_m(stream, mapper):
     return float(np.sqrt(np.mean(np.sum((compose(align(truth, poses), poses) - truth)[:, :2] ** 2, axis=1))))
 
 
+def put_down(stream, mapper):
+    """The first node after the robot was carried."""
+    stamps = np.array([node.stamp_ns for node in mapper.map.nodes])
+    return int(np.searchsorted(stamps, stream.groundtruth.stamps_ns[known(stream.carry).last]))
+
+
 @pytest.mark.parametrize(
     ("named", "carried_m"),
     [("laser", 0.75), ("laser", 1.0), ("laser", 2.0), pytest.param("rgbd", 1.0, marks=pytest.mark.slow)],
 )
 def test_a_short_carry_is_found_and_the_map_is_right(named, carried_m):
     stream, mapper = drive(named, "lab", carried_m)
-    stamps = np.array([node.stamp_ns for node in mapper.map.nodes])
-    down = int(np.searchsorted(stamps, stream.groundtruth.stamps_ns[known(stream.carry).last]))
+    down = put_down(stream, mapper)
     assert [(one.before, one.after) for one in kidnappings(mapper.map)] == [(down - 1, down)]
     assert error_m(stream, mapper) < 0.02
     motion = (EdgeKind.REGISTRATION, EdgeKind.ODOMETRY)  # where no registration of the step was accepted, the wheels' edge
@@ -57,10 +62,36 @@ def test_a_short_carry_is_found_and_the_map_is_right(named, carried_m):
 @pytest.mark.parametrize("named", ["laser", pytest.param("rgbd", marks=pytest.mark.slow)])
 def test_a_carry_to_a_place_that_looks_alike_is_found_by_the_place_that_fits_better(named):
     stream, mapper = drive(named, "lab", 20.0)  # the other end of the room, which looks the same turned round
-    stamps = np.array([node.stamp_ns for node in mapper.map.nodes])
-    down = int(np.searchsorted(stamps, stream.groundtruth.stamps_ns[known(stream.carry).last]))
+    down = put_down(stream, mapper)
     assert [(one.before, one.after) for one in kidnappings(mapper.map)] == [(down - 1, down)]
     assert error_m(stream, mapper) < 0.02
+
+
+def test_loops_outside_the_gate_tell_of_a_carry_of_some_metres():
+    stream, mapper = drive("laser", "lab", 3.0)
+    down = put_down(stream, mapper)
+    assert [one.after for one in kidnappings(mapper.map)] == [down]
+    assert error_m(stream, mapper) < 0.02
+    across = [e for e in mapper.map.edges if e.kind is EdgeKind.LOOP and e.target < down <= e.source]
+    assert sum(edge.status is Status.ACCEPTED for edge in across) >= 6
+    assert all(edge.search is Search.AGAIN for edge in across if edge.status is Status.ACCEPTED)
+
+
+@pytest.mark.slow
+def test_few_rejected_loops_count_together_with_those_that_the_front_end_refused():
+    stream, mapper = drive("laser", "lab", 1.5, seed=5)
+    assert [one.after for one in kidnappings(mapper.map)] == [put_down(stream, mapper)]
+    assert error_m(stream, mapper) < 0.02
+
+
+@pytest.mark.slow
+def test_where_no_step_is_odd_single_scans_tell_the_node():
+    stream, mapper = drive("laser", "office", 1.0, seed=3)
+    down = put_down(stream, mapper)
+    assert [one.after for one in kidnappings(mapper.map)] == [down]
+    [broken_by] = {e.broken_by for e in mapper.map.edges if e.source == down - 1 and e.target == down and e.broken_by}
+    assert [check.figure for check in broken_by] == ["fit_elsewhere"]
+    assert error_m(stream, mapper) < 0.03
 
 
 @pytest.mark.slow

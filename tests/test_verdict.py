@@ -74,6 +74,18 @@ def test_loops_that_lose_against_a_chain_that_was_broken_are_named_with_their_pl
     assert found.verdict is Verdict.DOUBTFUL
 
 
+def test_of_the_steps_that_loops_dispute_alike_the_one_that_contradicts_the_wheels_is_named():
+    truth = drive()
+    experiences = mapped(truth, slip=np.array([1.0, 0.0, 0.0]))
+    for number, edge in enumerate(experiences.edges):
+        if edge.kind is EdgeKind.ODOMETRY and edge.target == CARRIED + 5:
+            off = compose(between(truth[edge.source], truth[edge.target]), np.array([0.3, 0.0, 0.0]))
+            experiences.update_edge(number, replace(edge, relative=RelativePose(off, LOOSE)))
+    assert judged(experiences)["loops refused"].node == CARRIED + 5
+    facts = Facts.of_drive(experiences, backends.create("gtsam-gnc").solve(experiences), "gtsam-gnc")
+    assert [one.node for one in reasons_of(replace(facts, steps=None)) if one.kind == "loops refused"] == [CARRIED]
+
+
 def test_loops_that_left_the_graph_still_speak():
     truth = drive()
     experiences = mapped(truth, slip=np.array([1.0, 0.0, 0.0]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.mapping import NodesConfig
 from hybridmap.errors import GraphError
-from hybridmap.geometry import Array, between, compose
+from hybridmap.geometry import Array, RelativePose, between, compose
 from hybridmap.graph.edges import Edge, Status
 from hybridmap.graph.pose_graph import PoseGraph
 
@@ -128,16 +128,24 @@ class ExperienceMap:
         initial = self._initial.view()
         initial[:] = compose(initial[0], between(poses_odom[0], poses_odom))
 
-    def pose_graph(self) -> PoseGraph:
-        """The pose graph of all nodes and the accepted edges."""
-        kept = np.flatnonzero(self._accepted.view())
-        ends = self._ends.view()[kept]
+    def pose_graph(self, also: Sequence[int] = ()) -> PoseGraph:
+        """The pose graph of all nodes and the accepted edges, and those of the numbers `also`, whatever their status.
+
+        Raises:
+            GraphError: an edge of `also` was never measured.
+        """
+        chosen = self._accepted.view().copy()
+        chosen[list(also)] = True
+        kept = np.flatnonzero(chosen)
+        ends, information = self._ends.view()[kept], self._information.view()[kept]
+        for number in also:
+            information[np.searchsorted(kept, number)] = _invert(_measured(self._edges[number]).covariance)
         return PoseGraph(
             initial=self.initial,
             sources=ends[:, 0],
             targets=ends[:, 1],
             deltas=self._deltas.view()[kept],
-            information=self._information.view()[kept],
+            information=information,
             kinds=self._kinds.view()[kept],
             edge_ids=kept,
             entered=self._since.view()[kept],
@@ -181,6 +189,12 @@ class _Rows:
 def _require_measurement(edge: Edge) -> None:
     if edge.status is Status.ACCEPTED and edge.relative is None:
         raise GraphError(f"map: edge {edge.source} -> {edge.target} was accepted without a measurement (a relative pose)")
+
+
+def _measured(edge: Edge) -> RelativePose:
+    if edge.relative is None:
+        raise GraphError(f"map: edge {edge.source} -> {edge.target} was never measured (no relative pose)")
+    return edge.relative
 
 
 def _invert(covariance: Array) -> Array:

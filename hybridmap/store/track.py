@@ -46,7 +46,8 @@ def trajectory_of(track: Track, poses: Array) -> Trajectory:
     """Poses of the robot in `map` at every stamp of the track, given those of the nodes.
 
     Poses are known at nodes and anchors. Between two of these, the pose propagated from the first and that propagated back
-    from the second are blended along the SE(2) geodesic by the share of the way, so that the trajectory is continuous.
+    from the second are blended along the SE(2) geodesic by the share of the way, so that the trajectory is continuous. Where
+    they differ by more than this way, the odometry did not see the motion, and they are blended by the share of the time.
 
     Args:
         track: where the robot was, seen from nodes.
@@ -69,7 +70,11 @@ def trajectory_of(track: Track, poses: Array) -> Trajectory:
     start, end = knots[before], knots[after]
     forward = compose(known[before], between(track.poses_odom[start], track.poses_odom))
     backward = compose(known[after], between(track.poses_odom[end], track.poses_odom))
-    return Trajectory(track.stamps_ns, interpolate(forward, backward, _share_of_way(track, start, end)))
+    off = between(compose(known[before], between(track.poses_odom[start], track.poses_odom[end])), known[after])
+    way = _way(track)
+    unseen = _length(off) > way[end] - way[start]
+    share = np.where(unseen, _share_of_time(track, start, end), _share_of_way(track, start, end))
+    return Trajectory(track.stamps_ns, interpolate(forward, backward, share))
 
 
 def _anchored(track: Track, poses: Array, made: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array]:
@@ -91,11 +96,23 @@ def _neighbours(knots: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64]
 
 def _share_of_way(track: Track, start: NDArray[np.int64], end: NDArray[np.int64]) -> Array:
     """(T,) how much of the way from `start` to `end` is done: by travel and turn, by time where the robot stood still."""
-    step = np.diff(track.poses_odom, axis=0, prepend=track.poses_odom[:1])
-    length = np.hypot(step[:, 0], step[:, 1]) + _TURN_AS_TRAVEL_M * np.abs(wrap_angle(step[:, 2]))
-    way = np.cumsum(length)
+    way = _way(track)
     done, total = way - way[start], way[end] - way[start]
-    time_done, time_total = track.stamps_ns - track.stamps_ns[start], track.stamps_ns[end] - track.stamps_ns[start]
     moved = total > 1e-6
-    by_time = time_done / np.maximum(time_total, 1)
-    return np.asarray(np.where(end > start, np.where(moved, done / np.where(moved, total, 1.0), by_time), 0.0))
+    return np.asarray(np.where(moved, done / np.where(moved, total, 1.0), _share_of_time(track, start, end)))
+
+
+def _share_of_time(track: Track, start: NDArray[np.int64], end: NDArray[np.int64]) -> Array:
+    """(T,) how much of the time from `start` to `end` is over; 0 where they are one."""
+    stamps = track.stamps_ns
+    return np.asarray(np.where(end > start, (stamps - stamps[start]) / np.maximum(stamps[end] - stamps[start], 1), 0.0))
+
+
+def _way(track: Track) -> Array:
+    """(T,) length of the way up to each pose by the odometry, m."""
+    return np.asarray(np.cumsum(_length(np.diff(track.poses_odom, axis=0, prepend=track.poses_odom[:1]))))
+
+
+def _length(motion: Array) -> Array:
+    """(T,) length of motions (T, 3), m, with turns counted in."""
+    return np.asarray(np.hypot(motion[:, 0], motion[:, 1]) + _TURN_AS_TRAVEL_M * np.abs(wrap_angle(motion[:, 2])))

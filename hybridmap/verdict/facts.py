@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hybridmap.backends.base import Solution
 from hybridmap.calibration.clock import ClockOffset
 from hybridmap.geometry import Array
+from hybridmap.graph.contradictions import Contradictions, contradictions
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.gaps import free_lengths, kidnappings
@@ -39,6 +40,7 @@ class Facts:
         free_m: (N,) way to each node from the one before it on which odometry alone knows the motion, in one direction or in
             all, m; elsewhere 0 (see `graph.gaps.free_lengths`). None if unknown.
         breaks: nodes to which the robot seems not to have driven, without a kidnapping that was found there.
+        steps: how registrations and odometry of the same steps differ; None if unknown.
         lost_since: the first node since which the robot is lost; None if it is not.
         clock: the offset between the clocks of views and odometry; None if it was not looked for.
         driven: whether the loops were proposed by a front-end on a drive, and not read from a file.
@@ -55,6 +57,7 @@ class Facts:
     wheels: PoseGraph | None = None
     free_m: Array | None = None
     breaks: tuple[int, ...] = ()
+    steps: Contradictions | None = None
     lost_since: int | None = None
     clock: ClockOffset | None = None
     driven: bool = False
@@ -113,6 +116,7 @@ class Facts:
             driven=True,
             free_m=free_lengths(experiences),
             breaks=tuple(sorted({edge.target for edge in edges if edge.broken_by} - found)),
+            steps=contradictions(edges),
             failure=failure,
             lost_since=lost_since,
             clock=clock,

@@ -83,6 +83,9 @@ def refused_together(facts: Facts) -> Iterable[Reason]:
     A group needs `TOGETHER` loops, or some more if there are many groups, and must move the map noticeably. The loops of a
     drive were verified by views, so that all groups of them count together. Of those in a file any share may be false. No
     reason are loops that the map expects and that would hardly make it better: a kernel rejects such true ones.
+
+    The reason names the step that the group disputes most; on a drive, the one nearby whose registration differs oddly from
+    the odometry, if there is one.
     """
     graph, poses = facts.graph, facts.poses
     if poses is None:
@@ -98,7 +101,7 @@ def refused_together(facts: Facts) -> Iterable[Reason]:
     if not strong or _lack_nothing(facts, poses, strong):
         return []
     return [
-        facts.reason("loops refused", one.shift_m, SAME_M, node=one.node, count=one.spanning, against=one.against)
+        facts.reason("loops refused", one.shift_m, SAME_M, node=_suspect(facts, one), count=one.spanning, against=one.against)
         for one in strong
     ]
 
@@ -111,6 +114,12 @@ def _lack_nothing(facts: Facts, poses: Array, groups: Iterable[Rival]) -> bool:
     except BackendError:  # the map is too loose to be compared
         return False
     return one.expected >= EXPECTED_MIN and one.shift_m <= WRONG_TIMES * one.error_m
+
+
+def _suspect(facts: Facts, rival: Rival) -> int:
+    """The node whose step is the most likely one to be wrong, if a group of loops is right."""
+    odd = None if facts.steps is None else facts.steps.oddest(rival.first, rival.last)
+    return rival.node if odd is None else odd
 
 
 def _moves(rival: Rival) -> bool:

@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 
 from hybridmap.geometry import Array, RelativePose, between
 from hybridmap.graph.agreement import Indices
-from hybridmap.graph.edges import Check, Edge
+from hybridmap.graph.edges import Check, Edge, Lack
 from hybridmap.streams.base import Observation
 from hybridmap.trajectory import Anchors
+
+UNEXPECTED = (None, Lack.UNSUPPORTED, Lack.CONTRADICTED)
+"""What a loop may lack that is refused only because the map did not expect it: nothing, or others that agree with it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +141,19 @@ class VerifyingFrontEnd(FrontEnd, Protocol):
         """
 
 
+@dataclass(frozen=True, slots=True)
+class Division:
+    """Where single views divide the chain into the nodes before a kidnapping and those after it.
+
+    Attributes:
+        node: the first node after it.
+        evidence: how well the views tell; the check fails if they say that the robot was kidnapped there.
+    """
+
+    node: int
+    evidence: Check
+
+
 @runtime_checkable
 class PartingFrontEnd(FrontEnd, Protocol):
     """A front-end whose loops are measured by the views of several nodes, and which can be told of a kidnapping afterwards."""
@@ -148,6 +164,20 @@ class PartingFrontEnd(FrontEnd, Protocol):
 
     def way(self, node: int) -> tuple[Check, ...]:
         """Checks of whether what was seen allows that the robot drove to a node from the one before; empty if nothing tells."""
+
+    def unexpected(self, loop: Edge) -> bool:
+        """Whether a measured loop was refused for what the map expected and for no other reason: all that was seen fits."""
+
+    def divided(self, place: int, poses: Array) -> Division | None:
+        """Ask the views of single nodes on which side of a kidnapping they are.
+
+        Args:
+            place: a node near the kidnapping.
+            poses: (N, 3) of the nodes on a map whose chain is loose before `place`, m and rad.
+
+        Returns:
+            None if no view tells.
+        """
 
     def part(self, node: int) -> None:
         """Note that the robot was kidnapped between a node and the one before: from now on nothing joins views across it."""

@@ -13,7 +13,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.geometry import Array, RelativePose, between, log
+from hybridmap.geometry import Array, between
+from hybridmap.graph.contradictions import contradictions
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
 from hybridmap.vision.base import Belief, FrontEnd
 from hybridmap.vision.relocalising import SUPPORT, GlobalMatch, Relocaliser, Whereabouts, placed_by
@@ -97,7 +98,7 @@ class SecondOpinion:
         places = self._witness.carried_to(matches, since, belief) if matches else range(0)
         if not places:
             return []
-        sigmas = odometry_sigmas(edges)
+        sigmas = contradictions(edges).sigmas
         carried_to = max(places, key=lambda node: sigmas.get(node, 0.0))
         wrong = _contradicted(accepted, carried_to, belief.travel_m, self._witness.reach_m)
         corrected = [*wrong, *matches, *relocaliser.reattach(carried_to, matches, belief)]
@@ -158,22 +159,6 @@ def worse_since(loops: Sequence[Edge], registrations: Sequence[Edge], witness: W
         if worse > worst:
             worst, since = worse, node
     return since
-
-
-def odometry_sigmas(edges: Sequence[Edge]) -> dict[int, float]:
-    """Node -> how its registration to the node before differs from the odometry, in standard deviations of the latter."""
-    odometry: dict[int, RelativePose] = {}
-    out: dict[int, float] = {}
-    for edge in edges:
-        if edge.relative is None or edge.source != edge.target - 1 or edge.spans_kidnapping:
-            continue
-        if edge.kind is EdgeKind.ODOMETRY:
-            odometry[edge.target] = edge.relative
-        elif edge.kind is EdgeKind.REGISTRATION and edge.target in odometry:
-            wheels = odometry[edge.target]
-            error = log(between(wheels.delta, edge.relative.delta))
-            out[edge.target] = float(np.sqrt(error @ np.linalg.solve(wheels.covariance, error)))
-    return out
 
 
 SAME_M, SAME_RAD = 2.5, float(np.deg2rad(20.0))

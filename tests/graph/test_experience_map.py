@@ -102,3 +102,15 @@ def test_an_asymmetric_information_is_refused():
     graph.information[2, 0, 1] = 5.0
     with pytest.raises(GraphError, match="not symmetric"):
         graph.validate()
+
+
+def test_edges_that_are_not_accepted_can_be_added_to_the_graph():
+    chain = map_of(5)
+    refused = chain.add_edge(Edge(4, 0, EdgeKind.LOOP, Status.REJECTED, STEP))
+    unmeasured = chain.add_edge(Edge(4, 1, EdgeKind.LOOP, Status.REJECTED))
+    graph = chain.pose_graph(also=[refused])
+    assert graph.edge_ids.tolist() == [0, 1, 2, 3, refused]
+    assert np.allclose(graph.information[-1], 100 * np.eye(3))
+    assert chain.pose_graph().n_edges == 4
+    with pytest.raises(GraphError, match="4 -> 1 was never measured"):
+        chain.pose_graph(also=[unmeasured])

@@ -51,6 +51,18 @@ def test_standing_still_spreads_by_time():
     np.testing.assert_allclose(trajectory_of(track, poses).poses[:, 0], [0, 0.25, 0.5, 0.75, 1], atol=1e-12)
 
 
+def test_motion_that_the_odometry_did_not_see_is_spread_by_time():
+    stamps = np.arange(5) * SECOND
+    odometry = np.zeros((5, 3))
+    odometry[1:, 0] = 0.4
+    deltas = np.array([[0, 0, 0], [0.4, 0, 0], [0.4, 0, 0], [0.4, 0, 0], [0, 0, 0]])
+    track = Track(stamps, np.array([0, 0, 0, 0, 1]), deltas, odometry)
+    seen = trajectory_of(track, np.array([[0.0, 0, 0], [0.6, 0, 0]])).poses[:, 0]
+    np.testing.assert_allclose(seen, [0, 0.6, 0.6, 0.6, 0.6], atol=1e-12)
+    unseen = trajectory_of(track, np.array([[0.0, 0, 0], [2.4, 0, 0]])).poses[:, 0]
+    np.testing.assert_allclose(unseen, [0, 0.9, 1.4, 1.9, 2.4], atol=1e-12)
+
+
 def test_last_node_is_followed_by_odometry():
     stamps = np.arange(3) * SECOND
     deltas = np.array([[0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]])

@@ -27,6 +27,7 @@ class Rival:
     Attributes:
         edge_ids: the loops of the group.
         node: the step leads to this node from the one before it.
+        first, last: the steps about that one, up to these nodes, that more loops of the group than of the map span.
         spanning: loops of the group that span the step.
         against: loops of the map that span it too: they say that it is right.
         shift_m, turn_rad: how far the loops of the group would move the map, median.
@@ -34,6 +35,8 @@ class Rival:
 
     edge_ids: tuple[int, ...]
     node: int
+    first: int
+    last: int
     spanning: int
     against: int
     shift_m: float
@@ -96,8 +99,18 @@ def rivals(graph: PoseGraph, poses: Array, groups: Sequence[Sequence[int]], kept
         node = int(np.argmax(spanning / (against + 1)))
         apart = np.abs(residuals(graph.with_edges(members), poses))
         shift_m, turn_rad = float(np.median(np.hypot(apart[:, 0], apart[:, 1]))), float(np.median(apart[:, 2]))
-        found.append(Rival(tuple(group), node, int(spanning[node]), int(against[node]), shift_m, turn_rad))
+        first, last = _about(node, spanning > against)
+        found.append(Rival(tuple(group), node, first, last, int(spanning[node]), int(against[node]), shift_m, turn_rad))
     return found
+
+
+def _about(node: int, disputed: NDArray[np.bool_]) -> tuple[int, int]:
+    """First and last node of the run about a node on which a mask (N,) is true; the node itself if it is false there."""
+    others = np.flatnonzero(~disputed)
+    after, before = others[others > node], others[others < node]
+    if not disputed[node]:
+        return node, node
+    return int(before.max(initial=-1)) + 1, int(after.min(initial=len(disputed))) - 1
 
 
 def spans(graph: PoseGraph, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:

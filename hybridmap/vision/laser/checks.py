@@ -36,6 +36,8 @@ PIECES_MIN = 10
 """Fewest things in sight of which a share has a standard error worth the name: two or three trees tell nothing."""
 RIVAL = 0.75
 """The best rival cluster must score less than this share of the cluster."""
+FIT_ELSEWHERE_MAX = 1.0
+"""Scans that fit elsewhere better by more than this, summed, were taken there: as much as one that fits there and not here."""
 OFF_MAX_M, OFF_MAX_DEG = 1.0, 10.0
 """Largest distance of a re-proposed registration from the optimised map, m and degrees."""
 
@@ -139,6 +141,19 @@ def loosened(checks: Sequence[Check], pieces: int) -> tuple[Check, ...]:
         pieces: n, the number of separate things that were seen; with fewer than `PIECES_MIN` no limit moves.
     """
     return tuple(_by_a_hair(check, pieces) if check.figure in ("near", "fit", "violation") else check for check in checks)
+
+
+def unexpected(failed: Sequence[Check]) -> bool:
+    """Whether all failed checks are of the gate: the scans fit, but not where the map expected it."""
+    return all(check.figure in ("off_m", "off_deg") for check in failed)
+
+
+def of_division(better: float) -> tuple[Check, ...]:
+    """Check whether the scans after a node fit the map where the chain has them.
+
+    `better` is the measured share of a scan by which they fit better where loops put the robot, summed over these scans.
+    """
+    return (at_most("fit_elsewhere", better, FIT_ELSEWHERE_MAX),)
 
 
 def _by_a_hair(check: Check, pieces: int) -> Check:

@@ -60,13 +60,18 @@ class DenseTrajectory:
         """
         nodes = np.array([s.node for s in scans], dtype=np.int64)
         motions = np.array([s.motion for s in scans]).reshape(-1, 3)
-        expected = _expected(nodes, motions, steps.reshape(-1, 3), poses)
-        found, good = expected.copy(), np.zeros(len(scans), dtype=bool)
+        expected, jumped = _expected(nodes, motions, steps.reshape(-1, 3), poses)
+        found, fits = expected[0].copy(), np.zeros(len(scans))
         for first, stop in self._blocks():
             block = np.flatnonzero((nodes >= first) & (nodes < stop))
-            if len(block):
-                clouds = clouds_of_scans([scans[i].scan.ranges_m for i in block.tolist()], self._laser, self._atlas.scene.scale)
-                found[block], good[block] = self._register(clouds, expected[block], poses[first:stop], poses)
+            for start in expected:
+                if len(block):
+                    clouds = self._clouds([scans[i].scan for i in block.tolist()])
+                    pose, fit = self._register(clouds, start[block], poses[first:stop], poses)
+                    better = fit > fits[block]
+                    found[block[better]], fits[block[better]] = pose[better], fit[better]
+                block = block[jumped[block]]
+        good = fits >= INLIERS_MIN
         for piece in self._atlas.pieces[1:]:
             good[(nodes == piece.start - 1) & (_way(motions) > 0.0)] = False
         stamps = np.array([s.scan.stamp_ns for s in scans], dtype=np.int64)
@@ -77,8 +82,11 @@ class DenseTrajectory:
         size = BLOCK_NODES
         return [(first, min(first + size, p.stop)) for p in self._atlas.pieces for first in range(p.start, p.stop, size)]
 
-    def _register(self, clouds: list[Cloud], expected: Array, block: Array, poses: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Poses (K, 3) of a block's scans, and which of them are accepted."""
+    def _clouds(self, scans: list[LaserScan]) -> list[Cloud]:
+        return clouds_of_scans([scan.ranges_m for scan in scans], self._laser, self._atlas.scene.scale)
+
+    def _register(self, clouds: list[Cloud], expected: Array, block: Array, poses: Array) -> tuple[Array, Array]:
+        """Poses (K, 3) of a block's scans, and the share (K,) of each that fits; 0 where it is too far from `expected`."""
         distance = np.hypot(*(poses[:, :2] - block[:, :2].mean(axis=0)).T)
         near = np.argsort(distance, kind="stable")[:MAP_NODES]
         near = np.union1d(near[distance[near] < RADIUS_M], np.argsort(distance, kind="stable")[:1])
@@ -90,7 +98,7 @@ class DenseTrajectory:
         inliers = alignment.inliers * stack.points.shape[1] / np.maximum(counts, 1)
         off = between(expected, alignment.poses)
         close = (np.hypot(off[:, 0], off[:, 1]) < OFF_MAX_M) & (np.abs(off[:, 2]) < np.deg2rad(OFF_MAX_DEG))
-        return alignment.poses, np.asarray(close & (inliers >= INLIERS_MIN))
+        return alignment.poses, np.where(close, inliers, 0.0)
 
 
 def _stacked(clouds: list[Cloud]) -> tuple[Cloud, NDArray[np.int64]]:
@@ -103,17 +111,25 @@ def _stacked(clouds: list[Cloud]) -> tuple[Cloud, NDArray[np.int64]]:
     return Cloud(points, normals), counts
 
 
-def _expected(nodes: NDArray[np.int64], motions: Array, steps: Array, poses: Array) -> Array:
-    """Poses (S, 3) of the scans on the map by odometry, from the node before blended with that to the node after."""
+def _expected(nodes: NDArray[np.int64], motions: Array, steps: Array, poses: Array) -> tuple[list[Array], NDArray[np.bool_]]:
+    """Poses on the map by odometry, (S, 3) each, from which scans are registered, and where (S,) the latter two are wanted.
+
+    The first are propagated from the node before, and blended with those propagated back from the node after. Where these two
+    differ by more than a scan may be off, the robot slid or was carried at one moment, and each of them is right on one side
+    of it.
+    """
     forward = compose(poses[nodes], motions)
+    blended, backward, jumped = forward.copy(), forward.copy(), np.zeros(len(nodes), dtype=bool)
     inside = np.flatnonzero(nodes < len(poses) - 1)
     if len(inside) == 0:
-        return forward
+        return [blended], jumped
     node, motion = nodes[inside], motions[inside]
-    backward = compose(poses[node + 1], between(steps[node], motion))
+    backward[inside] = compose(poses[node + 1], between(steps[node], motion))
     share = (_way(motion) / np.maximum(_way(steps[node]), 1e-6)).clip(0.0, 1.0)
-    forward[inside] = interpolate(forward[inside], backward, share)
-    return forward
+    blended[inside] = interpolate(forward[inside], backward[inside], share)
+    off = between(forward, backward)
+    jumped = np.hypot(off[:, 0], off[:, 1]) > OFF_MAX_M
+    return [blended, forward, backward], np.asarray(jumped)
 
 
 def _way(motion: Array) -> Array:

@@ -15,11 +15,12 @@ from hybridmap.metrics import StageClock
 from hybridmap.streams.base import Observation, Rig
 from hybridmap.streams.laser import LASER, Laser, LaserScan
 from hybridmap.trajectory import Anchors
-from hybridmap.vision.base import Belief, View
+from hybridmap.vision.base import UNEXPECTED, Belief, Division, View
 from hybridmap.vision.laser import checks
 from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan
 from hybridmap.vision.laser.commitment import Commitment
 from hybridmap.vision.laser.dense_trajectory import DenseTrajectory, ObservedScan
+from hybridmap.vision.laser.division import divide
 from hybridmap.vision.laser.hypotheses import LENGTH_M, Prober
 from hybridmap.vision.laser.kidnapping import Continuity, GlobalLocalisation
 from hybridmap.vision.laser.revisits import Reviser
@@ -175,6 +176,14 @@ class LaserFrontEnd:
         """Check whether the scan of a node (not the first) and that of the node before look through each other's walls."""
         motion = between(self.atlas.chain[node - 1], self.atlas.chain[node])
         return checks.of_way(None, violation_of_step(node, motion, self.atlas, self._laser))
+
+    def unexpected(self, loop: Edge) -> bool:
+        """Whether a loop was refused only because of the gate, or as too few others agreed with it, or others did not."""
+        return loop.lack in UNEXPECTED and checks.unexpected(loop.failed)
+
+    def divided(self, place: int, poses: Array) -> Division | None:
+        """Ask single scans on which side of a kidnapping they were taken; see `division.divide`."""
+        return divide(self.atlas, place, poses)
 
     def part(self, node: int) -> None:
         """Begin a new piece of the atlas at a node: the robot was kidnapped before it."""

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose
@@ -15,7 +14,7 @@ from hybridmap.streams.laser import Laser, LaserScan
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import nodes_within
 from hybridmap.vision.laser import checks
-from hybridmap.vision.laser.cloud import build_field, cloud_of_scan, merged_at
+from hybridmap.vision.laser.cloud import build_field, cloud_of_scan
 from hybridmap.vision.laser.hypotheses import (
     GATE_DEG,
     GATE_INFLATION,
@@ -27,7 +26,7 @@ from hybridmap.vision.laser.hypotheses import (
     Prober,
 )
 from hybridmap.vision.laser.scan_matching import Prior, align
-from hybridmap.vision.laser.submap import Atlas, Submap, alone, violation_both_ways, violation_of_step
+from hybridmap.vision.laser.submap import Atlas, alone, violation_both_ways, violation_of_step
 from hybridmap.vision.laser.tracking import CONTRADICTION_DEG, CONTRADICTION_M, Step, Tracker
 from hybridmap.vision.profile import Profile
 from hybridmap.vision.relocalising import ChainState, GlobalMatch, Relocaliser, Settlement, Whereabouts, placed_by
@@ -141,7 +140,7 @@ class Continuity:
         if len(near) == 0 or np.trace(belief.covariance_from(node)[near, :2, :2], axis1=1, axis2=2).min() > SURE_M**2:
             return False
         here = self._atlas.submap(node, self._atlas.along(node, RECENT_M, 0.0))
-        there = self._old_about(poses[node], near, poses)
+        there = self._atlas.about(poses[node], near, poses, OLD_NODES)
         return violation_both_ways(here, there, IDENTITY, self._atlas.ranges, self._laser) > MAP_VIOLATION
 
     def kidnapped_unnoticed(self, matches: Sequence[Edge], belief: Belief, known: int | None = None) -> int | None:
@@ -189,16 +188,8 @@ class Continuity:
         near = np.flatnonzero(np.hypot(*(old[:, :2] - pose[:2]).T) < OLD_M)
         if len(near) == 0:
             return 0.0
-        field = build_field(self._old_about(pose, near, poses).cloud)
+        field = build_field(self._atlas.about(pose, near, poses, OLD_NODES).cloud)
         return float(align(field, self._atlas.clouds[node], IDENTITY[None], Prior(IDENTITY, LOOSE_M, LOOSE_RAD)).inliers[0])
-
-    def _old_about(self, pose: Array, near: NDArray[np.int64], poses: Array) -> Submap:
-        """The nearest of some nodes, by their poses on the map, merged in the frame of a pose (3,)."""
-        away = np.hypot(*(poses[near, :2] - pose[:2]).T)
-        nearest = np.sort(near[np.argsort(away, kind="stable")[:OLD_NODES]])
-        there = between(pose, poses[nearest])
-        cloud = merged_at([self._atlas.clouds[i] for i in nearest.tolist()], there)
-        return Submap(int(nearest[0]), nearest, there, cloud)
 
     def _follow(self, node: int, odometry: Array, on_the_way: Sequence[tuple[Array, LaserScan]]) -> bool:
         """Whether each scan from the last node to the newest fits the one before it."""

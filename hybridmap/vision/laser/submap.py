@@ -174,6 +174,16 @@ class Atlas:
         nodes = self.along(anchor, half_m, half_m)
         return self._submaps.get(_span(anchor, nodes), lambda: self.submap(anchor, nodes))
 
+    def about(self, pose: Array, nodes: NDArray[np.int64], poses: Array, most: int) -> Submap:
+        """The nearest of some nodes (n,), at most so many, merged in the frame of a pose (3,) on the map; not cached.
+
+        `poses` (N, 3) are those of all nodes on that map, m and rad.
+        """
+        away = np.hypot(*(poses[nodes, :2] - pose[:2]).T)
+        nearest = np.sort(nodes[np.argsort(away, kind="stable")[:most]])
+        there = between(pose, poses[nearest])
+        return Submap(int(nearest[0]), nearest, there, merged_at([self.clouds[i] for i in nearest.tolist()], there))
+
     def scoring_field(self, target: Submap, kind: Field) -> LikelihoodField:
         """A likelihood field of a submap, on which poses up to `SEARCH_M` from its anchor can be scored; cached.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from hybridmap.graph.edges import Check, at_least, at_most
 
 _MIN_INLIERS = "vision.rgbd.pnp.min_inliers"
@@ -136,3 +138,8 @@ def of_map(map_sigma: float) -> tuple[Check, ...]:
 def of_support(supporting: int) -> tuple[Check, ...]:
     """Check that at least one other measured loop nearby agrees with a loop; `supporting` is their number."""
     return (at_least("supporting", supporting, 1),)
+
+
+def unexpected(failed: Sequence[Check]) -> bool:
+    """Whether all failed checks are of what the map and other loops say: the views fit, but not where the map expected it."""
+    return all(check.figure in ("map_sigma", "supporting") for check in failed)

@@ -16,9 +16,9 @@ from hybridmap.graph.edges import Check, Edge
 from hybridmap.metrics import StageClock
 from hybridmap.streams.base import Observation, Rig
 from hybridmap.streams.rgbd import RGBD, Camera, RgbdFrame
-from hybridmap.vision.base import Belief, View
+from hybridmap.vision.base import UNEXPECTED, Belief, Division, View
 from hybridmap.vision.profile import image_profile
-from hybridmap.vision.rgbd.checks import CONTRADICTION_SIGMA
+from hybridmap.vision.rgbd import checks
 from hybridmap.vision.rgbd.closing import LoopCloser
 from hybridmap.vision.rgbd.depth_grid import cell_px, make_grid, place
 from hybridmap.vision.rgbd.features import detect
@@ -142,7 +142,7 @@ class RgbdFrontEnd:
 
     def overrules(self, registration: RelativePose, odometry: RelativePose) -> bool:
         """Whether a good registration says that the odometry is wrong; see `Overruling.overrules`."""
-        return odometry_sigma(registration, odometry) > CONTRADICTION_SIGMA
+        return odometry_sigma(registration, odometry) > checks.CONTRADICTION_SIGMA
 
     @property
     def reach_m(self) -> float:
@@ -152,6 +152,13 @@ class RgbdFrontEnd:
     def way(self, node: int) -> tuple[Check, ...]:
         """Check that the depth of a node fits that of the one before, not much worse than nearly always; see `Tracker.way`."""
         return self._tracker.way(node)
+
+    def unexpected(self, loop: Edge) -> bool:
+        """Whether a loop was refused only because it is far from where the map has it, or as no other one agreed with it."""
+        return loop.lack in UNEXPECTED and checks.unexpected(loop.failed)
+
+    def divided(self, place: int, poses: Array) -> Division | None:
+        """None: each loop is measured by two frames, so that loops tell the node of a kidnapping by themselves."""
 
     def part(self, node: int) -> None:
         """Nothing to do: no measurement joins frames of more than two nodes."""

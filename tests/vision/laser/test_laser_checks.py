@@ -17,6 +17,7 @@ RULES: dict[str, tuple[Callable[..., tuple[Check, ...]], dict[str, float]]] = {
     "gate": (lambda **f: checks.of_gate(radius_m=3.0, heading_deg=20.0, **f), {"off_m": 3.0, "off_deg": 20.0}),
     "place": (checks.of_place, {"loosest_m": checks.LOOSEST_MAX_M, "ambiguity": checks.AMBIGUITY_MAX}),
     "free space": (checks.of_free_space, {"violation": checks.VIOLATION_MAX}),
+    "division": (lambda fit_elsewhere: checks.of_division(fit_elsewhere), {"fit_elsewhere": checks.FIT_ELSEWHERE_MAX}),
     "cluster": (
         lambda **f: checks.of_cluster(least=3, least_m=2.0, **f),
         {"probes": 3, "span_m": 2.0, "rival": checks.RIVAL},
@@ -55,3 +56,9 @@ def test_a_limit_of_a_share_moves_by_the_standard_error_of_so_few_things():
     assert [check.figure for check in many if not check.passed] == ["near", "fit", "violation"]
     assert [check.limit for check in few[3:]] == [checks.LOOSEST_MAX_M, checks.AMBIGUITY_MAX]
     assert checks.loosened(asked, 0) == checks.loosened(asked, checks.PIECES_MIN - 1) == asked
+
+
+def test_a_loop_is_unexpected_if_the_gate_alone_refuses_it():
+    gate, place = checks.of_gate(4.0, 1.0, 3.0, 20.0), checks.of_place(0.05, 2.0)
+    assert checks.unexpected([check for check in gate if not check.passed])
+    assert not checks.unexpected([check for check in (*gate, *place) if not check.passed])

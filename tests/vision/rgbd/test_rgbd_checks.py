@@ -84,3 +84,9 @@ def test_a_sure_registration_may_contradict_the_odometry():
     assert [check.figure for check in sure] == ["depth_inliers"]
     for inliers, slack_m in ((checks.SURE_INLIERS, 0.01), (0.9, checks.SURE_SLACK_M)):
         assert not checks.of_step(inliers, slack_m, 99.0)[-1].passed
+
+
+def test_a_loop_is_unexpected_if_map_and_other_loops_alone_refuse_it():
+    far, alone, misfit = checks.of_map(9.0), checks.of_support(0), checks.of_depth(0.1)
+    assert checks.unexpected((*far, *alone))
+    assert not checks.unexpected((*far, *misfit))
