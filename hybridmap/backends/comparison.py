@@ -114,13 +114,7 @@ def compare(
     rows = []
     for number, (backend, way) in enumerate(plan):
         step = partial(_count, progress, sum(steps[:number]), sum(steps))
-        row = Row(
-            backend.name, None, way=way, title=backend.name if len(ways) == 1 or way is Way.BATCH else f"{backend.name}/{way}"
-        )
-        try:
-            row = _driven(row, backend, graph, step) if way is Way.INCREMENTAL else replace(row, solution=backend.solve(graph))
-        except BackendError as error:
-            row = replace(row, failure=str(error))
+        row = _solved(graph, backend, way, alone=len(ways) == 1, report=step)
         if row.solution is not None and certified:
             row = replace(row, certificate=certify(graph, row.solution.poses, row.solution.report.rejected_edge_ids))
         if row.solution is not None and traced and way is Way.BATCH:
@@ -163,6 +157,16 @@ def _limited(config: BackendsConfig, most: int) -> BackendsConfig:
 def _count(progress: Progress | None, before: int, total: int, done: int) -> None:
     if progress is not None:
         progress(before + done, total)
+
+
+def _solved(graph: PoseGraph, backend: Backend, way: Way, *, alone: bool, report: Callable[[int], None]) -> Row:
+    """The row of one back-end in one way, without a proof; `alone`: each back-end has this one row."""
+    title = backend.name if alone or way is Way.BATCH else f"{backend.name}/{way}"
+    row = Row(backend.name, None, way=way, title=title)
+    try:
+        return _driven(row, backend, graph, report) if way is Way.INCREMENTAL else replace(row, solution=backend.solve(graph))
+    except BackendError as error:
+        return replace(row, failure=str(error))
 
 
 def _driven(row: Row, backend: Backend, graph: PoseGraph, report: Callable[[int], None]) -> Row:

@@ -98,16 +98,12 @@ def compare(
         cells = _table(rows, reasons, judged.metrics)
         if place is not None:
             facts = (f"Back-ends on {source.name}", opened.start, opened.head, opened.graph)
-            write_comparison(place, Compared(*facts, rows, cells, settings, judged.truth, opened.kidnapped))
+            said = {title: [str(reason) for reason in found] for title, found in reasons.items()}
+            write_comparison(place, Compared(*facts, rows, cells, settings, judged.truth, opened.kidnapped, said))
     if as_json:
         _emit(opened, ways, rows, reasons, judged.metrics)
     else:
-        for remark in opened.head.get("remarks", ()):
-            typer.echo(f"note: {remark}")
-        _show(cells, rows, f"{source}: {opened.graph.n_nodes} nodes, {opened.graph.n_edges} edges; {_done(opened, ways)}")
-        for title, found in reasons.items():
-            for reason in found:
-                typer.echo(f"{title}: reason: {reason}")
+        _show(opened, cells, rows, reasons, _done(opened, ways))
 
 
 def _names(backends: str) -> list[str]:
@@ -207,7 +203,13 @@ def _table(rows: Sequence[Row], reasons: dict[str, Sequence[Reason]], judged: Se
     return table
 
 
-def _show(cells: Sequence[Sequence[str]], rows: Sequence[Row], title: str) -> None:
+def _show(
+    opened: GraphSource,
+    cells: Sequence[Sequence[str]],
+    rows: Sequence[Row],
+    reasons: dict[str, Sequence[Reason]],
+    done: str,
+) -> None:
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
@@ -217,7 +219,9 @@ def _show(cells: Sequence[Sequence[str]], rows: Sequence[Row], title: str) -> No
     console = Console()
     if not console.is_terminal:
         console = Console(width=_WIDTH)
-    print_title(console, title)
+    for remark in opened.head.get("remarks", ()):
+        typer.echo(f"note: {remark}")
+    print_title(console, f"{opened.path}: {opened.graph.n_nodes} nodes, {opened.graph.n_edges} edges; {done}")
     table = Table(box=SIMPLE)
     for i, column in enumerate(cells[0]):
         table.add_column(column, justify="right" if i > 1 else "left", no_wrap=i < 2)
@@ -226,3 +230,6 @@ def _show(cells: Sequence[Sequence[str]], rows: Sequence[Row], title: str) -> No
     console.print(table)
     for row in rows:
         typer.echo(f"{row.title}: {row.remark}")
+    for title, found in reasons.items():
+        for reason in found:
+            typer.echo(f"{title}: reason: {reason}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,7 @@ class Compared:
         settings: settings of the back-ends.
         truth: pieces (P, 3) of the true path in the frame of the maps, m and rad; empty if unknown.
         kidnapped: the places where the robot was kidnapped; no line is drawn there.
+        reasons: title of a row -> reasons against its map, in words; a row without any may be left out.
     """
 
     title: str
@@ -57,6 +58,7 @@ class Compared:
     settings: BackendsConfig
     truth: Sequence[Array] = ()
     kidnapped: Sequence[Kidnapping] = ()
+    reasons: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
 def write_comparison(place: Held, compared: Compared) -> Path:
@@ -83,7 +85,7 @@ def write_comparison(place: Held, compared: Compared) -> Path:
         tiles=[(compared.head[key], key) for key in ("nodes", "edges", "loops")],
         columns=compared.cells[0],
         rows=[{"cells": line, "bad": not row.has_map} for row, line in zip(rows, compared.cells[1:], strict=True)],
-        messages=[(row.title, row.remark) for row in rows],
+        messages=[(row.title, row.remark, compared.reasons.get(row.title, ())) for row in rows],
         ways={str(row.way) for row in rows},
         kidnapped=compared.kidnapped,
         of_truth=bool(compared.truth),

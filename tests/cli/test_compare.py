@@ -78,6 +78,7 @@ def test_a_folder_gets_a_picture_and_a_page_that_needs_nothing_else(monkeypatch,
     assert "gtsam-lm: reason" not in printed
     assert (out / "maps.png").read_bytes()[:4] == b"\x89PNG"
     page = (out / "comparison.html").read_text()
+    assert page.count("the map is dead reckoning") == 1
     assert page.count("data:image/") == 4  # over one another, side by side, convergence, residuals; no loop has a weight
     assert "http" not in page
     assert "gtsam-lm" in page

@@ -33,11 +33,11 @@ def ended(row, status):
     return replace(row, solution=replace(row.solution, report=report))
 
 
-def page_of(folder, graph, rows):
+def page_of(folder, graph, rows, **more):
     cells = [("back-end",), *((row.title,) for row in rows)]
     head = {"nodes": 30, "edges": graph.n_edges, "loops": 18}
     with held(folder, COMPARISON, overwrite=True) as place:
-        compared = Compared("laps", "the start", head, graph, rows, cells, BackendsConfig())
+        compared = Compared("laps", "the start", head, graph, rows, cells, BackendsConfig(), **more)
         return write_comparison(place, compared).read_text()
 
 
@@ -57,6 +57,13 @@ def test_a_row_that_diverged_is_in_the_table_and_in_no_picture(graph, rows, tmp_
     assert '<tr class="bad"><td>relaxation-ratslam</td></tr>' in page
     assert "theta is too large" in page
     assert "Without a map" not in page_of(tmp_path, graph, rows)
+
+
+def test_the_reasons_against_a_map_stand_beside_what_its_back_end_says(graph, rows, tmp_path):
+    page = page_of(tmp_path, graph, rows, reasons={"gtsam-lm": ["nodes 3 to 5: <bent>", "lone"], "odometry": []})
+    assert page.count('<ul class="reasons">') == 1
+    said = page[page.index("<dt>gtsam-lm</dt>") : page.index("<dt>odometry</dt>")]
+    assert "<li>nodes 3 to 5: &lt;bent&gt;</li><li>lone</li>" in said
 
 
 def test_a_page_without_any_map_shows_the_start_alone(graph, rows, tmp_path):
