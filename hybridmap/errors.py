@@ -14,6 +14,11 @@ def quoted(found: object) -> str:
     return f"'{text if len(text) <= _MOST_QUOTED else text[: _MOST_QUOTED - 3] + '...'}'"
 
 
+def counted(count: float, noun: str) -> str:
+    """A whole number of things in words: `1 loop`, `2 loops`; of a noun of several words the last one takes the s."""
+    return f"{count:.0f} {noun}{'' if count == 1 else 's'}"
+
+
 class HybridMapError(Exception):
     """Root of all errors that the user can do something about."""
 

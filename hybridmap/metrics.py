@@ -105,7 +105,7 @@ FIGURES: dict[str, tuple[str, str]] = {
     "relation_loop_used/": ("1", "relations used of {total}, {which}; {when}"),
     # of edges, against the truth
     "loop_precision/": ("1", "share of {judged} within 1 m and 15 deg of truth"),
-    "loop_recall/": ("1", "share of the {revisits} revisits with a right loop edge {kept}"),
+    "loop_recall/": ("1", "share of the {revisits} with a right loop edge {kept}"),
     "loops_right/": ("1", "right ones of {judged}"),
     "loop_trans_median/": ("m", "translational error of right loop edges, median"),
     "loop_trans_p95/": ("m", "translational error of right loop edges, 95 %"),
@@ -119,7 +119,7 @@ FIGURES: dict[str, tuple[str, str]] = {
     "edges_wrong/": ("1", "share of {which} that are wrong by more than 1 m"),
     "edges_wrong_kept/": ("1", "of those, how many the primary back-end gave a weight above one half"),
     # of views, before any verification
-    "pair_auc/": ("1", "chance that a pair of one place scores better than another, {pairs} pairs"),
+    "pair_auc/": ("1", "chance that a pair of one place scores better than another, {pairs}"),
     "candidate_top1/": ("1", "share whose best match of all older nodes is the same place, {views}"),
     "candidate_ap/": ("1", "average precision of the best matches, {views}"),
     "candidate_recall_full_precision/": ("1", "recall without a false match, {views}"),

@@ -16,7 +16,7 @@ from hybridmap.calibration.clock import ClockOffset
 from hybridmap.calibration.sessions import CLOCK_OFFSET, GAIN_CHANGES
 from hybridmap.config import Config
 from hybridmap.edge_book import Update
-from hybridmap.errors import StreamError
+from hybridmap.errors import StreamError, counted
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.gaps import kidnappings, unobserved
@@ -114,7 +114,8 @@ def _drive(stream: Stream, mapper: Mapper, recorder: _Recorder, progress: Progre
             if progress is not None:
                 progress(observations, stream.expected_observations)
     for name, (gone, stated) in stream.report.lost.items():
-        log.warning("%s: %s: %d messages of %d are damaged or missing; they were left out", stream.name, name, gone, stated)
+        of = counted(stated, "message")
+        log.warning("%s: %s: %d of %s damaged or missing, left out", stream.name, name, gone, of)
     for update in mapper.finish():
         recorder.record(update)
     recorder.rewrite_odometry()

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Protocol
 
+from hybridmap.errors import counted
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
 
@@ -121,7 +122,7 @@ class SolveReport:
         together, groups = sum(map(len, self.rejected_clusters)), len(self.rejected_clusters)
         if not groups:
             return ""
-        where = "one group" if groups == 1 else f"{groups} groups"
+        where = counted(groups, "group")
         found = f"{together} of {len(self.rejected_edge_ids)} rejected loops agree with each other, in {where}"
         return f"{found}: either false loops with one common error, or true loops and odometry worse than its covariance"
 

@@ -16,7 +16,7 @@ from hybridmap.backends.judging.certificate import Certificate, certify
 from hybridmap.backends.objective import chi2
 from hybridmap.backends.registry import create, is_sequential
 from hybridmap.config.backends import BackendsConfig, ConsistencyConfig
-from hybridmap.errors import BackendError
+from hybridmap.errors import BackendError, counted
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.metrics import FIGURES, Metric, figure
@@ -181,7 +181,7 @@ def _driven(row: Row, backend: Backend, graph: PoseGraph, report: Callable[[int]
     iterations += final.report.iterations
     total = replace(
         final.report,
-        message=f"{iterations} iterations over {graph.n_nodes} nodes; at the end: {final.report.message}",
+        message=f"{counted(iterations, 'iteration')} over {counted(graph.n_nodes, 'node')}; at the end: {final.report.message}",
         cpu_s=cpu_s + final.report.cpu_s,
         iterations=iterations,
         chi2_initial=chi2(graph, graph.initial),

@@ -18,7 +18,7 @@ from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.objective import chi2, gate_of, hanging_nodes, squared_norms, total, unit_variance, weak_edges
 from hybridmap.backends.registry import create
 from hybridmap.config.backends import BackendsConfig
-from hybridmap.errors import BackendError
+from hybridmap.errors import BackendError, counted
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.order import in_driving_order
 from hybridmap.graph.paths import extend, require_connected
@@ -179,7 +179,9 @@ class Driver:
         if old is None:
             return graph.initial[:1]
         if graph.n_nodes < old.n_nodes:
-            raise BackendError(f"{self._name}: the graph shrank from {old.n_nodes} to {graph.n_nodes} nodes between updates")
+            raise BackendError(
+                f"{self._name}: the graph shrank from {old.n_nodes} to {counted(graph.n_nodes, 'node')} between updates"
+            )
         if len(change.removed):
             require_connected(graph)
         return self._poses

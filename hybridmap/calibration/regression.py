@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from hybridmap.calibration.estimate import SIGNIFICANT_SIGMAS, Estimate
 from hybridmap.calibration.legs import Legs, Motion
-from hybridmap.errors import EvaluationError
+from hybridmap.errors import EvaluationError, counted
 from hybridmap.geometry import Array, between, robust_sigma, wrap_angle
 from hybridmap.odometry_model import NEUTRAL, Gains
 
@@ -102,7 +102,7 @@ def regress(sightings: Sequence[Sighting], leg_m: float | None = None) -> Estima
     count = sum(len(drive.legs) for drive in drives)
     if total < 4.0 * length or count < 8:
         raise EvaluationError(
-            f"calibration: found {count} pieces of {length:.1f} m in {total:.1f} m of odometry between known poses, "
+            f"calibration: found {counted(count, 'piece')} of {length:.1f} m in {total:.1f} m of odometry between known poses, "
             f"expected at least 8 pieces and {4.0 * length:.1f} m; give a longer drive, or a smaller --leg"
         )
     return _solve(drives, length, total)

@@ -17,7 +17,7 @@ from hybridmap.calibration.legs import Motion, corrected
 from hybridmap.calibration.regression import Sighting, regress, require_leg
 from hybridmap.config import Config
 from hybridmap.config.gone import without_gone
-from hybridmap.errors import EvaluationError
+from hybridmap.errors import EvaluationError, counted
 from hybridmap.geometry import Array, between
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
@@ -291,8 +291,8 @@ def _seen(drive: Drive, truth: Trajectory) -> Sighting:
     known = np.flatnonzero(known_at(truth, motion.stamps_ns))
     if len(known) < 2:
         raise EvaluationError(
-            f"{drive.name}: {len(known)} stamps in common with the reference, expected many; are they of the same recording "
-            f"and on the same clock?"
+            f"{drive.name}: {counted(len(known), 'stamp')} in common with the reference, expected many; are they of the same "
+            f"recording and on the same clock?"
         )
     mark = np.floor(motion.travel_m / _KEY_M + motion.turned_rad / _KEY_RAD)[known]
     keys = known[np.flatnonzero(np.diff(mark, prepend=-1.0) > 0)]

@@ -215,13 +215,15 @@ def _show(
     from rich.table import Table
 
     from hybridmap.cli.show import print_title
+    from hybridmap.errors import counted
 
     console = Console()
     if not console.is_terminal:
         console = Console(width=_WIDTH)
     for remark in opened.head.get("remarks", ()):
         typer.echo(f"note: {remark}")
-    print_title(console, f"{opened.path}: {opened.graph.n_nodes} nodes, {opened.graph.n_edges} edges; {done}")
+    size = f"{counted(opened.graph.n_nodes, 'node')}, {counted(opened.graph.n_edges, 'edge')}"
+    print_title(console, f"{opened.path}: {size}; {done}")
     table = Table(box=SIMPLE)
     for i, column in enumerate(cells[0]):
         table.add_column(column, justify="right" if i > 1 else "left", no_wrap=i < 2)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hybridmap.cli.options import AsJson
-from hybridmap.errors import ConfigError
+from hybridmap.errors import ConfigError, counted
 from hybridmap.trajectory import format_motion, format_stamp
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def _pose_lines(poses: Any, title: str) -> Iterator[str]:
 def _gate_lines(story: NodeStory) -> Iterator[str]:
     gate = story.gate
     if gate is not None:
-        inside = f"{gate.inside} of {gate.older} nodes that were old enough"
+        inside = f"{gate.inside} of {counted(gate.older, 'node')} that were old enough"
         yield f"  gate         {gate.radius_m:.2f} m and {gate.heading_deg:.0f} deg: {inside}"
         if gate.whole_map:
             yield "               the robot was lost: the whole map was searched as well"

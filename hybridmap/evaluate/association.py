@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.errors import EvaluationError
+from hybridmap.errors import EvaluationError, counted
 from hybridmap.geometry import Array
 from hybridmap.trajectory import MAX_GAP_S, Trajectory, known_at
 
@@ -50,8 +50,9 @@ def associate(estimate: Trajectory, reference: Trajectory, max_gap_s: float = MA
     known = known_at(reference, estimate.stamps_ns, max_gap_s)
     if np.count_nonzero(known) < 3:
         raise EvaluationError(
-            f"estimate ({_span(estimate)}) and reference ({_span(reference)}) have {np.count_nonzero(known)} stamps in "
-            f"common, expected at least 3; are both of the same recording and on the same clock?"
+            f"estimate ({_span(estimate)}) and reference ({_span(reference)}) have "
+            f"{counted(int(np.count_nonzero(known)), 'stamp')} in common, expected at least 3; are both of the same "
+            f"recording and on the same clock?"
         )
     stamps = estimate.stamps_ns[known]
     return PosePairs(stamps, estimate.poses[known], reference.at(stamps), len(estimate))

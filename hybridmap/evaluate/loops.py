@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.gone import without_gone
 from hybridmap.config.vision import MatchingConfig, ProfileConfig
-from hybridmap.errors import EvaluationError
+from hybridmap.errors import EvaluationError, counted
 from hybridmap.geometry import Array, wrap_angle
 from hybridmap.metrics import Metric, figure
 from hybridmap.store import MapStore, SessionFolder
@@ -291,14 +291,14 @@ def evaluate_loops(folder: Path, reference: Path | None = None) -> list[Metric]:
 
 def candidate_metrics(mode: str, errors: CandidateErrors) -> list[Metric]:
     """The errors of one formula of the score as metrics, named `<measure>/<mode>`; `mode` is the name of the formula."""
-    views = f"of {errors.revisits} revisits among {errors.queries} views"
+    views = f"of {counted(errors.revisits, 'revisit')} among {counted(errors.queries, 'view')}"
     rows = [
         ("pair_auc", errors.pair_auc),
         ("candidate_top1", errors.top1),
         ("candidate_ap", errors.average_precision),
         ("candidate_recall_full_precision", errors.recall_full_precision),
     ]
-    return [figure(f"{measure}/{mode}", value, pairs=errors.pairs, views=views) for measure, value in rows]
+    return [figure(f"{measure}/{mode}", value, pairs=counted(errors.pairs, "pair"), views=views) for measure, value in rows]
 
 
 def truth_of(folder: Path, reference: Path | None) -> Trajectory:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.errors import EvaluationError, quoted
+from hybridmap.errors import EvaluationError, counted, quoted
 from hybridmap.geometry import Array, between
 from hybridmap.trajectory import NS_PER_S, Trajectory, known_at, read_stamp_ns
 
@@ -103,8 +103,8 @@ def relations_of(path: Path, trajectory: Trajectory) -> Relations:
     if relation_errors(trajectory, relations).all.used == 0:
         first_s, last_s = trajectory.stamps_s[[0, -1]]
         raise EvaluationError(
-            f"{path}: none of its {len(relations.deltas)} relations lies within the session, {first_s:.3f}..{last_s:.3f} s; "
-            f"are they of this recording and on the same clock?"
+            f"{path}: none of its {counted(len(relations.deltas), 'relation')} lies within the session, "
+            f"{first_s:.3f}..{last_s:.3f} s; are they of this recording and on the same clock?"
         )
     return relations
 

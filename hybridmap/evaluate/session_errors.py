@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hybridmap.backends.base import ODOMETRY
-from hybridmap.errors import EvaluationError
+from hybridmap.errors import EvaluationError, counted
 from hybridmap.evaluate.association import associate
 from hybridmap.evaluate.edge_errors import ClosureErrors, EdgeErrors, closure_errors, edge_errors
 from hybridmap.evaluate.loops import evaluate_loops
@@ -173,7 +173,9 @@ def against_relations(estimate: str, trajectory: Trajectory, relations: Relation
     errors = relation_errors(trajectory, relations)
     if not suffix and backend == ODOMETRY and errors.all.used < 0.5 * errors.all.total:
         log.warning(
-            "only %d of %d relations lie within the session; are they of this recording?", errors.all.used, errors.all.total
+            "of %s only %d within the session; are they of this recording?",
+            counted(errors.all.total, "relation"),
+            errors.all.used,
         )
     metrics = []
     judged = (("relation", errors.all, "all relations"), ("relation_loop", errors.loops, "relations over more than 60 s"))
@@ -193,7 +195,7 @@ def against_relations(estimate: str, trajectory: Trajectory, relations: Relation
 def _closure_metrics(name: str, errors: ClosureErrors) -> list[Metric]:
     of_graph = name == "graph"  # back-ends share a line of the page, and its words; how many each kept is its own affair
     kept = "accepted by the front-end" if of_graph else "that the back-end kept"
-    judged = f"the {errors.judged} loop edges {kept}" if of_graph else f"the loop edges {kept}"
+    judged = f"the {counted(errors.judged, 'loop edge')} {kept}" if of_graph else f"the loop edges {kept}"
     values = {"loop_precision": errors.precision, "loop_recall": errors.recall, "loops_right": errors.right}
     if of_graph:
         values |= {
@@ -202,12 +204,12 @@ def _closure_metrics(name: str, errors: ClosureErrors) -> list[Metric]:
             "loop_rot_median": errors.rot_median_deg,
             "loop_rot_p95": errors.rot_p95_deg,
         }
-    facts = {"judged": judged, "kept": kept, "revisits": errors.revisits}
+    facts = {"judged": judged, "kept": kept, "revisits": counted(errors.revisits, "revisit")}
     return [figure(f"{measure}/{name}", value, **facts) for measure, value in values.items()]
 
 
 def _edge_metrics(kind: str, errors: EdgeErrors) -> list[Metric]:
-    which = f"the {errors.count} {kind} edges"
+    which = f"the {counted(errors.count, f'{kind} edge')}"
     values = {
         "edge_trans_median": errors.trans_median_m,
         "edge_trans_p95": errors.trans_p95_m,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.inputs import SensorsConfig
-from hybridmap.errors import StreamError
+from hybridmap.errors import StreamError, counted
 from hybridmap.geometry import Array, compose, yaw_from_quaternion
 from hybridmap.streams.bagfile import TRANSFORM, BagFile, RawMessage, Topic
 from hybridmap.streams.base import Rig, SensorKind
@@ -300,7 +300,7 @@ class TopicChooser:
         ranked = sorted(candidates, key=preference)
         if len(ranked) > 1:
             others = ", ".join(topic.name for topic in ranked[1:])
-            self.remarks.append(f"took {ranked[0].name} ({ranked[0].count} messages) rather than {others}")
+            self.remarks.append(f"took {ranked[0].name} ({counted(ranked[0].count, 'message')}) rather than {others}")
         return ranked[0].name
 
 

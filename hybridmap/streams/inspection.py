@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.root import Config
-from hybridmap.errors import HybridMapError, StreamError
+from hybridmap.errors import HybridMapError, StreamError, counted
 from hybridmap.streams.base import Rig, Stream
 from hybridmap.streams.open import kind_of, open_stream, world_of
 from hybridmap.trajectory import NS_PER_S, read_tum
@@ -133,9 +133,11 @@ def _try_to_open(found: Inspection, source: str | Path, config: Config, *, skip_
     found.lost |= lost
     losses: dict[str, int] = getattr(stream, "losses", {})
     found.problems += [f"{count} {name}" for name, count in losses.items() if count]
-    found.problems += [f"{name}: {gone} messages of {stated} cannot be read" for name, (gone, stated) in found.lost.items()]
+    found.problems += [
+        f"{name}: {gone} of {counted(stated, 'message')} cannot be read" for name, (gone, stated) in found.lost.items()
+    ]
     if truth is not None:
-        found.remarks.append(f"ground truth: {len(truth)} poses")
+        found.remarks.append(f"ground truth: {counted(len(truth), 'pose')}")
 
 
 def _lost_in_all(stream: Stream) -> dict[str, tuple[int, int]]:
@@ -177,7 +179,9 @@ def _bag_parts(path: Path, problems: list[str]) -> list[Part]:
         seen = np.asarray(stamps.get(topic.name, []), dtype=np.int64)
         parts.append(Part(topic.name, topic.msgtype.replace("/msg/", "/"), topic.count, seen))
         if topic.name in stamps and len(seen) != topic.count:
-            problems.append(f"{topic.name}: {len(seen)} messages can be read of the {topic.count} that the bag says it holds")
+            problems.append(
+                f"{topic.name}: {counted(len(seen), 'message')} can be read of the {topic.count} that the bag says it holds"
+            )
         if topic.count == 0:
             problems.append(f"{topic.name}: no messages")
     return parts

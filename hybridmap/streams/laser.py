@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.inputs import SensorsConfig
-from hybridmap.errors import StreamError
+from hybridmap.errors import StreamError, counted
 from hybridmap.geometry import Array, transform_points
 from hybridmap.streams.base import InBag, Keyframe, Observation, Planned, Rig, Seen, SensorKind, SensorPlan
 from hybridmap.streams.mounting import planar
@@ -82,7 +82,7 @@ class ScanDecoder:
         bearings = self._bearings(first)
         if not 2 <= len(bearings) <= _MOST_BEAMS or not np.isfinite(bearings).all() or bearings[0] == bearings[-1]:
             raise StreamError(
-                f"{what}: found {len(first.ranges)} beams in steps of {first.angle_increment} rad; "
+                f"{what}: found {counted(len(first.ranges), 'beam')} in steps of {first.angle_increment} rad; "
                 f"expected 2 to {_MOST_BEAMS} beams apart"
             )
         self._reversed = bool(bearings[-1] < bearings[0])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hybridmap.config.inputs import CameraIntrinsics, CameraMounting, SensorsConfig
 from hybridmap.config.root import Config, is_allowed
 from hybridmap.config.section import read_mapping
-from hybridmap.errors import StreamError
+from hybridmap.errors import StreamError, counted
 from hybridmap.geometry import Array
 from hybridmap.streams.base import Rig, Sample, SelfMotion, StreamReport
 from hybridmap.streams.cameras import (
@@ -78,7 +78,7 @@ class TumStream:
             if not path.is_file() and not skip_damaged:
                 raise StreamError(f"{path}: no such picture, though the folder's lists name it")
         if self._pairs and not any(islice(self._frames(), 1)):  # sizes and kinds that contradict each other show at once
-            raise StreamError(f"{folder}: none of its {len(self._pairs)} pictures can be read")
+            raise StreamError(f"{folder}: none of its {counted(len(self._pairs), 'picture')} can be read")
         frame_ns = np.array([pair.stamp_ns for pair in self._pairs], dtype=np.int64)
         check_overlap(self._odometry.stamps_ns, frame_ns, str(folder))
         self.rig = Rig(camera=pinhole(self._calibration, self._T_base_camera) if self._pairs else None)

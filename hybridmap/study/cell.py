@@ -15,7 +15,7 @@ from hybridmap.backends.gtsam.initial import angular_start
 from hybridmap.backends.objective import chi2
 from hybridmap.backends.odometry import dead_reckoning
 from hybridmap.backends.registry import create
-from hybridmap.errors import BackendError, HybridMapError
+from hybridmap.errors import BackendError, HybridMapError, counted
 from hybridmap.geometry import Array, align, between, compose
 from hybridmap.graph.paths import chain
 from hybridmap.graph.pose_graph import PoseGraph
@@ -224,8 +224,8 @@ def _begun(graph: PoseGraph, start: str, reference: Array) -> PoseGraph:
         unknown = int(np.count_nonzero(~np.isfinite(reference).all(axis=1)))
         if unknown:
             raise BackendError(
-                f"start: reference: found {unknown} of {len(reference)} nodes without a reference pose, expected none; choose"
-                f" another start"
+                f"start: reference: found {unknown} of {counted(len(reference), 'node')} without a reference pose, "
+                f"expected none; choose another start"
             )
         return replace(graph, initial=compose(graph.initial[0], between(reference[0], reference)))
     return graph

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hybridmap.backends.base import ODOMETRY, Solution
 from hybridmap.config import Config
 from hybridmap.edge_book import Update
-from hybridmap.errors import StudyError
+from hybridmap.errors import StudyError, counted
 from hybridmap.evaluate.edge_errors import ClosureLimits, closure_errors, edge_errors, normalised_errors
 from hybridmap.evaluate.relations import Relations, relation_errors, relations_of
 from hybridmap.evaluate.trajectory_errors import absolute_error
@@ -91,7 +91,9 @@ class MappedDrive:
             updates += mapper.finish()
         graph = mapper.map.pose_graph()
         if not graph.n_edges:
-            raise StudyError(f"{stream.name}: the drive gave {graph.n_nodes} nodes and no edge; drive longer (end_s)")
+            raise StudyError(
+                f"{stream.name}: the drive gave {counted(graph.n_nodes, 'node')} and no edge; drive longer (end_s)"
+            )
         track = _track(mapper, updates)
         relations = relations_of(_there(self.relations), track.odometry) if self.relations else None
         reference = truth_at(truth, _stamps(mapper)) if truth is not None else np.full((graph.n_nodes, 3), np.nan)

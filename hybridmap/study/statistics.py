@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hybridmap.errors import counted
 from hybridmap.geometry import Array
 from hybridmap.study.cell import CellResult
 from hybridmap.study.cells import Cell, Grid
@@ -39,7 +40,7 @@ class Interval:
 
     def __str__(self) -> str:
         if not self.known:
-            return f"{self.count} value{'' if self.count == 1 else 's'}: no interval"
+            return f"{counted(self.count, 'value')}: no interval"
         return f"{100 * self.confidence:g} % interval {self.low:.4g} to {self.high:.4g} of {self.count}"
 
     @property

@@ -50,13 +50,13 @@ KINDS = {
     "dead reckoning": Kind(
         Verdict.DOUBTFUL,
         "1",
-        "the map is dead reckoning: no loop and no registration is in it ({value:.0f} loops were measured)",
+        "the map is dead reckoning: no loop and no registration is in it (loops measured: {value:.0f})",
     ),
     "loops refused": Kind(
         Verdict.DOUBTFUL,
         "m",
-        "{count} loops agree with each other and would move the map by {value:.2f} m, but are not in it; {against} loops are"
-        " against them: either they have one common error, or the motion here is wrong",
+        "{count} loops agree with each other and would move the map by {value:.2f} m, but are not in it"
+        " (loops of the map against them: {against}): either they have one common error, or the motion here is wrong",
     ),
     "bent": Kind(
         Verdict.DOUBTFUL,
@@ -81,8 +81,8 @@ KINDS = {
     "loops alone": Kind(
         Verdict.DOUBTFUL,
         "m",
-        "{count} loops move the map by {value:.2f} m (at most {limit:.1f} m) to where nothing else has it, and no other loop"
-        " confirms them; the farthest joins these two nodes",
+        "loops that no other loop confirms ({count}) move the map by {value:.2f} m (at most {limit:.1f} m) to where nothing"
+        " else has it; the farthest joins these two nodes",
     ),
     "loops rejected": Kind(
         Verdict.DOUBTFUL, "1", "the back-end rejected {value:.0f} loops and kept {count}: hardly any loop holds the map"
@@ -96,7 +96,7 @@ KINDS = {
     "odometry dropped": Kind(
         Verdict.DOUBTFUL,
         "%",
-        "registrations contradict {count} odometry edges, {value:.0f} % of them (at most {limit:.0f} %): the wheels slip, or"
+        "registrations contradict {value:.0f} % of the odometry edges ({count}; at most {limit:.0f} %): the wheels slip, or"
         " the clock of the sensor is not theirs",
     ),
     "clock offset": Kind(
@@ -105,7 +105,7 @@ KINDS = {
         "scans or frames are stamped {value:+.2f} s off odometry of the same moment (+: later; at most {limit:.2f} s), and the"
         " map was not corrected for it",
     ),
-    "nodes without weight": Kind(Verdict.DOUBTFUL, "1", "{value:.0f} nodes are joined to the rest by edges without weight"),
+    "nodes without weight": Kind(Verdict.DOUBTFUL, "1", "nodes joined to the rest by edges without weight alone: {value:.0f}"),
     "motion unobserved": Kind(
         Verdict.DOUBTFUL,
         "m",
@@ -120,10 +120,10 @@ KINDS = {
     "not localised": Kind(
         Verdict.DOUBTFUL,
         "1",
-        "{value:.0f} nodes lie where the odometry has them: what was seen there does not follow what was seen before, and no"
-        " loop says where the robot was",
+        "nodes that lie where the odometry has them: {value:.0f}; what was seen there does not follow what was seen before, and"
+        " no loop says where the robot was",
     ),
-    "messages lost": Kind(Verdict.DOUBTFUL, "%", "{name}: {count} messages ({value:.2g} %) cannot be read"),
+    "messages lost": Kind(Verdict.DOUBTFUL, "%", "{name}: messages that cannot be read: {count} ({value:.2g} %)"),
 }
 """Every kind of reason by its name."""
 

@@ -444,7 +444,7 @@ def test_messages_that_are_lost_are_counted(tmp_path):
     stream = open_stream(folder, Config())
     assert len(list(stream)) == 11
     assert stream.report.lost == {"/scan": (1, 6)}
-    assert "/scan: 1 messages of 6 cannot be read" in inspect_source(folder, Config()).problems
+    assert "/scan: 1 of 6 messages cannot be read" in inspect_source(folder, Config()).problems
 
 
 def test_a_broken_transform_elsewhere_does_not_matter_and_is_remarked_on(tmp_path):

@@ -14,6 +14,7 @@ from hybridmap.backends.driver import Driver
 from hybridmap.backends.gtsam.factors import NoiseModels, anchor, collected, factor_graph, factors, poses_of, values
 from hybridmap.backends.gtsam.initial import best_start
 from hybridmap.config.backends import BackendsConfig
+from hybridmap.errors import counted
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph, difference
 
@@ -101,9 +102,9 @@ def _attempt(method: str, graph: Any, start: Array, initial: Any, max_iterations
         return Outcome(start, SolveStatus.DIVERGED, "gn: the cost rose, kept the start", iterations)
     status, message = SolveStatus.CONVERGED, f"{method}: converged"
     if iterations >= max_iterations:
-        status, message = SolveStatus.MAX_ITERATIONS, f"{method}: stopped at {iterations} iterations"
+        status, message = SolveStatus.MAX_ITERATIONS, f"{method}: stopped at {counted(iterations, 'iteration')}"
     elif method == "lm" and optimizer.lambda_() > _STUCK:
-        status, message = SolveStatus.STALLED, f"lm: no step lowered the cost after {iterations} iterations"
+        status, message = SolveStatus.STALLED, f"lm: no step lowered the cost after {counted(iterations, 'iteration')}"
     return Outcome(poses, status, message, iterations, values=result)
 
 

@@ -21,7 +21,7 @@ from hybridmap.backends.gtsam.factors import factor_graph, noise_models
 from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.objective import gate_of, residuals, softened, truncated_cost
 from hybridmap.config.backends import BackendsConfig
-from hybridmap.errors import BackendError
+from hybridmap.errors import BackendError, counted
 from hybridmap.geometry import Array, adjoint, between, log
 from hybridmap.graph.paths import own_odometry
 from hybridmap.graph.pose_graph import PoseGraph
@@ -85,7 +85,7 @@ def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outc
             break
     chosen = min(found, key=lambda each: each.cost)
     gain, turn_gain, bias = chosen.gains
-    message = f"gain {gain:.4f}, turn gain {turn_gain:.4f}, heading bias {bias:.5f} rad/m from {len(found)} starts"
+    message = f"gain {gain:.4f}, turn gain {turn_gain:.4f}, heading bias {bias:.5f} rad/m from {counted(len(found), 'start')}"
     return replace(chosen.outcome, message=f"{message}; {chosen.outcome.message}", calibrated=chosen.graph)
 
 

@@ -32,7 +32,7 @@ from hybridmap.backends.objective import (
     weak_edges,
 )
 from hybridmap.config.backends import BackendsConfig
-from hybridmap.errors import BackendError
+from hybridmap.errors import BackendError, counted
 from hybridmap.geometry import Array
 from hybridmap.graph.paths import extend
 from hybridmap.graph.pose_graph import PoseGraph, prefix
@@ -380,7 +380,7 @@ def _cheapest(graph: PoseGraph, results: dict[str, Truncated], config: BackendsC
     weights = dict(zip(loops, result.kept.astype(np.float64).tolist(), strict=True))
     rejected = tuple(edge for edge, weight in weights.items() if weight == 0.0)
     variance = _variance(graph, result, config)
-    message = f"gnc: {len(rejected)} of {len(loops)} loops rejected (start: {start}; unit variance {variance:.3g})"
+    message = f"gnc: {len(rejected)} of {counted(len(loops), 'loop')} rejected (start: {start}; unit variance {variance:.3g})"
     if result.lack:
         return Outcome(result.poses, SolveStatus.FELL_BACK, f"{message}; {result.lack}", result.rounds, weights, rejected)
     return Outcome(result.poses, SolveStatus.CONVERGED, message, result.rounds, weights, rejected)

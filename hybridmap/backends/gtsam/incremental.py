@@ -24,6 +24,7 @@ from hybridmap.backends.gtsam.initial import angular_start
 from hybridmap.backends.gtsam.robust import judged
 from hybridmap.backends.objective import gate_of, squared_norms, total, truncated_cost
 from hybridmap.config.backends import BackendsConfig
+from hybridmap.errors import counted
 from hybridmap.geometry import Array, compose, exp
 from hybridmap.graph.pose_graph import Change, PoseGraph, difference, prefix
 
@@ -51,7 +52,7 @@ def create(name: str, config: BackendsConfig) -> Driver:
         updates = sum(drive.update(prefix(graph, nodes)).report.iterations for nodes in grown)
         end = drive.finish(graph)
         report, updates = end.report, updates + end.report.iterations
-        message = f"isam2: {updates} updates"
+        message = f"isam2: {counted(updates, 'update')}"
         return Outcome(end.poses, report.status, message, updates, report.weights, report.rejected_edge_ids)
 
     return Driver(name, config, solve, follow=isam2.follow, last=isam2.conclude, most_rise=most_rise, softens=True)
@@ -151,7 +152,7 @@ class Isam2:
 
     def _kept(self, smoother: Smoother, updates: int, graph: PoseGraph) -> Outcome:
         """The outcome; if finite, the smoother is kept for the next update."""
-        outcome = Outcome(smoother.poses(), SolveStatus.CONVERGED, f"isam2: {updates} updates", updates)
+        outcome = Outcome(smoother.poses(), SolveStatus.CONVERGED, f"isam2: {counted(updates, 'update')}", updates)
         if self._kernel is not None:
             outcome = judged(outcome, self._kernel, graph, gate_of(self._config))
         if np.isfinite(outcome.poses).all():

@@ -14,7 +14,7 @@ from hybridmap.backends.gtsam.covariance import expected_loops
 from hybridmap.backends.judging.clusters import loops_of, neighbouring_pairs, rejected_clusters
 from hybridmap.backends.objective import SLACK, chi2, gate_of, softened, truncated_cost
 from hybridmap.config.backends import BackendsConfig
-from hybridmap.errors import BackendError, GraphError
+from hybridmap.errors import BackendError, GraphError, counted
 from hybridmap.graph.agreement import BOUND, agreement, chi2_quantile, largest_consistent_set, ring
 from hybridmap.graph.paths import chain_of
 from hybridmap.graph.pose_graph import PoseGraph
@@ -140,7 +140,7 @@ class ConsistentBackend:
         rejected = tuple(sorted({*report.rejected_edge_ids, *inconsistent}))
         loops = graph.edge_ids[graph.is_loop].tolist()
         weights = {edge: 0.0 if edge in set(inconsistent) else report.weights.get(edge, 1.0) for edge in loops}
-        note = f"{len(inconsistent)} of {len(loops)} loops left out as inconsistent, {tried.taken_in} added again"
+        note = f"{len(inconsistent)} of {counted(len(loops), 'loop')} left out as inconsistent, {tried.taken_in} added again"
         whole = replace(
             report,
             message=f"{note}; {report.message}",

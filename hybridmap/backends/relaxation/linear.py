@@ -20,6 +20,7 @@ from hybridmap.backends.base import Outcome, SolveStatus
 from hybridmap.backends.driver import Driver
 from hybridmap.backends.relaxation.ratslam import TOLERANCE_M, relaxing
 from hybridmap.config.backends import BackendsConfig, RelaxationConfig
+from hybridmap.errors import counted
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
 
@@ -145,10 +146,12 @@ def _relaxed(
         return Outcome(start, SolveStatus.DIVERGED, f"{note}; not run", 0)
     positions, done = relax(rule, start[:, :2], rate, sweeps, TOLERANCE_M)
     if positions is None:
-        return Outcome(start, SolveStatus.DIVERGED, f"{note}; diverged within {done} sweeps; the initial poses are kept", done)
+        return Outcome(
+            start, SolveStatus.DIVERGED, f"{note}; diverged within {counted(done, 'sweep')}; the initial poses are kept", done
+        )
     poses = np.column_stack([positions, graph.initial[:, 2]])
     status = SolveStatus.CONVERGED if done < sweeps else SolveStatus.MAX_ITERATIONS
-    return Outcome(poses, status, f"{note}; {done} sweeps", done)
+    return Outcome(poses, status, f"{note}; {counted(done, 'sweep')}", done)
 
 
 def _by_degree(rule: LinearRule, config: RelaxationConfig) -> Array:

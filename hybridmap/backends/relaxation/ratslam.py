@@ -19,6 +19,7 @@ from hybridmap.backends.gtsam.initial import best_start
 from hybridmap.backends.objective import chi2, gate_of, truncated_cost
 from hybridmap.compiled import compiled
 from hybridmap.config.backends import BackendsConfig, RelaxationConfig
+from hybridmap.errors import counted
 from hybridmap.geometry import Array, between, compose, wrap_angle
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
@@ -222,7 +223,7 @@ def then_least_squares(name: str, config: BackendsConfig) -> Driver:
         relaxed = relax(graph, start)
         if relaxed.status is SolveStatus.DIVERGED:
             return relaxed
-        refined = _refined(graph, relaxed.poses, config, f"{relaxed.iterations} sweeps")
+        refined = _refined(graph, relaxed.poses, config, counted(relaxed.iterations, "sweep"))
         return replace(refined, iterations=relaxed.iterations + refined.iterations)
 
     def onward(graph: PoseGraph, driven: Array) -> Outcome:
@@ -294,7 +295,7 @@ def _judged(graph: PoseGraph, relaxed: Relaxed) -> Outcome:
     by_id = dict(zip(loops.edge_ids.tolist(), weights(loops, relaxed.poses).tolist(), strict=True))
     rejected = tuple(edge for edge, weight in by_id.items() if weight < _REJECTED)
     outcome = _outcome(relaxed)
-    message = f"{outcome.message}; {len(rejected)} of {len(by_id)} loops rejected"
+    message = f"{outcome.message}; {len(rejected)} of {counted(len(by_id), 'loop')} rejected"
     return replace(outcome, message=message, weights=by_id, rejected=rejected)
 
 
@@ -302,7 +303,7 @@ def _outcome(relaxed: Relaxed) -> Outcome:
     if relaxed.settled:
         message = f"no node moved more than {TOLERANCE_M} m"
         return Outcome(relaxed.poses, SolveStatus.CONVERGED, message, relaxed.sweeps)
-    return Outcome(relaxed.poses, SolveStatus.MAX_ITERATIONS, f"{relaxed.sweeps} sweeps", relaxed.sweeps)
+    return Outcome(relaxed.poses, SolveStatus.MAX_ITERATIONS, counted(relaxed.sweeps, "sweep"), relaxed.sweeps)
 
 
 def _refined(graph: PoseGraph, start: Array, config: BackendsConfig, before: str) -> Outcome:
@@ -312,4 +313,4 @@ def _refined(graph: PoseGraph, start: Array, config: BackendsConfig, before: str
     outcome = run("lm", factor_graph(graph, NoiseModels()), start, config.max_iterations, tolerance=_TOLERANCE)
     if chi2(graph, outcome.poses) > chi2(graph, start):
         return Outcome(start, SolveStatus.STALLED, f"{before}; {outcome.message}; kept the relaxed map", outcome.iterations)
-    return replace(outcome, message=f"{before}; {outcome.message} after {outcome.iterations} iterations")
+    return replace(outcome, message=f"{before}; {outcome.message} after {counted(outcome.iterations, 'iteration')}")
