@@ -84,7 +84,10 @@ _COMMANDS: dict[str, tuple[Callable[..., None], dict[int, str]]] = {
     "compare": (compare, {0: "compared, even if a back-end failed"}),
     "study": (
         study,
-        {0: "no bar (limit) of the study is missed", 1: "a bar is missed, and everything is written all the same"},
+        {
+            0: "every cell has a result, and no bar (limit) of the study is missed",
+            1: "a cell has no result or a bar is missed, and everything is written all the same",
+        },
     ),
     "calibrate": (
         calibrate,

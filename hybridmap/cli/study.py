@@ -18,34 +18,39 @@ if TYPE_CHECKING:
 _COLUMNS = {"false_kept": "false kept", "own_lost": "own lost", "loop_recall": "recall", "found_m": "found after (m)"}
 
 
+_Config = Annotated[
+    str,
+    typer.Argument(
+        metavar="CONFIG.yaml",
+        help="Study: a YAML file, or a name that comes with hybridmap (an unknown one gives the list).",
+    ),
+]
+_Out = Annotated[
+    Path,
+    typer.Option(
+        metavar="DIR",
+        help="Folder for the results. In an existing study folder, stored results of the same cells are used again, and its"
+        " tables and page are replaced. One with other files is refused.",
+    ),
+]
+_Workers = Annotated[
+    int, typer.Option(min=0, help="Worker processes on this machine, one thread each; 0: compute in this process.")
+]
+_Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="tcp://HOST:PORT", help="Compute on the workers of this Dask scheduler (needs the extra `cluster`)."),
+]
+_Setting = Annotated[
+    list[str] | None, typer.Option("--set", help="KEY=VALUE of the study, e.g. seeds=3. Keys: docs/studies.md.")
+]
+
+
 def study(
-    config: Annotated[
-        str,
-        typer.Argument(
-            metavar="CONFIG.yaml",
-            help="Study: a YAML file, or a name that comes with hybridmap (an unknown one gives the list).",
-        ),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            metavar="DIR",
-            help="Folder for the results. In an existing study folder, stored results of the same cells are used again, and its"
-            " tables and page are replaced. One with other files is refused.",
-        ),
-    ],
-    workers: Annotated[
-        int, typer.Option(min=0, help="Worker processes on this machine, one thread each; 0: compute in this process.")
-    ] = 1,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            metavar="tcp://HOST:PORT", help="Compute on the workers of this Dask scheduler (needs the extra `cluster`)."
-        ),
-    ] = None,
-    setting: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE of the study, e.g. seeds=3. Keys: docs/studies.md.")
-    ] = None,
+    config: _Config,
+    out: _Out,
+    workers: _Workers = 1,
+    scheduler: _Scheduler = None,
+    setting: _Setting = None,
     as_json: AsJson = False,
 ) -> None:
     """Run a study: map or solve every combination of source, setting, back-end, false loops and seed; compare the back-ends.
@@ -54,8 +59,9 @@ def study(
     chi2; accepted false loops; lost true loops. Differences between back-ends are paired by seed.
 
     Writes study.yaml, tables (cells.csv, timings.csv, summary.csv, bars.csv), metrics.json, the page report.html, and every
-    result as soon as it is known: an interrupted study continues when it is run again. A cell that fails keeps its row, with
-    the reason. The exit code tells only whether a limit (bar) of the study is missed; a cell without the figure misses it.
+    result as soon as it is known: an interrupted study continues when it is run again. A cell without a result (`failed`,
+    `unmapped`, `crashed`) keeps its row, with the reason. A back-end that diverged is a result. A cell without the figure of a
+    limit (bar) misses it.
     """
     _one_thread()
     from hybridmap.cli.choose import parse_settings
@@ -73,7 +79,7 @@ def study(
     else:
         _show(done)
         typer.echo(f"page: {page}")
-    if done.missed:
+    if done.missed or done.without_result:
         raise typer.Exit(1)
 
 
@@ -97,6 +103,7 @@ def _show(done: Study) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from hybridmap.errors import counted
     from hybridmap.report.study_figures import ERRORS
     from hybridmap.report.study_page import error_of, remarks
     from hybridmap.study.model import quoted
@@ -107,12 +114,13 @@ def _show(done: Study) -> None:
     known = len({cell.key for cell in done.grid.cells}) - done.computed
     counts = ", ".join(f"{count} {status}" for status, count in done.head["status"].items())
     table = Table(
-        title=f"{done.head['study']}: {done.head['cells']} cells ({counts}); {known} computed earlier", title_justify="left"
+        title=f"{done.head['study']}: {counted(done.head['cells'], 'cell')} ({counts}); {known} computed earlier",
+        title_justify="left",
     )
     measure, others = error_of(done), [name for name in _COLUMNS if _known(done, name)]
     table.add_column("source / setting / false loops")
     table.add_column("back-end")
-    for column in ("solved", f"median {ERRORS[measure]} (m)", f"mean minus {quoted(done.head['baseline'])} (m)"):
+    for column in ("known in", f"median {ERRORS[measure]} (m)", f"mean minus {quoted(done.head['baseline'])} (m)"):
         table.add_column(column, justify="right")
     for name in others:
         table.add_column(_COLUMNS[name], justify="right")
@@ -126,7 +134,7 @@ def _show(done: Study) -> None:
     if done.verdicts:
         console.print(f"bars: {len(done.verdicts) - len(done.missed)} of {len(done.verdicts)} kept", highlight=False)
     for remark in remarks(done):
-        where = f"{remark.count} cells {remark.status}: {remark.where}, {remark.backend}"
+        where = f"{counted(remark.count, 'cell')} {remark.status}: {remark.where}, {remark.backend}"
         console.print(f"note: {where}: {remark.message}", soft_wrap=True, markup=False, highlight=False)
 
 

@@ -6,10 +6,11 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
+from hybridmap.backends.base import SolveStatus
 from hybridmap.errors import StudyError
 from hybridmap.study import cell as cells
 from hybridmap.study import provenance, sources
-from hybridmap.study.cell import CellResult
+from hybridmap.study.cell import UNMAPPED, CellResult
 from hybridmap.study.cells import Grid
 from hybridmap.study.folder import StudyFolder
 from hybridmap.study.pools import Lost, Pool
@@ -20,6 +21,8 @@ log = logging.getLogger(__name__)
 Progress = Callable[[int, int], None]
 
 CRASHED = "crashed"
+WITHOUT_RESULT = (SolveStatus.FAILED, UNMAPPED, CRASHED)
+"""Status of cells that an error left without a result."""
 """Status of a cell that raised what no back-end may raise, or that killed its workers; not kept, tried again."""
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hybridmap.errors import counted
 from hybridmap.metrics import Metric, to_json
 from hybridmap.output import held, write_text
 from hybridmap.study import bars, provenance, tables
@@ -18,7 +19,7 @@ from hybridmap.study.folder import BARS_CSV, CELLS_CSV, METRICS, STUDY, STUDY_FO
 from hybridmap.study.measures import measures_of
 from hybridmap.study.model import StudyConfig, quoted
 from hybridmap.study.pools import Pool
-from hybridmap.study.runner import Progress, run
+from hybridmap.study.runner import WITHOUT_RESULT, Progress, run
 from hybridmap.study.statistics import Summary, summarise
 
 
@@ -55,6 +56,11 @@ class Study:
     def missed(self) -> list[Verdict]:
         """Verdicts of the bars that are missed."""
         return [verdict for verdict in self.verdicts if not verdict.passed]
+
+    @property
+    def without_result(self) -> list[Cell]:
+        """The cells that an error left without a result; a back-end that diverged is a result."""
+        return [cell for cell, result in self.rows if result.status in WITHOUT_RESULT]
 
 
 def run_study(study: StudyConfig, out: Path, pool: Pool, progress: Progress | None = None) -> Study:
@@ -113,7 +119,9 @@ def _metrics(summaries: Sequence[Summary], verdicts: Sequence[Verdict]) -> list[
     for one in summaries:
         stage = f"{one.cell.label}/{one.cell.backend}"
         stem = _stem(one.measure, one.unit)
-        metrics.append(Metric(f"{stem}_median/{stage}", one.median, one.unit, f"median of {one.solved} of {one.cells} cells"))
+        metrics.append(
+            Metric(f"{stem}_median/{stage}", one.median, one.unit, f"median of {one.solved} of {counted(one.cells, 'cell')}")
+        )
         metrics.append(Metric(f"{stem}_mean/{stage}", one.mean.value, one.unit, f"mean, {one.mean}"))
         if one.difference is not None:
             what = f"mean of the paired differences to {quoted(one.baseline)}, {one.difference}"

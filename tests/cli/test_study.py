@@ -64,7 +64,7 @@ def test_a_study_is_run_and_gone_on_with(run, tmp_path, monkeypatch):
     assert (tmp_path / "again" / "cells.csv").read_bytes() == (out / "cells.csv").read_bytes()
 
 
-def test_why_cells_failed_stands_under_the_table(run, tmp_path, monkeypatch):
+def test_cells_without_a_result_are_exit_code_1_and_why_stands_under_the_table(run, tmp_path, monkeypatch):
     monkeypatch.setattr(study_page, "write_study_page", lambda study: study.folder.path / PAGE)
     tree = TREE | {
         "backends": ["gtsam-lm"],
@@ -74,7 +74,7 @@ def test_why_cells_failed_stands_under_the_table(run, tmp_path, monkeypatch):
     (tmp_path / "way.yaml").write_text(yaml.safe_dump(tree))
     code, printed, _ = run(tmp_path / "way.yaml", "--out", tmp_path / "out", "--workers", 0)
     (note,) = [line for line in printed.splitlines() if line.startswith("note: ")]
-    assert code == 0
+    assert code == 1
     assert "cells failed: way/" in note
     assert "loops" in note
 
