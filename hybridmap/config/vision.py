@@ -25,7 +25,8 @@ class ProfileConfig(Section):
     normalise: Literal["z", "mean"] = "z"
     """`z`: mean 0 and standard deviation 1; `mean`: divided by its mean.
 
-    Watch: `mean` ranks worse."""
+    Watch: `mean` ranks worse. A laser ignores it: its profile is always normalised by `z`.
+    """
 
     @property
     def max_shift(self) -> int:
