@@ -235,6 +235,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
         "lost": {name: list(counts) for name, counts in stream.report.lost.items()},
         "remarks": [
             *stream.report.remarks,
+            *stream.report.skips,
             *map(str, mapper.calibration.changes),
             *([str(offset)] if offset.used_s else []),
             *map(str, kidnappings(mapper.map)),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.inputs import SensorsConfig
 from hybridmap.geometry import Array
-from hybridmap.trajectory import NS_PER_S, Trajectory
+from hybridmap.trajectory import NS_PER_S, Trajectory, format_stamp
 
 if TYPE_CHECKING:
     from hybridmap.streams.bagindex import BagIndex, TopicChooser
@@ -19,6 +19,8 @@ Keyframe = Mapping[str, NDArray[Any]]
 """What a map keeps of a node's observation: arrays by name."""
 MessageKey = tuple[str, int]
 """A message of a bag: topic, and its place within the topic."""
+_SKIPS_NAMED = 3
+"""How many damaged observations are named; one kind of damage looks the same again and again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +118,10 @@ class Planned:
 
 
 class Decoder(Protocol):
-    """Makes an observation from its messages, and counts irregularities in `counts`: name -> number."""
+    """Makes an observation from its messages, and counts irregularities in `counts`: name -> number.
+
+    Every count becomes a remark `<name>: <number>`, so the name says what was irregular and what was done.
+    """
 
     counts: dict[str, int]
 
@@ -205,16 +210,32 @@ class StreamReport:
         remarks: choices and assumptions, for the user.
         lost: topic or list of pictures -> (messages that were not used, messages in all), where the recording states to hold
             messages that cannot be read, or damaged ones were skipped.
+        skipped: what was skipped as damaged, in words with stamp and place, in the order of reading.
     """
 
     counts: dict[str, int] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     lost: dict[str, tuple[int, int]] = field(default_factory=dict)
+    skipped: list[str] = field(default_factory=list)
 
-    def lose(self, name: str, total: int) -> None:
-        """Count one lost message of a topic or list that has `total` messages in all."""
+    def skip(self, name: str, total: int, stamp_ns: int, why: str) -> None:
+        """Count a damaged observation as a lost message of a topic or list that has `total` messages in all.
+
+        Args:
+            name, total: the topic or list of pictures, and how many messages it has.
+            stamp_ns: stamp of the observation, ns.
+            why: what is damaged, and where, in words.
+        """
         gone, stated = self.lost.get(name, (0, total))
         self.lost[name] = (gone + 1, stated)
+        self.skipped.append(f"{format_stamp(stamp_ns)} s: {why}")
+
+    @property
+    def skips(self) -> list[str]:
+        """What was skipped as damaged, for people: the first few, then how many more."""
+        more = len(self.skipped) - _SKIPS_NAMED
+        named = [f"skipped, stamp {one}" for one in self.skipped[:_SKIPS_NAMED]]
+        return [*named, f"skipped {more} more that {'is' if more == 1 else 'are'} damaged"] if more > 0 else named
 
     def count(self, name: str, increment: int = 1) -> None:
         """Add `increment` to the count of this name."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.root import Config
 from hybridmap.errors import HybridMapError, StreamError, counted
-from hybridmap.streams.base import Rig, Stream
+from hybridmap.streams.base import Rig, Stream, StreamReport
 from hybridmap.streams.open import kind_of, open_stream, world_of
 from hybridmap.trajectory import NS_PER_S, read_tum
 
@@ -122,7 +122,7 @@ def _try_to_open(found: Inspection, source: str | Path, config: Config, *, skip_
     try:
         stream = open_stream(source, config, skip_damaged=skip_damaged)
         truth = stream.groundtruth
-        lost: dict[str, tuple[int, int]] = _lost_in_all(stream) if skip_damaged else getattr(stream, "lost", {})
+        report = _read_whole(stream) if skip_damaged else StreamReport(lost=getattr(stream, "lost", {}))
     except HybridMapError as error:
         found.reason = str(error)
         found.problems.append(str(error))
@@ -130,21 +130,22 @@ def _try_to_open(found: Inspection, source: str | Path, config: Config, *, skip_
     found.rig = stream.rig
     found.uses |= getattr(stream, "uses", {})
     found.remarks += getattr(stream, "remarks", [])
-    found.lost |= lost
+    found.lost |= report.lost
     losses: dict[str, int] = getattr(stream, "losses", {})
     found.problems += [f"{count} {name}" for name, count in losses.items() if count]
     found.problems += [
         f"{name}: {gone} of {counted(stated, 'message')} cannot be read" for name, (gone, stated) in found.lost.items()
     ]
+    found.problems += report.skips
     if truth is not None:
         found.remarks.append(f"ground truth: {counted(len(truth), 'pose')}")
 
 
-def _lost_in_all(stream: Stream) -> dict[str, tuple[int, int]]:
-    """Read a whole stream; returns what of it was lost (`StreamReport.lost`)."""
+def _read_whole(stream: Stream) -> StreamReport:
+    """Read a whole stream; returns what that found."""
     for _ in stream:
         pass
-    return stream.report.lost
+    return stream.report
 
 
 def _gaps(part: Part) -> list[str]:

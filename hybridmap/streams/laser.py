@@ -26,6 +26,8 @@ _MOST_TILT_COS = 0.9  # a planar laser may lean by 25 deg at most
 _GREY = 0.25
 _MOST_BEAMS = 50_000
 """Beams of a scan; the finest scanners of 2D have some 10,000."""
+_RESAMPLED = "scans with other beams than the first, brought to its beams"
+"""Name of the count of such scans."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +64,7 @@ class ScanDecoder:
 
     Attributes:
         laser: beams, limits and mounting.
-        counts: name of an irregularity (`scans with other beams`) -> number so far.
+        counts: name of an irregularity (`_RESAMPLED`) -> number so far.
     """
 
     def __init__(self, first: Any, pose_base_laser: Array, upside_down: bool, config: SensorsConfig, what: str) -> None:
@@ -127,7 +129,7 @@ class ScanDecoder:
 
     def _resample(self, message: Any, ranges: NDArray[np.float32]) -> NDArray[np.float32]:
         """The nearest beam within half a step of each bearing of the first scan."""
-        self.counts["scans with other beams"] = self.counts.get("scans with other beams", 0) + 1
+        self.counts[_RESAMPLED] = self.counts.get(_RESAMPLED, 0) + 1
         out = np.full(len(self.laser.bearings_rad), np.nan, dtype=np.float32)
         bearings = self._bearings(message)
         if not np.isfinite(bearings).all():

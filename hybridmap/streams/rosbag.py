@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -31,8 +30,6 @@ from hybridmap.streams.mounting import clean_frame, planar
 from hybridmap.streams.order import Window, check_overlap, merge
 from hybridmap.streams.sensors import kind_of, kinds, message_types, wanted
 from hybridmap.trajectory import Trajectory
-
-log = logging.getLogger(__name__)
 
 _MOST_DAMAGED_FIRST = 10
 """How many damaged messages at the beginning of a topic are skipped until its layout is known."""
@@ -113,7 +110,9 @@ class BagStream:
             self.report.count(kind_of(sample).counted if isinstance(sample, Observation) else "odometry")
             yield sample
         if self._plan_made.decode is not None:
-            self.report.counts |= self._plan_made.decode.counts
+            irregular = self._plan_made.decode.counts
+            self.report.counts |= irregular
+            self.report.remarks += [f"{name}: {number} of {len(self._planned)}" for name, number in irregular.items() if number]
 
     def _motions(self) -> Iterator[Sample]:
         for stamp, pose in zip(self._motion_ns, self._motion_poses, strict=True):
@@ -149,9 +148,8 @@ class BagStream:
         except StreamError as error:
             if not self._skip_damaged:
                 raise
-            log.info("skipped: %s", error)
-            topic = messages[0].topic
-            self.report.lose(topic, len(self._index.stamps_ns[topic]))
+            topic, why = messages[0].topic, str(error).removeprefix(f"{self._bag.path}: ")
+            self.report.skip(topic, len(self._index.stamps_ns[topic]), planned.stamp_ns, why)
             return None
 
     def _check_unchanged(self, message: RawMessage) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -32,8 +31,6 @@ from hybridmap.streams.order import Window, check_overlap, merge, pair_nearest, 
 from hybridmap.streams.rgbd import RGBD, RgbdFrame, pinhole
 from hybridmap.streams.sensors import wanted
 from hybridmap.trajectory import Trajectory, read_stamp_ns, read_tum
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +119,7 @@ class TumStream:
             except StreamError as error:
                 if not self._skip_damaged:
                     raise
-                log.info("skipped: %s", error)
-                self.report.lose(name, len(self._pairs))
+                self.report.skip(name, len(self._pairs), pair.stamp_ns, str(error).removeprefix(f"{self._folder}/"))
                 continue
             yield frame
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import resource
 import shutil
 import zlib
@@ -14,6 +15,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from typer.testing import CliRunner
 
+from hybridmap import session
 from hybridmap.cli.app import app
 from hybridmap.cli.map import LOST
 from hybridmap.config import Config
@@ -431,6 +433,17 @@ def test_damaged_scans_are_skipped_and_counted_on_request(tmp_path, damaged):
     scans = [sample for sample in stream if isinstance(sample, LaserScan)]
     assert len(scans) == 6 - len(damaged)
     assert stream.report.lost == {"/scan": (len(damaged), 6)}
+    assert all(f"/scan: message {number + 1} (" in said for number, said in zip(damaged, stream.report.skips, strict=True))
+    assert all(re.match(r"skipped, stamp 10\d\.\d{9} s: /scan: message \d", said) for said in stream.report.skips)
+
+
+def test_of_many_damaged_scans_the_first_few_are_named(tmp_path):
+    path = laser_drive().write(tmp_path / "a.mcap")
+    _damage_some(path, {"/scan": [0, 1, 2, 4, 5]})
+    finished = session.run(open_stream(path, Config(), skip_damaged=True), Config(), tmp_path / "s")
+    said = [remark for remark in finished.head["remarks"] if remark.startswith("skipped")]
+    assert [one.partition(" (")[0].rpartition(": ")[2] for one in said[:3]] == ["message 1", "message 2", "message 3"]
+    assert said[3:] == ["skipped 2 more that are damaged"]
 
 
 def test_inspect_counts_damaged_scans_on_request(tmp_path):

@@ -113,7 +113,8 @@ def test_scans_of_uneven_length_are_brought_to_the_beams_of_the_first(tmp_path):
     stream = open_stream(recording.write(tmp_path / "a.mcap"), Config())
     scans = [sample for sample in stream if isinstance(sample, LaserScan)]
     np.testing.assert_array_equal(scans[1].ranges_m, [np.nan, 7, 8, 9, np.nan])
-    assert stream.report.counts["scans with other beams"] == 1
+    assert stream.report.counts["scans with other beams than the first, brought to its beams"] == 1
+    assert stream.report.remarks[-1] == "scans with other beams than the first, brought to its beams: 1 of 2"
 
 
 def test_mounting_along_a_chain_of_static_and_constant_transforms(tmp_path):

@@ -178,6 +178,7 @@ def test_damaged_and_missing_pictures_are_skipped_and_counted_on_request(folder)
     stream = open_stream(folder, Config(), skip_damaged=True)
     assert len(_frames(stream)) == 1
     assert stream.report.lost == {"rgb.txt": (2, 3)}
+    assert [said.split(": ")[1] for said in stream.report.skips] == ["depth/0.png", "rgb/2.png"]
     (folder / "rgb/1.png").unlink()
     with pytest.raises(StreamError, match="none of its 3 pictures"):
         open_stream(folder, Config(), skip_damaged=True)
