@@ -27,7 +27,8 @@ def evaluate_session(
     folder: Path, reference: Path | None = None, relations: Path | None = None, *, loops: bool = False
 ) -> list[Metric]:
     """Evaluate the trajectories of a session (odometry, and each back-end's final and online one) and store the metrics in its
-    `metrics.json`, where they replace those of the same name. If that file cannot be written, a warning is logged.
+    `metrics.json`, where they replace those of the same name. The files that were given are named there. If that file cannot
+    be written, a warning is logged.
 
     With a reference, its loops and its edges by kind are evaluated as well.
 
@@ -69,7 +70,8 @@ def evaluate_session(
     for name, errors in closures.items():
         metrics += _closure_metrics(name, errors)
     metrics += [*edges, *candidates]
-    session.merge_metrics(metrics)
+    judged_by = {} if truth is None else {"reference": "" if reference is None else str(reference)}
+    session.merge_metrics(metrics, judged_by if relations is None else judged_by | {"relations": str(relations)})
     return metrics
 
 

@@ -62,6 +62,7 @@ def _content(scene: SessionScene, store: MapStore) -> dict[str, Any]:
         "backends": scene.backends,
         "reports": [scene.reports[name] for name in scene.backends if name in scene.reports],
         "known_truth": scene.truth is not None,
+        "judged_by": {"reference": "", "relations": ""} | scene.head.get("judged_by", {}),
         "saw_something": building is not None,
         "tiles": tiles(scene),
         "verdict": scene.head.get("verdict"),

@@ -56,6 +56,7 @@ _HEAD: dict[str, Any] = {
     "remarks": list[str],
     "verdict": str,
     "reasons": list[_Reason],
+    "judged_by": dict[str, str],
 }
 """Keys of `metrics.json` beside the metrics that are read again, and what they hold."""
 
@@ -190,10 +191,16 @@ class SessionFolder:
             raise StoreError(f"{self.metrics_json}: damaged: {found}; map again or delete it") from None
         return MetricsFile(tree, metrics)
 
-    def merge_metrics(self, metrics: Iterable[Metric]) -> None:
+    def merge_metrics(self, metrics: Iterable[Metric], judged_by: dict[str, str] | None = None) -> None:
         """Put metrics into `metrics.json`: one replaces that of the same name in its place, others are added at the end.
 
         If the file cannot be written, it stays as it is and a warning says so.
+
+        Args:
+            metrics: the metrics.
+            judged_by: kind of file (`reference`, `relations`) -> path of the file that the metrics are errors against; it
+                replaces that of the same kind in `judged_by` of `metrics.json`. An empty path stands for the session's own truth, and
+                removes it.
 
         Raises:
             StoreError: the file is damaged.
@@ -201,8 +208,10 @@ class SessionFolder:
         before = self.read_metrics()
         rows = {metric.name: metric for metric in before.metrics}
         rows |= {metric.name: metric for metric in metrics}
+        files = before.head.get("judged_by", {}) | (judged_by or {})
+        named = {"judged_by": {kind: path for kind, path in files.items() if path}} if files else {}
         try:
-            self.write_metrics(before.head, rows.values())
+            self.write_metrics(before.head | named, rows.values())
         except OutputError as error:
             log.warning("%s; the figures are not kept", error)
 

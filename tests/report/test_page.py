@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from hybridmap.errors import StoreError
+from hybridmap.evaluate import evaluate_session
 from hybridmap.metrics import Metric
 from hybridmap.report import write_report
 from hybridmap.store import MapStore, SessionFolder
@@ -135,6 +136,21 @@ def test_little_to_show(tmp_path: Path, known: dict) -> None:
     assert page.open == []
     assert "No ground truth is known" in page.text
     assert "Loop closures, looked at" not in page.text
+
+
+def test_says_what_the_errors_are_against(tmp_path: Path) -> None:
+    folder = write_session(tmp_path / "session", ring_map(1.1), keyframes=False)
+    truth = folder.groundtruth.rename(tmp_path / "truth.tum")
+    evaluate_session(folder.path, truth)
+    text = " ".join(Page(write_report(folder).read_text()).text.split())
+    assert "No ground truth is known" not in text
+    assert "The session holds no ground truth of its own; all are in the frame map" in text
+    assert f"are against the reference {truth}." in text
+    assert folder.read_metrics().head["judged_by"] == {"reference": str(truth)}
+    truth.rename(folder.groundtruth)
+    evaluate_session(folder.path)
+    assert folder.read_metrics().head["judged_by"] == {}
+    assert "are against the reference" not in write_report(folder).read_text()
 
 
 def test_without_any_solution(tmp_path: Path) -> None:
