@@ -20,7 +20,7 @@ from hybridmap.graph.gaps import free_lengths, kidnappings
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.verdict.reasons import Reason
 
-HAIR = 0.1
+NEAR_MISS_SHARE = 0.1
 """A loop that missed its limits by up to this share of them may be right; in one that missed by more the views differ."""
 
 
@@ -31,7 +31,8 @@ class Facts:
     Attributes:
         graph: the E accepted edges, and loops that were measured but are not accepted; of N nodes.
         in_map: (E,) which edges the map was made of: the accepted ones that its back-end did not reject.
-        plausible: (E,) which of the other loops may be right all the same: not those that failed a check by more than `HAIR`.
+        plausible: (E,) which of the other loops may be right all the same: not those that failed a check by more than
+            `NEAR_MISS_SHARE`.
         solution: the solution of the primary back-end, also without a map of its own; None if it never gave one.
         primary: name of that back-end.
         failure: why the primary back-end failed; empty if it did not.
@@ -149,7 +150,7 @@ class Facts:
 
 def _may_be_right(edge: Edge) -> bool:
     """Whether a loop that is not in the map may be right: it was in the map, or missed the limits of its checks by a hair."""
-    return edge.status in (Status.ACCEPTED, Status.RETRACTED) or all(check.slack >= -HAIR for check in edge.failed)
+    return edge.status in (Status.ACCEPTED, Status.RETRACTED) or all(check.slack >= -NEAR_MISS_SHARE for check in edge.failed)
 
 
 def _graph_of(experiences: ExperienceMap, chosen: Sequence[int]) -> PoseGraph:
