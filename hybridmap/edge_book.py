@@ -127,22 +127,28 @@ class EdgeBook:
     def __init__(self, experiences: ExperienceMap, config: EdgesConfig) -> None:
         self._map = experiences
         self._config = config
-        self._edge_of_proposal: dict[int, int] = {}
+        self._number_of_key: dict[int, int] = {}
+        self._proposed: set[int] = set()
         self.tried_again: tuple[int, ...] = ()
         self.motion = MotionEdges(experiences, config)
 
     def enter(self, proposals: Sequence[Edge]) -> list[int]:
         """Write proposed edges into the map; a proposal with the key (`Edge.key`) of an earlier one replaces that one's edge.
 
+        A proposal without a key (-1) is always a new edge.
+
         Returns the numbers of the new and changed edges, odometry edges that a proposal contradicts among them.
         """
         changed = []
         for proposal in proposals:
-            if proposal.key in self._edge_of_proposal:
-                number = self._edge_of_proposal[proposal.key]
+            number = self._number_of_key.get(proposal.key)
+            if number is not None:
                 self._map.update_edge(number, proposal)
             else:
-                number = self._edge_of_proposal[proposal.key] = self._map.add_edge(proposal)
+                number = self._map.add_edge(proposal)
+                self._proposed.add(number)
+                if proposal.key >= 0:
+                    self._number_of_key[proposal.key] = number
             changed += [number, *self.motion.entered(number, proposal)]
         return changed
 
@@ -167,8 +173,7 @@ class EdgeBook:
 
     def proposed(self, numbers: Sequence[int]) -> list[Edge]:
         """Of the edges with these numbers, those that the front-end proposed, in the order of the numbers given."""
-        proposed = set(self._edge_of_proposal.values())
-        return [self._map.edge(number) for number in numbers if number in proposed]
+        return [self._map.edge(number) for number in numbers if number in self._proposed]
 
     def enter_again(self, proposals: Sequence[Edge]) -> list[int]:
         """Write loops that were measured again into the map, as `enter`, and add their numbers to `tried_again`."""

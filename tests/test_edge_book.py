@@ -48,6 +48,11 @@ def test_a_later_proposal_of_the_same_key_replaces_the_edge(book, experiences):
     assert [edge.status for edge in experiences.edges[3:]] == [Status.ACCEPTED, Status.REJECTED]
 
 
+def test_a_proposal_without_a_key_is_always_a_new_edge(book, experiences):
+    assert book.enter([proposal(-1), proposal(-1, Status.REJECTED)]) == [3, 4]
+    assert [edge.status for edge in book.proposed([0, 3, 4])] == [Status.ACCEPTED, Status.REJECTED]
+
+
 def test_a_contradicted_odometry_edge_is_dropped(book, experiences):
     assert book.enter([proposal(0, kind=EdgeKind.REGISTRATION, contradicts=True)]) == [3, 2]
     assert (experiences.edge(2).status, experiences.edge(2).lack) == (Status.RETRACTED, Lack.OVERRULED)
