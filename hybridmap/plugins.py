@@ -68,8 +68,12 @@ class Table(Generic[T]):
     def _loaded(self, point: EntryPoint) -> T:
         try:
             factory: T = point.load()
-        except (ImportError, AttributeError) as error:
-            raise self._error(f"{self._what} {point.name!r}: {point.value} cannot be imported: {error}") from error
+        except Exception as error:
+            if isinstance(error.__cause__, KeyboardInterrupt):  # what compiled libraries make of Ctrl-C while they load
+                raise
+            package = "" if point.dist is None else f" of the package {point.dist.name}"
+            found = f"{type(error).__name__}: {error}"
+            raise self._error(f"{self._what} {point.name!r}{package}: {point.value} cannot be imported: {found}") from error
         return factory
 
 

@@ -35,6 +35,34 @@ def test_an_unknown_name_is_told_what_there_is():
         table()["no"]
 
 
+@pytest.fixture
+def broken(tmp_path, monkeypatch):
+    """Install a package whose module raises while it is imported; returns the table that it extends."""
+
+    def install(raises: str) -> Table[int]:
+        (tmp_path / "brokenthing.py").write_text(f"raise {raises}\n")
+        about = tmp_path / "broken_thing-1.0.dist-info"
+        about.mkdir()
+        (about / "METADATA").write_text("Metadata-Version: 2.1\nName: broken-thing\nVersion: 1.0\n")
+        (about / "entry_points.txt").write_text("[hybridmap.nothing]\ntheirs = brokenthing:make\n")
+        monkeypatch.syspath_prepend(tmp_path)
+        return table()
+
+    return install
+
+
+@pytest.mark.parametrize("raises", ["ImportError('no wheel')", "AttributeError('no wheel')", "ValueError('no wheel')"])
+def test_a_package_that_cannot_be_imported_is_named(broken, raises):
+    with pytest.raises(ConfigError, match=r"thing 'theirs' of the package broken-thing: brokenthing:make .*: no wheel"):
+        broken(raises)["theirs"]
+
+
+def test_ctrl_c_while_a_package_loads_is_no_error_of_the_package(broken):
+    with pytest.raises(ImportError) as stopped:
+        broken("ImportError('failed') from KeyboardInterrupt()")["theirs"]
+    assert isinstance(stopped.value.__cause__, KeyboardInterrupt)
+
+
 def test_an_unknown_front_end_is_told_what_there_is():
     with pytest.raises(ConfigError, match=r"unknown front-end 'sonar'; there are laser, rgbd, none$"):
         Mapper(Config.load(None, {"vision.sensor": "sonar"}))
