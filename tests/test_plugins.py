@@ -10,7 +10,7 @@ from hybridmap.plugins import Table
 from hybridmap.streams.base import Rig
 
 
-def table():
+def table() -> Table[int]:
     return Table("thing", {"own": 1}, "hybridmap.nothing", ConfigError)
 
 

@@ -199,8 +199,8 @@ class SessionFolder:
         Args:
             metrics: the metrics.
             judged_by: kind of file (`reference`, `relations`) -> path of the file that the metrics are errors against; it
-                replaces that of the same kind in `judged_by` of `metrics.json`. An empty path removes it: the session's own truth
-                was used.
+                replaces that of the same kind in `judged_by` of `metrics.json`. An empty path removes it: the session's own
+                truth was used.
 
         Raises:
             StoreError: the file is damaged.
