@@ -13,10 +13,10 @@ from hybridmap.graph.edges import Edge, EdgeKind
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.paths import covariances_from, odometry_covariance
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.motion_edges import MotionEdges
 from hybridmap.streams.synchronise import Ready
 from hybridmap.trajectory import NS_PER_S
 from hybridmap.vision.base import Belief
-from hybridmap.wheel_noise import MotionEdges
 
 
 @dataclass(frozen=True, slots=True)
