@@ -58,10 +58,10 @@ def calibrate(
     The estimate comes from the loop closures of the sessions, or from reference trajectories if they are given. It is
     printed, with standard deviations; the sessions stay as they are.
 
-    --out writes the configuration that all sessions share. If gain, turn gain or heading bias in use differs from the
-    estimate by more than three standard deviations, all three are replaced, but for those that the drives do not determine.
-    The delay is decided by itself: its estimate is what is left beside the delay in use, and is added to that if it is more
-    than three standard deviations from 0. Otherwise they are written as they are.
+    --out writes the configuration that all sessions share, with the values that are replaced. If gain, turn gain or heading
+    bias in use differs from the estimate by more than three standard deviations, all three are replaced, but for those that
+    the drives do not determine. The delay is decided by itself: its estimate is what is left beside the delay in use, and is
+    added to that if it is more than three standard deviations from 0.
     """
     from hybridmap.calibration.estimate import calibrated, changes, metrics_of, verdict
     from hybridmap.calibration.sessions import common_tree, estimate_of, read_drive, require_options

@@ -72,8 +72,9 @@ def compare(
 ) -> None:
     """Compare back-ends on one graph: chi2, status, iterations, CPU seconds, rejected loops, and proof of optimality if found.
 
-    A session with ground truth or verified relations also gets errors (m). A session's graph is solved in batch and
-    incrementally: two rows per back-end. A back-end that fails keeps its row, with the reason. The input is not changed.
+    Each map gets a verdict with its reasons, on the graph alone. A session with ground truth or verified relations also gets
+    errors (m). A session's graph is solved in batch and incrementally: two rows per back-end. A back-end that fails keeps its
+    row, with the reason. The input is not changed.
     """
     from hybridmap.backends import comparison
     from hybridmap.cli.graphs import open_graph, settings_of

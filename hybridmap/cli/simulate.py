@@ -43,7 +43,8 @@ _Kidnap = Annotated[
     bool,
     typer.Option(
         "--kidnap",
-        help="Kidnap the robot: carry it 20 m (simulation.carried_m) to a visited place while its sensors are off.",
+        help="Kidnap the robot: carry it 20 m (simulation.carried_m) to a visited place, or to the farthest one of a smaller"
+        " drive, while its sensors are off.",
     ),
 ]
 _ClockOffset = Annotated[

@@ -30,7 +30,7 @@ _Out = Annotated[
     typer.Option(
         metavar="DIR",
         help="Folder for the results. In an existing study folder, stored results of the same cells are used again, and its"
-        " tables and page are replaced. One with other files is refused.",
+        " tables and page are replaced. A folder with other files is refused.",
     ),
 ]
 _Workers = Annotated[
