@@ -17,6 +17,7 @@ from hybridmap.backends.base import ODOMETRY
 from hybridmap.backends.comparison import Row, Way
 from hybridmap.backends.objective import squared_norms
 from hybridmap.config.backends import BackendsConfig
+from hybridmap.errors import counted
 from hybridmap.geometry import Array
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.gaps import Kidnapping, kidnapping_edges, parted
@@ -82,7 +83,7 @@ def write_comparison(place: Held, compared: Compared) -> Path:
         start=compared.start,
         chi2_start=tables.number(float(squared_norms(graph, graph.initial).sum())),
         facts=[(key, value) for key, value in compared.head.items() if key not in ("nodes", "edges", "loops")],
-        tiles=[(compared.head[key], key) for key in ("nodes", "edges", "loops")],
+        tiles=[counted(compared.head[f"{noun}s"], noun).split() for noun in ("node", "edge", "loop")],
         columns=compared.cells[0],
         rows=[{"cells": line, "bad": not row.has_map} for row, line in zip(rows, compared.cells[1:], strict=True)],
         messages=[(row.title, row.remark, compared.reasons.get(row.title, ())) for row in rows],

@@ -93,15 +93,16 @@ def tiles(scene: SessionScene) -> list[Tile]:
         (f"relation_trans_mean/{scene.primary}", f"relation error of {scene.primary}"),
         ("travel", "driven"),
         ("duration", "recorded"),
-        ("nodes", "nodes"),
-        ("loops_accepted", "loops accepted"),
-        ("loops_rejected", "loops rejected"),
+        ("nodes", "node(s)"),
+        ("loops_accepted", "loop(s) accepted"),
+        ("loops_rejected", "loop(s) rejected"),
         ("cpu_s_per_min", "CPU a minute of recording"),
     ]
     return [_tile(named[name], label) for name, label in dict(reversed(wanted)).items() if name in named][::-1]
 
 
 def _tile(metric: Metric, label: str) -> Tile:
+    label = label.replace("(s)", "" if metric.value == 1 else "s")
     if metric.unit == "m":
         return Tile(*tables.length(metric.value), label)
     if metric.unit == "s/min":

@@ -10,6 +10,8 @@ from hybridmap.errors import StoreError
 from hybridmap.evaluate import evaluate_session
 from hybridmap.metrics import Metric
 from hybridmap.report import write_report
+from hybridmap.report.session_page import tiles
+from hybridmap.report.session_scene import load_scene
 from hybridmap.store import MapStore, SessionFolder
 from tests.store.sessions import ring_map, write_session
 
@@ -82,6 +84,13 @@ def test_shows_every_part(page: Page) -> None:
     assert "not accepted" in page.text
     assert "matches 8 < 12" in page.text
     assert sum(source.startswith("data:image/jpeg") for source in page.sources) == 2 * 4
+
+
+def test_one_loop_is_no_plural(tmp_path: Path) -> None:
+    folder = write_session(tmp_path / "session", ring_map(1.2), keyframes=False)
+    folder.write_metrics({}, [Metric("nodes", 2.0, "1", "nodes"), Metric("loops_accepted", 1.0, "1", "loop closures")])
+    with MapStore.open(folder.path) as store:
+        assert [tile.label for tile in tiles(load_scene(folder, store))] == ["nodes", "loop accepted"]
 
 
 @pytest.mark.parametrize(
