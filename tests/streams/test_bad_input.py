@@ -20,7 +20,7 @@ from hybridmap.cli.app import app
 from hybridmap.cli.map import LOST
 from hybridmap.config import Config
 from hybridmap.config.inputs import SensorsConfig
-from hybridmap.errors import StreamError
+from hybridmap.errors import StreamError, counted
 from hybridmap.store import SessionFolder
 from hybridmap.streams import open_stream
 from hybridmap.streams.cameras import Calibration, DepthRegistration, decode_color
@@ -516,4 +516,4 @@ def test_a_scan_that_no_laser_takes(tmp_path, beams, step):
     for topic, _, message in recording.messages:
         if topic == "/scan":
             message.ranges, message.angle_increment = np.full(beams, 2.0, np.float32), step
-    _refuses(recording.write(tmp_path / "a.mcap"), "/scan", f"{beams} beams")
+    _refuses(recording.write(tmp_path / "a.mcap"), "/scan", counted(beams, "beam"))
