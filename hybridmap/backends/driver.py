@@ -196,7 +196,7 @@ class Driver:
         """The outcome of an update without the solver."""
         status, message = SolveStatus.CONVERGED, "extended by odometry"
         if waiting:
-            status, message = SolveStatus.WAITING, f"{message}; {waiting} loops or registrations wait for a loop closure"
+            status, message = SolveStatus.WAITING, f"{message}; {counted(waiting, 'edge')} waiting for a loop closure"
         return Outcome(start, status, message, 0, self._weights, self._rejected)
 
     def _rose(self, before: float, after: float) -> bool:
@@ -228,13 +228,11 @@ class Driver:
         weak = weak_edges(meant, strain, self._config.robust) if self._softens else {}
         without = (*outcome.rejected, *weak)
         hanging = hanging_nodes(graph, without) if weak else 0
-        note = (
-            f"; {len(weak)} odometry or registration edges down-weighted, {hanging} nodes joined by them alone" if weak else ""
-        )
+        softened = f"; {counted(len(weak), 'edge')} of motion down-weighted, {counted(hanging, 'node')} joined by them alone"
         report = SolveReport(
             backend=self._name,
             status=outcome.status,
-            message=outcome.message + note,
+            message=outcome.message + (softened if weak else ""),
             iterations=outcome.iterations,
             chi2_initial=before,
             chi2=total(squared),

@@ -172,7 +172,7 @@ def test_what_waits_for_a_closure_is_not_called_converged_and_counts_at_the_end_
     backend = backends.create(name)
     *_, last = backends.replay(backend, graph)
     assert last.report.status is SolveStatus.WAITING
-    assert "19 loops or registrations wait" in last.report.message
+    assert "19 edges waiting for a loop closure" in last.report.message
     end, whole = backend.finish(graph), backends.create(name).solve(graph)
     assert end.report.status is SolveStatus.CONVERGED
     assert end.report.chi2 < 0.9 * last.report.chi2
