@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from hybridmap.config.mapping import EdgesConfig
 from hybridmap.errors import GraphError
-from hybridmap.geometry import Array, RelativePose, adjoint, between, compose, inverse
+from hybridmap.geometry import Array, RelativePose, adjoint, between, compose, exp, inverse, log
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
 
@@ -110,19 +110,21 @@ class Chain:
 def chain_of(graph: PoseGraph, poses: Array | None = None) -> Chain:
     """Compose the poses of consecutive nodes from their edges of motion.
 
-    Of several edges of two nodes the most certain gives the motion, and the information of all adds up. Across a break the
+    Of several edges of two nodes the motion is the mean, weighted by their information, which adds up. Across a break the
     composed pose stays the same.
 
     Args:
         graph: the measurements.
         poses: (N, 3) poses to be used instead of the composed ones; None: compose them, with node 0 at the origin.
     """
-    links = _links(graph.with_edges(graph.is_motion))
+    motion = graph.with_edges(graph.is_motion)
+    links = _links(motion)
     steps = np.flatnonzero(links.high == links.low + 1)
-    deltas, covariances = np.zeros((graph.n_nodes, 3)), np.zeros((graph.n_nodes, 3, 3))
-    deltas[links.high[steps]], covariances[links.high[steps]] = links.delta[steps], links.covariance[steps]
+    covariances = np.zeros((graph.n_nodes, 3, 3))
+    covariances[links.high[steps]] = links.covariance[steps]
     if poses is None:
-        poses = np.zeros((graph.n_nodes, 3))
+        poses, deltas = np.zeros((graph.n_nodes, 3)), np.zeros((graph.n_nodes, 3))
+        deltas[links.high[steps]] = _means(motion, links)[steps]
         for node in range(1, graph.n_nodes):
             poses[node] = compose(poses[node - 1], deltas[node])
     carry = adjoint(poses)
@@ -194,14 +196,32 @@ def _propagate(parent: Indices, edge: Indices, down: Indices, carry: Array, step
             done[node] = True
 
 
-def _links(graph: PoseGraph) -> _Links:
-    """All edges from the lower to the higher node, those of one pair fused: their information adds up."""
+def _means(graph: PoseGraph, links: _Links) -> Array:
+    """Poses (L, 3) of the higher nodes of links in the frames of the lower ones: the weighted means of all edges of a pair."""
+    delta, information, key = _upwards(graph)
+    link = np.searchsorted(links.keys, key)
+    pull = np.zeros((len(links.low), 3))
+    np.add.at(pull, link, np.einsum("eij,ej->ei", information, log(between(links.delta[link], delta))))
+    return compose(links.delta, exp(np.einsum("lij,lj->li", links.covariance, pull)))
+
+
+def _upwards(graph: PoseGraph) -> tuple[Array, Array, Indices]:
+    """Every edge from its lower to its higher node: delta (E, 3), information (E, 3, 3), and one number (E,) for each pair."""
     turned = graph.sources > graph.targets
     delta, information = graph.deltas.copy(), graph.information.copy()
     delta[turned] = inverse(graph.deltas[turned])
     back = adjoint(delta[turned])
     information[turned] = back.transpose(0, 2, 1) @ information[turned] @ back
-    key = np.minimum(graph.sources, graph.targets) * graph.n_nodes + np.maximum(graph.sources, graph.targets)
+    return (
+        delta,
+        information,
+        np.minimum(graph.sources, graph.targets) * graph.n_nodes + np.maximum(graph.sources, graph.targets),
+    )
+
+
+def _links(graph: PoseGraph) -> _Links:
+    """All edges from the lower to the higher node, those of one pair fused: their information adds up."""
+    delta, information, key = _upwards(graph)
     order = np.lexsort((-information[:, 0, 0] - information[:, 1, 1], key))
     first = np.flatnonzero(np.diff(key[order], prepend=-1))
     total = np.add.reduceat(information[order], first, axis=0) if len(first) else information

@@ -28,7 +28,9 @@ WAIT_M = 32.0
 REATTACHED_M, REATTACHED_RAD = 0.5, float(np.deg2rad(10.0))
 """Standard deviations of the edge that replaces a broken one, m and rad: loose, as the closures place the node."""
 SAME_PLACE_SIGMA = 2.0
-"""A robot found within so many of these deviations of its pose by the chain was not kidnapped."""
+"""A robot found within so many of these deviations of its pose by the chain, and the drift of the chain, was not kidnapped."""
+BENDING = 4.0
+"""Factor on the standard deviation of the chain, as for the gate of loops: it bends more than independent edges would."""
 BELOW_HALF = float(np.nextafter(0.5, 0.0))
 """Contradicting matches must weigh less than half of the agreeing ones."""
 KEPT_STEPS = 1000
@@ -253,9 +255,18 @@ class Relocaliser:
         )
 
     def _is_elsewhere(self, broken_at: int, accepted: tuple[Edge, ...], belief: Belief) -> bool:
-        off = between(belief.poses_map_node[broken_at], placed_by(accepted, broken_at, belief.poses_map_node))
-        sigmas = max(np.hypot(off[0], off[1]) / REATTACHED_M, abs(off[2]) / REATTACHED_RAD)
-        return bool(sigmas > SAME_PLACE_SIGMA)
+        """Whether matches put the node after a break elsewhere than the chain can have drifted on the way to the first of them.
+
+        A break in a sparse scene may be a bad registration. Found again after a long way, the robot is off by the drift.
+        """
+        poses, first = belief.poses_map_node, min(accepted, key=lambda match: match.source)
+        drift = BENDING**2 * belief.covariance_from(first.target)[first.source]
+        drift = np.where(np.isfinite(drift), drift, 0.0)  # no motion joins them: the chain says nothing of where it is
+        drift_m2 = float(np.linalg.eigvalsh(drift[:2, :2])[1])
+        off = between(poses[broken_at], placed_by(accepted, broken_at, poses))
+        by_place = np.hypot(off[0], off[1]) / np.sqrt(REATTACHED_M**2 + drift_m2)
+        by_heading = abs(off[2]) / np.sqrt(REATTACHED_RAD**2 + drift[2, 2])
+        return bool(max(by_place, by_heading) > SAME_PLACE_SIGMA)
 
     def _reattached(self, broken_at: int, accepted: tuple[Edge, ...], belief: Belief) -> Edge:
         """The edge to the first node after the break, by way of the matches; it replaces the odometry."""

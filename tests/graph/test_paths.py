@@ -5,8 +5,9 @@ import time
 import numpy as np
 import pytest
 
+from hybridmap.backends.registry import create
 from hybridmap.errors import GraphError
-from hybridmap.geometry import RelativePose, compose, compose_relative, invert_relative
+from hybridmap.geometry import RelativePose, between, compose, compose_relative, inverse, invert_relative
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.paths import chain_of, covariances_from
 from hybridmap.graph.pose_graph import PoseGraph
@@ -103,6 +104,7 @@ def test_an_unknown_node_is_refused():
 
 def test_the_way_between_two_nodes_of_a_chain_is_that_along_its_edges():
     graph = graph_of([(0, 1), (2, 1), (2, 3), (3, 4), (2, 3)], np.random.default_rng(0), 5)
+    graph.deltas[4] = graph.deltas[2]
     chain = chain_of(graph)
     first, second = np.array([0, 1, 2, 3]), np.array([4, 3, 4, 0])
     ways = chain.ways(first, second)
@@ -110,6 +112,16 @@ def test_the_way_between_two_nodes_of_a_chain_is_that_along_its_edges():
         assert np.allclose(covariance, covariances_from(graph)(source)[target])
         assert np.allclose(compose(chain.poses[source], delta), chain.poses[target])
     assert np.allclose(compose(chain.poses[3], graph.deltas[3]), chain.poses[4])
+
+
+def test_the_motion_of_several_edges_is_where_least_squares_has_it():
+    graph = graph_of([(0, 1), (1, 0), (0, 1), (1, 2)], np.random.default_rng(3), 3)
+    back = inverse(graph.deltas[1])
+    graph.deltas[0] = compose(back, np.array([0.002, -0.001, 0.0005]))
+    graph.deltas[2] = compose(back, np.array([-0.001, 0.003, -0.0008]))
+    best = create("gtsam-lm").solve(graph)
+    chain = chain_of(graph)
+    assert between(best.poses[0], best.poses[1:]) == pytest.approx(between(chain.poses[0], chain.poses[1:]), abs=1e-5)
 
 
 def test_nothing_is_known_of_a_way_across_a_break():

@@ -1,5 +1,6 @@
 """Sightings of a lost robot wait for each other, and enter together with the edge that joins the broken chain again."""
 
+from dataclasses import replace
 from itertools import count
 
 import numpy as np
@@ -98,6 +99,20 @@ def test_a_robot_found_where_the_chain_has_it_was_not_carried():
     assert search.verdicts(EdgeKind.REGISTRATION) == []
     assert search.settlements[-1].kidnapped_to is None
     assert not search.lost
+
+
+@pytest.mark.parametrize(("sigma_m", "carried"), [(0.1, True), (2.0, False)])
+def test_a_robot_found_within_the_drift_of_a_long_way_was_not_carried(sigma_m, carried):
+    drift = np.diag([sigma_m**2, sigma_m**2, 1e-6])
+    search = Search()
+    for node in range(BROKEN_AT, BROKEN_AT + 4):
+        belief = seen_until(node)
+        relative = RelativePose(np.zeros(3), np.eye(3) * 1e-4)
+        edge = Edge(node, THERE + node - BROKEN_AT, EdgeKind.LOOP, Status.PENDING, relative, key=next(search.keys))
+        far = replace(belief, covariance_from=lambda _: np.broadcast_to(drift, (200, 3, 3)))
+        settled = search.relocaliser.settle([GlobalMatch(edge)], far)
+    assert len(settled.accepted) == 4
+    assert (settled.kidnapped_to == BROKEN_AT) is carried
 
 
 def test_sightings_that_enter_have_passed_what_they_are_held_against():

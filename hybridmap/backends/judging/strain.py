@@ -54,8 +54,8 @@ def largest_bend(graph: PoseGraph, poses: Array, variance: float = 1.0) -> Bend 
     """The stretch of 5, 10 or 20 m that a map bends most against the edges of motion, in standard deviations.
 
     Args:
-        graph: the measurements. Of several edges of motion (odometry, registration) of two nodes the most certain gives the
-            motion, and the information of all adds up.
+        graph: the measurements. Of several edges of motion (odometry, registration) of two nodes the motion is the weighted
+            mean, as `graph.paths.chain_of` has it.
         poses: (N, 3) poses of the map, m and rad.
         variance: factor on the covariances of the edges.
 
