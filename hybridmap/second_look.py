@@ -26,6 +26,7 @@ from hybridmap.backends.judging.breaks import (
 )
 from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.judging.rivals import rivals, spans
+from hybridmap.backends.judging.strain import largest_bend
 from hybridmap.backends.objective import gate_of, squared_norms
 from hybridmap.config import Config
 from hybridmap.edge_book import EdgeBook
@@ -78,7 +79,7 @@ class _Disputed:
         graph: the edges of the map, and the loops that were refused only because the map did not expect them.
         poses: (N, 3) the map, m and rad.
         outliers: (L,) indices of the loops that do not fit it.
-        claimed: nodes to whose steps groups of them point.
+        claimed: nodes to whose steps groups of them point, and one amid the stretch of the chain that the map bends most.
         asked: node -> checks of whether the robot drove there from the node before, for the steps that many of them span.
     """
 
@@ -167,6 +168,8 @@ class SecondLook:
         groups = rejected_clusters(graph, poses, tuple(graph.edge_ids[outliers].tolist()), self._gate)
         found = rivals(graph, poses, groups, graph.is_loop & ~refused & ~outliers)
         claimed = {one.node for one in found if one.spanning >= LEAST_LOOPS}
+        if (bend := largest_bend(graph.with_edges(~outliers), poses)) is not None:
+            claimed.add((bend.first + bend.last) // 2)
         return _Disputed(graph, poses, np.flatnonzero(outliers), claimed, asked)
 
     def _unexpected(self) -> list[int]:
