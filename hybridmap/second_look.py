@@ -26,11 +26,11 @@ from hybridmap.backends.judging.breaks import (
 )
 from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.judging.rivals import rivals, spans
-from hybridmap.backends.judging.strain import largest_bend
+from hybridmap.backends.judging.strain import BENT_MAX, largest_bend
 from hybridmap.backends.objective import gate_of, squared_norms
 from hybridmap.config import Config
 from hybridmap.edge_book import EdgeBook
-from hybridmap.geometry import Array, RelativePose, between
+from hybridmap.geometry import IDENTITY, Array, RelativePose, between
 from hybridmap.graph.contradictions import contradictions
 from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Status, at_most
 from hybridmap.graph.experience_map import ExperienceMap
@@ -147,14 +147,14 @@ class SecondLook:
             return None
         known = {one.after for one in kidnappings(self._map)}
         trials = [self._trial(disputed, place) for place in sorted((disputed.claimed | _oddest(disputed.asked)) - known)]
-        paying = [trial for trial in trials if trial is not None and trial.found.pays]
+        paying = [trial for trial in trials if trial is not None and (trial.found.pays or trial.found.straightens)]
         most = max((trial.found.gain for trial in paying), default=0.0)
         good = [trial for trial in paying if trial.found.gain >= EQUAL * most]
         best = max(good, key=lambda trial: (len(trial.signs), trial.found.gain), default=None)
         return None if best is None else self._divided(disputed, best)
 
     def _disputed(self, solution: Solution) -> _Disputed | None:
-        """What the loops say that are against the map; None if they are too few, or the map may not be parted."""
+        """What the loops say that are against the map; None if they are too few and the map does not bend the chain either."""
         if not self._may_part:
             return None
         own, poses = self._map.pose_graph().edge_ids, solution.poses
@@ -162,13 +162,16 @@ class SecondLook:
         refused = ~np.isin(graph.edge_ids, own)
         outliers = graph.is_loop & np.isin(graph.edge_ids, solution.report.rejected_edge_ids)
         outliers |= refused & (squared_norms(graph, poses) > self._gate)
-        if np.count_nonzero(outliers) < LEAST_LOOPS:
+        variance = min(solution.report.unit_variance or 1.0, 1.0)
+        bend = largest_bend(graph.with_edges(~outliers & ~refused), poses, variance)
+        bent = bend is not None and bend.sigmas > BENT_MAX
+        if np.count_nonzero(outliers) < LEAST_LOOPS and not bent:
             return None
         asked = self._asked(np.flatnonzero(spans(graph, outliers) >= LEAST_LOOPS))
         groups = rejected_clusters(graph, poses, tuple(graph.edge_ids[outliers].tolist()), self._gate)
         found = rivals(graph, poses, groups, graph.is_loop & ~refused & ~outliers)
         claimed = {one.node for one in found if one.spanning >= LEAST_LOOPS}
-        if (bend := largest_bend(graph.with_edges(~outliers), poses)) is not None:
+        if bend is not None:
             claimed.add((bend.first + bend.last) // 2)
         return _Disputed(graph, poses, np.flatnonzero(outliers), claimed, asked)
 
@@ -194,10 +197,10 @@ class SecondLook:
             if divided.node == trial.place:
                 return replace(trial, signs=(*trial.signs, divided.evidence))
             there = self._trial(disputed, divided.node)
-            if there is None or not there.found.pays:
+            if there is None or not (there.found.pays or there.found.straightens):
                 break
             trial = there
-        return trial if trial.signs else None
+        return trial if trial.signs and trial.found.pays else None
 
     def _asked(self, places: Indices) -> dict[int, tuple[Check, ...]]:
         """Checks of whether the robot drove to each of some nodes: registration against wheels, and what it saw."""
@@ -212,9 +215,7 @@ class SecondLook:
         graph, poses = disputed.graph, disputed.poses
         clear = self._clear(graph, place)
         voting = disputed.outliers[leads_across(graph, place)[disputed.outliers]]
-        if not len(voting):
-            return None
-        motion = wanted_motion(graph, poses, voting, place)
+        motion = wanted_motion(graph, poses, voting, place) if len(voting) else IDENTITY
         solved = self._backends.trial(loosened(graph.with_edges(clear), poses, place, motion))
         if solved is None:
             return None

@@ -12,7 +12,7 @@ from hybridmap.backends.base import ODOMETRY, SolveStatus
 from hybridmap.backends.judging.breaks import SAME_DEG, SAME_M
 from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.judging.rivals import Rival, admitted, rivals, spans
-from hybridmap.backends.judging.strain import bend_of, largest_bend, lone_pull, optimum, recalibrated, rejected_pull
+from hybridmap.backends.judging.strain import BENT_MAX, bend_of, largest_bend, lone_pull, optimum, recalibrated, rejected_pull
 from hybridmap.backends.objective import SLACK, squared_norms, unit_variance
 from hybridmap.calibration.clock import MATTERS_S, TRANSPORT_S, ClockState
 from hybridmap.errors import BackendError
@@ -35,9 +35,6 @@ PULLED_MAX_M = 0.05
 """Most by which rejected loops may pull a map, RMS, m: the error below which studies call a map right in any case."""
 AS_MEANT = (SolveStatus.CONVERGED, SolveStatus.WAITING, SolveStatus.MAX_ITERATIONS)
 """Statuses of a solver that ended as it should. Whether it is at an optimum is asked apart, as a relaxation may end before."""
-BENT_MAX = 10.0
-"""Standard deviations by which a map may bend a stretch of the chain of motion. Right maps stay below 6; wrong loops, a
-kidnapping or a bent odometry give more than 14."""
 UNSETTLED_MAX_M = 0.5
 """Distance of a node from the optimum of the map's own edges, m. A relaxation that ends early is off by some 0.4 m at its
 worst node, outliers that a kernel does not silence pull by more."""

@@ -67,6 +67,16 @@ def test_loosening_a_sound_chain_does_not_pay(plain):
     assert not freed(graph, solution.poses, again.poses, AT, GATE, np.ones(graph.n_edges, dtype=bool)).pays
 
 
+def test_loosening_a_chain_that_loops_bend_straightens_it(carried, plain):
+    for graph, straightens in ((carried[0], True), (plain[0], False)):
+        poses = create("gtsam-lm", BackendsConfig()).solve(graph).poses
+        again = create("gtsam-lm", BackendsConfig()).solve(loosened(graph, poses, AT, np.zeros(3))).poses
+        found = freed(graph, poses, again, AT, np.inf, np.ones(graph.n_edges, dtype=bool))
+        assert not found.pays
+        found = freed(graph, poses, again, AT, GATE, np.ones(graph.n_edges, dtype=bool))
+        assert found.straightens is straightens
+
+
 def test_a_loosened_graph_keeps_all_but_the_motion_across(plain):
     graph, _ = plain
     loose = loosened(graph, graph.initial, AT, np.array([1.0, 0.0, 0.0]))

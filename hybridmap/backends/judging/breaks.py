@@ -99,6 +99,7 @@ class Freed:
         gain: fall of the cost: truncated for loops, whole for edges of motion.
         motion: (3,) how the node has moved on the map against the one before it, as a transform of the map, m and rad.
         pays: whether so many loops are freed at so little cost that the chain was wrong.
+        straightens: whether loops that fit had bent the chain so much that as many freed ones would not lower the cost more.
     """
 
     loops: Indices
@@ -106,6 +107,7 @@ class Freed:
     gain: float
     motion: Array
     pays: bool
+    straightens: bool
 
 
 def freed(graph: PoseGraph, poses: Array, solved: Array, place: int, gate: float, clear: Mask) -> Freed:
@@ -121,15 +123,19 @@ def freed(graph: PoseGraph, poses: Array, solved: Array, place: int, gate: float
             count if they are lost.
     """
     before, after = squared_norms(graph, poses), squared_norms(graph, solved)
-    loops, motion_edges = graph.is_loop, graph.is_motion & ~leads_across(graph, place)
+    loops, across = graph.is_loop, leads_across(graph, place)
+    motion_edges = graph.is_motion & ~across
     edges = np.flatnonzero(loops & (before > gate) & (after <= gate))
     lost = int(np.count_nonzero(loops & clear & (before <= gate) & (after > gate)))
     fall = np.minimum(before, gate) - np.minimum(after, gate)
-    crossing = before[graph.is_motion & leads_across(graph, place)].sum()
+    crossing = before[graph.is_motion & across].sum()
     counted = loops & (clear | (fall > 0.0))
     gain = float(fall[counted].sum() + (before - after)[motion_edges].sum() + crossing)
     expected = compose(solved[place - 1], between(poses[place - 1], poses[place]))
     motion = compose(solved[place], inverse(expected))
     worth = gain > GAIN * gate * len(edges) and len(edges) >= OUTWEIGHS * lost
-    pays = bool(worth and is_group(graph, edges) and moves(motion, poses, place))
-    return Freed(graph.edge_ids[edges], lost, gain, motion, pays)
+    moved = moves(motion, poses, place)
+    pays = bool(worth and is_group(graph, edges) and moved)
+    bent = gain > GAIN * gate * max(LEAST_LOOPS, OUTWEIGHS * lost) and moved
+    straightens = bool(bent and is_group(graph, np.flatnonzero(loops & across & (after <= gate))))
+    return Freed(graph.edge_ids[edges], lost, gain, motion, pays, straightens)

@@ -29,6 +29,9 @@ from hybridmap.odometry_model import NEUTRAL, Gains
 
 WINDOWS_M = (5.0, 10.0, 20.0)
 """Stretches on which map and chain are compared: shorter ones judge single edges, longer ones the drift of good odometry."""
+BENT_MAX = 10.0
+"""Standard deviations by which a map may bend a stretch of the chain of motion. Right maps stay below 6; wrong loops, a
+kidnapping or a bent odometry give more than 14."""
 APART_M = 10.0
 """Way between the middles of two sets of loops from which on they say different things about the chain of motion."""
 _ITERATIONS, _TOLERANCE = 30, 1e-9
