@@ -34,7 +34,7 @@ def divide(atlas: Atlas, place: int, poses: Array) -> Division | None:
         poses: (N, 3) of the nodes on a map whose chain is loose before `place`, m and rad.
 
     Returns:
-        None if there is no scan to be asked.
+        None if there is no scan to be asked, or the whole piece of the chain is on one side.
     """
     travel_m = np.asarray(atlas.travel_m)
     rest = np.flatnonzero(np.abs(travel_m - travel_m[place]) > MAP_M)
@@ -50,6 +50,8 @@ def divide(atlas: Atlas, place: int, poses: Array) -> Division | None:
         return None
     later = np.nan_to_num(better)[::-1].cumsum()[::-1]
     first = int(np.argmax(later))
+    if asked[first] == atlas.piece(place).start:
+        return None
     return Division(int(asked[first]), *checks.of_division(float(later[first])))
 
 

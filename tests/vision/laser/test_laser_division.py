@@ -36,12 +36,16 @@ def carried():
     return atlas_of(truth, np.concatenate([truth[:AT], felt])), truth
 
 
+def loosened(atlas, truth, place):
+    """Poses of the nodes on a map whose chain is loose before a place: both ends of the drive are right."""
+    chain = np.array(atlas.chain)
+    return np.concatenate([chain[:place], compose(truth[-1], between(chain[-1], chain[place:]))])
+
+
 @pytest.mark.parametrize("place", [AT - 6, AT, AT + 5])
 def test_scans_find_the_node_of_a_carry_from_a_place_nearby(carried, place):
     atlas, truth = carried
-    chain = np.array(atlas.chain)
-    loose = np.concatenate([chain[:place], compose(truth[-1], between(chain[-1], chain[place:]))])
-    found = known(divide(atlas, place, loose))
+    found = known(divide(atlas, place, loosened(atlas, truth, place)))
     assert found.node == AT
     assert not found.evidence.passed
 
@@ -56,6 +60,14 @@ def test_scans_do_not_part_a_chain_that_is_right(carried):
 def test_scans_tell_nothing_where_the_map_has_no_others():
     way = ring_drive(0.5)[::EVERY]
     assert divide(atlas_of(way, way), len(way) // 2, way) is None
+
+
+def test_a_piece_that_lies_wholly_after_a_kidnapping_is_not_parted_again(carried):
+    atlas, truth = carried
+    place = AT + 4
+    atlas.part(AT)
+    assert divide(atlas, place, loosened(atlas, truth, place)) is None
+    atlas.join(AT)
 
 
 def test_scans_on_either_side_of_a_jump_between_two_nodes_are_put_right():
