@@ -18,13 +18,14 @@ from hybridmap.backends.driver import Ensemble
 from hybridmap.backends.judging.breaks import (
     LEAST_LOOPS,
     Freed,
+    drove,
     freed,
     leads_across,
     loosened,
     shift,
     wanted_motion,
 )
-from hybridmap.backends.judging.clusters import rejected_clusters
+from hybridmap.backends.judging.clusters import loops_of, rejected_clusters
 from hybridmap.backends.judging.rivals import rivals, spans
 from hybridmap.backends.judging.strain import BENT_MAX, largest_bend
 from hybridmap.backends.objective import gate_of, squared_norms
@@ -35,6 +36,7 @@ from hybridmap.graph.contradictions import contradictions
 from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Status, at_most
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.gaps import kidnappings
+from hybridmap.graph.paths import chain_of
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.metrics import StageClock
 from hybridmap.vision.base import Belief, FrontEnd, PartingFrontEnd, VerifyingFrontEnd
@@ -151,7 +153,17 @@ class SecondLook:
         most = max((trial.found.gain for trial in paying), default=0.0)
         good = [trial for trial in paying if trial.found.gain >= EQUAL * most]
         best = max(good, key=lambda trial: (len(trial.signs), trial.found.gain), default=None)
-        return None if best is None else self._divided(disputed, best)
+        return None if best is None or self._drove(disputed, best) else self._divided(disputed, best)
+
+    def _drove(self, disputed: _Disputed, trial: _Trial) -> bool:
+        """Whether dead reckoning has the robot where the loops that a trial frees have it: then it was not carried."""
+        edges = enumerate(self._map.edges)
+        own = [n for n, edge in edges if edge.kind is EdgeKind.ODOMETRY and edge.relative and not edge.spans_kidnapping]
+        wheels = chain_of(self._map.pose_graph(also=own).only(EdgeKind.ODOMETRY))
+        graph, place = disputed.graph, trial.place
+        freed_there = np.isin(graph.edge_ids, trial.found.loops) & leads_across(graph, place)
+        step = between(trial.solved[place - 1], trial.solved[place])
+        return bool(freed_there.any()) and drove(wheels, loops_of(graph, np.flatnonzero(freed_there)), place, step)
 
     def _disputed(self, solution: Solution) -> _Disputed | None:
         """What the loops say that are against the map; None if they are too few and the map does not bend the chain either."""

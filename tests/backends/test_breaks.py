@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybridmap.backends.judging.breaks import freed, leads_across, loosened, moves, shift, wanted_motion
+from hybridmap.backends.judging.breaks import drove, freed, leads_across, loosened, moves, shift, wanted_motion
 from hybridmap.backends.objective import gate_of
 from hybridmap.backends.registry import create
 from hybridmap.config.backends import BackendsConfig
-from hybridmap.geometry import align, between, compose
+from hybridmap.geometry import RelativePose, align, between, compose
+from hybridmap.graph.agreement import Loops
 from hybridmap.graph.edges import EdgeKind
-from hybridmap.graph.paths import chain
+from hybridmap.graph.paths import Chain, chain
 from tests.backends.graphs_for_tests import laps
 
 CARRIED, AT = np.array([1.0, 0.3, 0.1]), 35
@@ -92,3 +93,21 @@ def test_a_motion_within_the_noise_moves_nothing():
     assert not moves(np.array([0.05, 0.0, 0.0]), poses, 1)
     assert moves(np.array([0.3, 0.0, 0.0]), poses, 1)
     assert shift(np.array([0.3, 0.4, 0.0]), poses, 1) == pytest.approx((0.5, 0.0))
+
+
+@pytest.mark.parametrize("sigma_m", [0.03, 3.0])
+@pytest.mark.parametrize(("carried_m", "expected"), [(0.0, True), (0.5, True), (1.5, False), (3.0, False)])
+def test_a_robot_drove_where_its_wheels_agree_with_loops_and_not_where_they_lack_the_carry(carried_m, sigma_m, expected):
+    """On a bent map loops want node 10 put down 3 m farther on; in truth the robot was carried there by less, or not at all."""
+    way = np.column_stack([0.5 * np.arange(21.0), np.zeros(21), np.zeros(21)])
+    there = way + np.where(np.arange(21) < 10, 0.0, carried_m)[:, None] * np.array([1.0, 0.0, 0.0])
+    grown = np.arange(21.0)[:, None, None] * np.diag([sigma_m**2, sigma_m**2, 1e-8])
+    wheels, sure = Chain(way, grown, np.zeros(0, dtype=np.int64)), np.diag([0.01, 0.01, 0.01]) ** 2
+    loops = Loops.measured([(a, b, RelativePose(between(there[a], there[b]), sure)) for a, b in [(0, 18), (1, 19), (2, 20)]])
+    assert drove(wheels, loops, 10, np.array([0.5 + 3.0, 0.0, 0.0])) is expected
+
+
+def test_nothing_tells_whether_a_robot_drove_where_its_wheels_are_not_known():
+    wheels = Chain(np.zeros((10, 3)), np.zeros((10, 3, 3)), np.array([5]))
+    loops = Loops.measured([(1, 8, RelativePose(np.zeros(3), np.eye(3)))])
+    assert not drove(wheels, loops, 5, np.array([3.0, 0.0, 0.0]))

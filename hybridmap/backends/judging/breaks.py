@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from hybridmap.backends.judging.clusters import loops_of
 from hybridmap.backends.objective import squared_norms
-from hybridmap.geometry import Array, between, compose, inverse, wrap_angle
-from hybridmap.graph.agreement import Indices
+from hybridmap.geometry import Array, between, compose, inverse, log, wrap_angle
+from hybridmap.graph.agreement import Indices, Loops, Ring
 from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.paths import Chain
 from hybridmap.graph.pose_graph import PoseGraph
 
 Mask = NDArray[np.bool_]
@@ -26,6 +27,9 @@ OUTWEIGHS = 4.0
 """The freed loops must be so many times those that are lost."""
 GAIN = 0.5
 """Least fall of the truncated cost, as a share of what the freed loops cost while they were rejected."""
+FARTHER = 3.0
+"""A carry is refuted where dead reckoning with it is so many times as far from the loops as without it. Wheels that err by as
+much as the robot was carried refute one carry in a hundred by chance, better and worse ones fewer."""
 SAME_M, SAME_DEG = 0.1, 2.0
 """Loops that move the map by less contradict the noise of the solution and not the solution, m and degrees."""
 LOOSE_M, LOOSE_RAD = 0.5, float(np.deg2rad(10.0))
@@ -139,3 +143,27 @@ def freed(graph: PoseGraph, poses: Array, solved: Array, place: int, gate: float
     bent = gain > GAIN * gate * max(LEAST_LOOPS, OUTWEIGHS * lost) and moved
     straightens = bool(bent and is_group(graph, np.flatnonzero(loops & across & (after <= gate))))
     return Freed(graph.edge_ids[edges], lost, gain, motion, pays, straightens)
+
+
+def drove(wheels: Chain, loops: Loops, place: int, step: Array) -> bool:
+    """Whether dead reckoning alone says that the robot drove to a node where loops want it carried there.
+
+    Wheels feel no carry: after one, they are off by it until it is put into them. Where they are much farther off with it
+    than without, the robot drove, and registrations are wrong. How large the noise of the wheels is does not count.
+
+    Args:
+        wheels: the chain of the odometry edges.
+        loops: the loops that say that the robot was carried, each from before the node to after it.
+        place: the node.
+        step: (3,) its pose in the frame of the node before, with the carry, m and rad.
+    """
+    poses = wheels.poses.copy()
+    poses[place:] = compose(compose(poses[place - 1], step), between(wheels.poses[place], wheels.poses[place:]))
+    without, carried = (np.median(_off(replace(wheels, poses=way), loops)) for way in (wheels.poses, poses))
+    return bool(np.isfinite(without) and carried > FARTHER**2 * without)
+
+
+def _off(wheels: Chain, loops: Loops) -> Array:
+    """Squared Mahalanobis distance (L,) of the loops from a chain; infinite across its breaks."""
+    ways = wheels.ways(loops.older, loops.newer)
+    return Ring(log(between(ways.delta, loops.relative.delta)), ways.covariance + loops.relative.covariance).distance
