@@ -157,8 +157,11 @@ class SecondLook:
 
     def _drove(self, disputed: _Disputed, trial: _Trial) -> bool:
         """Whether dead reckoning has the robot where the loops that a trial frees have it: then it was not carried."""
-        edges = enumerate(self._map.edges)
-        own = [n for n, edge in edges if edge.kind is EdgeKind.ODOMETRY and edge.relative and not edge.spans_kidnapping]
+        own = [
+            number
+            for number, edge in enumerate(self._map.edges)
+            if edge.kind is EdgeKind.ODOMETRY and edge.relative is not None and not edge.spans_kidnapping
+        ]
         wheels = chain_of(self._map.pose_graph(also=own).only(EdgeKind.ODOMETRY))
         graph, place = disputed.graph, trial.place
         freed_there = np.isin(graph.edge_ids, trial.found.loops) & leads_across(graph, place)
