@@ -8,10 +8,11 @@ import pytest
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, between, compose, log
-from hybridmap.graph.edges import EdgeKind, Search, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Search, Status
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
 from hybridmap.vision.base import DenseFrontEnd, VerifyingFrontEnd
+from hybridmap.vision.laser import checks
 from hybridmap.vision.laser.front_end import LaserFrontEnd
 from tests.vision.laser.laser_worlds import LASER, Run, cast, corridor, drifting, ring, ring_drive, room
 
@@ -109,6 +110,23 @@ def test_scans_between_nodes_are_put_right_on_the_final_map(two_laps):
     off = between(between(two_laps.truth[0], two_laps.truth[index]), compose(final[retraced.nodes], retraced.deltas))
     assert np.percentile(np.hypot(off[:, 0], off[:, 1]), 95) < 0.03
     assert np.percentile(np.abs(off[:, 2]), 95) < np.deg2rad(0.5)
+
+
+@pytest.mark.parametrize(
+    ("asked", "lack", "unexpected"),
+    [
+        (checks.of_gate(4.0, 1.0, 3.0, 20.0), None, True),
+        ((), Lack.UNSUPPORTED, True),
+        ((), Lack.CONTRADICTED, True),
+        (checks.of_gate(4.0, 1.0, 3.0, 20.0), Lack.NOT_LOST, False),
+        ((), Lack.KIDNAPPED, False),
+        (checks.of_free_space(0.3), None, False),
+        (checks.of_free_space(0.3), Lack.UNSUPPORTED, False),
+    ],
+)
+def test_a_loop_is_unexpected_if_all_that_was_seen_fits(two_laps, asked, lack, unexpected):
+    loop = Edge.decided(9, 1, EdgeKind.LOOP, two_laps.loops(Status.ACCEPTED)[0].relative, asked, lack)
+    assert two_laps.front_end.unexpected(loop) is unexpected
 
 
 def test_two_different_rooms_are_not_one():
