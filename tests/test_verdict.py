@@ -14,6 +14,7 @@ from hybridmap.calibration.clock import ClockOffset, ClockState
 from hybridmap.geometry import RelativePose, apart_m, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status, at_least
 from hybridmap.graph.experience_map import ExperienceMap, Node
+from hybridmap.graph.io import read_graph
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.study.false_loops import inject, with_drift
 from hybridmap.study.model import DriftConfig, SyntheticConfig
@@ -211,6 +212,18 @@ def test_two_lone_loops_confirm_each_other_if_they_say_the_same(clean, other_m, 
     noisy = overstated(clean)
     graph = with_loops(noisy, backends.create("gtsam-lm").solve(noisy).poses, [(0, 150, 3.0), (12, 162, other_m)])
     assert ("loops alone" in kinds_of(graph)) is speaks
+
+
+@pytest.mark.parametrize("backend", ["gtsam-lm", "gtsam-gnc"])
+@pytest.mark.parametrize("file", ["input_INTEL_g2o.g2o", "FR079_P_toro.graph", "intel.g2o", "CSAIL.g2o"])
+def test_clean_public_graphs_are_trusted(file, backend, data_dir):
+    assert kinds_of(read_graph(data_dir / "posegraphs" / file), backend) == set()
+
+
+def test_a_lone_false_loop_in_a_public_graph_is_doubted(data_dir):
+    graph = read_graph(data_dir / "posegraphs" / "input_INTEL_g2o.g2o")
+    poses = backends.create("gtsam-lm").solve(graph).poses
+    assert "loops alone" in kinds_of(with_loops(graph, poses, [(300, 900, 2.0)]))
 
 
 @pytest.mark.parametrize(("backend", "speaks"), [("gtsam-huber", True), ("gtsam-gnc", False)])
