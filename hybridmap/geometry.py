@@ -235,6 +235,22 @@ def apart_m(poses_a: ArrayLike, poses_b: ArrayLike) -> float:
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 
+def squared_distance(error: Array, covariance: Array) -> Array:
+    """Squared Mahalanobis distance (E,) of errors (E, k) with covariances (E, k, k), all finite.
+
+    Where a covariance is singular, as the numbers of a file may make it, directions that are certain beyond the precision of
+    its numbers are left out.
+    """
+    try:
+        solved = np.linalg.solve(covariance, error[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        scale = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), np.finfo(np.float64).tiny))
+        correlation = np.nan_to_num(covariance / scale[..., :, None] / scale[..., None, :])
+        inverse_of = np.linalg.pinv(correlation, hermitian=True)
+        solved = np.einsum("...ij,...j->...i", inverse_of, error / scale) / scale
+    return np.asarray(np.einsum("...i,...i->...", error, solved))
+
+
 def loosest_direction(covariance: Array) -> tuple[float, float]:
     """Largest standard deviation (m) of the position of a planar pose, and its direction: an axis in [-pi/2, pi/2) rad from x.
 

@@ -101,3 +101,13 @@ def test_a_quaternion_of_another_length_has_the_same_heading_and_none_has_none()
     assert np.allclose(g.yaw_from_quaternion(*(2.5 * unit).T), [0.3, -2.0, 3.0])
     for none in ((0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1e300, 1.0), (0.0, 0.0, np.nan, 1.0), (0.0, 0.0, np.inf, 1.0)):
         assert np.isnan(g.yaw_from_quaternion(*none))
+
+
+def test_squared_distances_of_errors_also_where_a_covariance_is_singular():
+    error = np.array([[1.0, 2.0, 0.0], [0.0, 0.0, 3.0]])
+    regular = np.array([np.diag([1.0, 4.0, 1.0]), np.diag([1.0, 1.0, 9.0])])
+    assert g.squared_distance(error, regular) == pytest.approx([2.0, 1.0])
+    assert g.squared_distance(error[0], regular[0]) == pytest.approx(2.0)
+    alike = np.array([[[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]], np.diag([1.0, 1.0, 9.0])])
+    assert g.squared_distance(np.array([[1.0, 1.0, 0.0], error[1]]), alike) == pytest.approx([1.0, 1.0])
+    assert np.isfinite(g.squared_distance(error, np.array([np.diag([1e300, 1e-300, 0.0]), regular[1]]))).all()

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.geometry import Array, between, log, wrap_angle
+from hybridmap.geometry import Array, between, log, squared_distance, wrap_angle
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.trajectory import NS_PER_S, Trajectory, known_at
@@ -215,7 +215,7 @@ def normalised_errors(edges: list[Edge], poses: Array) -> tuple[Array, Array]:
     delta = np.array([m.delta for m in measured]).reshape(-1, 3)
     covariance = np.array([m.covariance for m in measured]).reshape(-1, 3, 3)
     error = log(between(delta, between(poses[ends[:, 0]], poses[ends[:, 1]])))
-    return error, np.einsum("ei,ei->e", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+    return error, squared_distance(error, covariance)
 
 
 def _true_nodes(experiences: ExperienceMap, truth: Trajectory) -> tuple[NDArray[np.int64], Array, NDArray[np.bool_]]:

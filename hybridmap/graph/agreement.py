@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from hybridmap.geometry import Array, RelativePose, between, compose_relative, invert_relative, log
+from hybridmap.geometry import Array, RelativePose, between, compose_relative, invert_relative, log, squared_distance
 
 Indices = NDArray[np.int64]
 Ways = Callable[[Indices, Indices], RelativePose]
@@ -87,9 +87,8 @@ class Ring:
         It is infinite where the covariance is unknown.
         """
         known: NDArray[np.bool_] = np.asarray(np.isfinite(self.covariance).all(axis=(-2, -1)))
-        error, covariance = self.error[known], self.covariance[known]
         out = np.full(len(known), np.inf)
-        out[known] = np.einsum("ei,ei->e", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+        out[known] = squared_distance(self.error[known], self.covariance[known])
         return out
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybridmap.geometry import RelativePose, between, log
+from hybridmap.geometry import RelativePose, between, log, squared_distance
 from hybridmap.graph.edges import Edge, EdgeKind
 
 ODD, ODD_FACTOR = 98.0, 1.5
@@ -44,5 +44,5 @@ def contradictions(edges: Sequence[Edge]) -> Contradictions:
         elif edge.kind is EdgeKind.REGISTRATION and edge.target in odometry:
             wheels = odometry[edge.target]
             error = log(between(wheels.delta, edge.relative.delta))
-            sigmas[edge.target] = float(np.sqrt(error @ np.linalg.solve(wheels.covariance, error)))
+            sigmas[edge.target] = float(np.sqrt(squared_distance(error, wheels.covariance)))
     return Contradictions(sigmas, ODD_FACTOR * float(np.percentile(list(sigmas.values()), ODD)) if sigmas else 0.0)

@@ -11,7 +11,7 @@ from scipy.sparse.linalg import splu
 
 from hybridmap.backends.objective import SLACK, residuals
 from hybridmap.errors import BackendError
-from hybridmap.geometry import Array, adjoint, between
+from hybridmap.geometry import Array, adjoint, between, squared_distance
 from hybridmap.graph.agreement import chi2_quantile
 from hybridmap.graph.pose_graph import PoseGraph
 
@@ -39,7 +39,7 @@ def expected_loops(
     covariance = Covariances(backbone, poses).relative(graph.sources[loops], graph.targets[loops])
     covariance = (covariance + np.linalg.inv(graph.information[loops])) * min(1.0, variance)
     r = residuals(graph.with_edges(loops), poses)
-    innovation = np.einsum("ei,ei->e", r, np.linalg.solve(covariance, r[:, :, None])[:, :, 0])
+    innovation = squared_distance(r, covariance)
     return np.asarray(innovation <= (SLACK * chi2_quantile(_EXPECTED) if bound is None else bound))
 
 

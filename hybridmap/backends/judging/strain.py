@@ -21,7 +21,7 @@ from hybridmap.backends.judging.clusters import lone_loops, loops_of
 from hybridmap.backends.objective import residuals, squared_norms, unit_variance
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError, EvaluationError
-from hybridmap.geometry import Array, apart_m, between, log
+from hybridmap.geometry import Array, apart_m, between, log, squared_distance
 from hybridmap.graph.agreement import BOUND, QUANTILE, Loops, Ring, ring
 from hybridmap.graph.paths import Chain, chain_of, own_odometry
 from hybridmap.graph.pose_graph import PoseGraph
@@ -88,7 +88,7 @@ def _most_bent(chain: Chain, poses: Array, first: NDArray[np.int64], last: NDArr
     if not len(first):
         return None
     error = log(between(ways.delta[known], between(poses[first], poses[last])))
-    squared = np.einsum("ei,ei->e", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+    squared = squared_distance(error, covariance)
     worst = int(np.argmax(squared))
     apart_m = math.hypot(*error[worst, :2])
     return Bend(int(first[worst]), int(last[worst]), math.sqrt(squared[worst]), apart_m)
