@@ -202,3 +202,26 @@ def test_a_map_bent_until_all_loops_fit_is_not_taken_for_a_good_one(data_dir):
     clean = backends.create("gtsam-lm").solve(graph).poses
     false = inject(graph, 0.1, "random", np.random.default_rng(0))
     assert ate(backends.create("gtsam-gnc").solve(false).poses, clean) < 0.05
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("file", ["intel.g2o", "input_INTEL_g2o.g2o"])
+def test_one_false_loop_does_not_move_the_map(data_dir, file, seed):
+    graph = read_graph(data_dir / "posegraphs" / file)
+    loops = int(graph.is_loop.sum())
+    false = inject(graph, 1.0 / (loops + 1), "random", np.random.default_rng(seed))
+    solution = backends.create("gtsam-gnc").solve(false)
+    assert int(false.edge_ids[-1]) in solution.report.rejected_edge_ids
+    assert ate(solution.poses, backends.create("gtsam-lm").solve(graph).poses) < 0.05
+
+
+def test_a_lone_loop_that_bends_a_map_of_overstated_noise_is_left_out():
+    laps_of_20, _ = laps(np.random.default_rng(3), nodes=60, per_lap=20)
+    graph = replace(laps_of_20, information=laps_of_20.information * 1e-3)  # noise stated 30 times too large: all fits
+    clean = backends.create("gtsam-lm").solve(graph).poses
+    false = inject(graph, 1.0 / (int(graph.is_loop.sum()) + 1), "random", np.random.default_rng(2))
+    assert ate(backends.create("gtsam-lm").solve(false).poses, clean) > 0.05
+    solution = backends.create("gtsam-gnc").solve(false)
+    assert solution.report.rejected_edge_ids == (int(false.edge_ids[-1]),)
+    assert ate(solution.poses, clean) < 0.02
+    assert backends.create("gtsam-gnc").solve(graph).report.rejected_edge_ids == ()

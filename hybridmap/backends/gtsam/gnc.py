@@ -49,6 +49,8 @@ _ROUGHLY = 10.0  # of the bound, before the first iteration
 _QUICK = (2, 12)  # iterations before each look: where loops agree few are needed, where they do not they are of no use
 _MOSTLY, _ALMOST_ALL = 0.9, 0.97  # share of loops that least squares must agree with, on the way and in the end
 
+_LAST_RESORT = "headings of all loops"
+"""Begins with all loops, also false ones: only where the other attempts, from dead reckoning, reject most loops."""
 _GIVES_UP = (RuntimeError, BackendError, np.linalg.LinAlgError)  # gtsam raises nothing more specific than the first
 
 Whole = Callable[[PoseGraph, BackendsConfig, Array | None], Outcome]
@@ -283,7 +285,8 @@ def create(name: str, config: BackendsConfig, whole: Whole | None = None) -> Dri
 def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outcome:
     """Run the configured attempts until a result convinces; if none does, take the one with the lowest truncated cost.
 
-    A result convinces if no rejected loops agree with each other, or if two different attempts lead to it. With a kernel on
+    A result convinces if no rejected loops agree with each other, or if two different attempts lead to it and it keeps more
+    than half of the loops: two attempts from dead reckoning may both be lost. With a kernel on
     odometry, which false loops may tear, every loop must fit as well. The map of the drive `driven` (N, 3) may be bent by false
     loops: if a run from it rejects loops, it only competes with the next convincing result. An attempt that fails is left out;
     if all fail, the result is that of least squares with all loops, and the status says so.
@@ -293,6 +296,8 @@ def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outc
     failures: list[str] = []
     tearable = config.robust.odometry != "none"
     for name, attempt in attempts(graph, config, driven).items():
+        if name == _LAST_RESORT and any(_share(result.kept) > 0.5 for result in results.values()):
+            continue
         try:
             found = attempt()
         except _GIVES_UP as error:
@@ -300,9 +305,9 @@ def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outc
             continue
         if found is None:
             continue
-        if not found.kept.all():
-            found = _tested(graph, found, config)
+        found = _without_lone(graph, found, config) if found.kept.all() else _tested(graph, found, config)
         agreed = name == "grown" and any(np.array_equal(found.kept, other.kept) for other in results.values())
+        agreed = agreed and _share(found.kept) > 0.5
         if tearable:
             convincing = found.kept.all() and unit_variance(graph, squared_norms(graph, found.poses)) <= SLACK
         else:
@@ -321,6 +326,20 @@ def _tested(graph: PoseGraph, found: Truncated, config: BackendsConfig) -> Trunc
         return on_probation(graph, found, config)
     except _GIVES_UP as error:
         return replace(found, lack=f"lone loops were not tested ({first_line(error)})")
+
+
+def _without_lone(graph: PoseGraph, found: Truncated, config: BackendsConfig) -> Truncated:
+    """A result that keeps all loops, or the one without lone loops that bend it, if that is cheaper.
+
+    Where a file overstates its noise, one false loop bends the map until all loops fit. So the costs are compared at the bound
+    that the residuals of the map without it suggest.
+    """
+    rival = _tested(graph, found, config)
+    if rival.kept.all():
+        return found
+    bound = found.bound * min(1.0, SLACK * _variance(graph, rival, config))
+    bent, straight = (truncated_cost(graph, one.poses, bound, config.robust) for one in (found, rival))
+    return replace(rival, bound=bound) if straight < bent else found
 
 
 def _least_squares(graph: PoseGraph, config: BackendsConfig, why: str) -> Outcome:
@@ -361,6 +380,7 @@ def attempts(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> 
     ways["grown"] = lambda: grow(graph, config, _PATIENT)
     if config.gnc.start == "auto":
         ways["grown, near loops first"] = lambda: grow(graph, config, _NEAR_FIRST)
+        ways[_LAST_RESORT] = lambda: graduate(graph, best_start(graph, graph.initial), config, _PATIENT)
     if config.gnc.start == "auto" and config.robust.odometry != "none":
         ways["kernels"] = lambda: _from_kernels(graph, config)
         ways["grown on stiff odometry"] = lambda: _softened_last(graph, config)
