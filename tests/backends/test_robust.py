@@ -204,14 +204,21 @@ def test_a_map_bent_until_all_loops_fit_is_not_taken_for_a_good_one(data_dir):
     assert ate(backends.create("gtsam-gnc").solve(false).poses, clean) < 0.05
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("file", ["intel.g2o", "input_INTEL_g2o.g2o"])
-def test_one_false_loop_does_not_move_the_map(data_dir, file, seed):
+@pytest.mark.parametrize(
+    ("file", "count", "seed"),
+    [
+        *(("intel.g2o", 1, seed) for seed in range(3)),
+        *(("input_INTEL_g2o.g2o", 1, seed) for seed in range(3)),
+        ("intel.g2o", 8, 1),
+        ("intel.g2o", 20, 2),
+    ],
+)
+def test_a_few_false_loops_do_not_move_the_map(data_dir, file, count, seed):
     graph = read_graph(data_dir / "posegraphs" / file)
     loops = int(graph.is_loop.sum())
-    false = inject(graph, 1.0 / (loops + 1), "random", np.random.default_rng(seed))
+    false = inject(graph, count / (loops + count), "random", np.random.default_rng(seed))
     solution = backends.create("gtsam-gnc").solve(false)
-    assert int(false.edge_ids[-1]) in solution.report.rejected_edge_ids
+    assert set(false.edge_ids[-count:].tolist()) <= set(solution.report.rejected_edge_ids)
     assert ate(solution.poses, backends.create("gtsam-lm").solve(graph).poses) < 0.05
 
 

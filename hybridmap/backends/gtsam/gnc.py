@@ -49,6 +49,8 @@ _ROUGHLY = 10.0  # of the bound, before the first iteration
 _QUICK = (2, 12)  # iterations before each look: where loops agree few are needed, where they do not they are of no use
 _MOSTLY, _ALMOST_ALL = 0.9, 0.97  # share of loops that least squares must agree with, on the way and in the end
 
+_BENDABLE = ("least squares", "drive")
+"""Attempts whose start false loops may have bent, until other true loops fit no better than these."""
 _LAST_RESORT = "headings of all loops"
 """Begins with all loops, also false ones: only where the other attempts, from dead reckoning, reject most loops."""
 _GIVES_UP = (RuntimeError, BackendError, np.linalg.LinAlgError)  # gtsam raises nothing more specific than the first
@@ -286,10 +288,10 @@ def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outc
     """Run the configured attempts until a result convinces; if none does, take the one with the lowest truncated cost.
 
     A result convinces if no rejected loops agree with each other, or if two different attempts lead to it and it keeps more
-    than half of the loops: two attempts from dead reckoning may both be lost. With a kernel on
-    odometry, which false loops may tear, every loop must fit as well. The map of the drive `driven` (N, 3) may be bent by false
-    loops: if a run from it rejects loops, it only competes with the next convincing result. An attempt that fails is left out;
-    if all fail, the result is that of least squares with all loops, and the status says so.
+    than half of the loops: two attempts from dead reckoning may both be lost. With a kernel on odometry, which false loops may
+    tear, every loop must fit as well. Least squares with all loops, and the map of the drive `driven` (N, 3), may be bent by
+    false loops: if a run from either rejects loops, it only competes with the next convincing result. An attempt that fails is
+    left out; if all fail, the result is that of least squares with all loops, and the status says so.
     """
     results: dict[str, Truncated] = {}
     unconfirmed: dict[str, Truncated] = {}
@@ -312,7 +314,7 @@ def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outc
             convincing = found.kept.all() and unit_variance(graph, squared_norms(graph, found.poses)) <= SLACK
         else:
             convincing = agreed or not rejected_clusters(graph, found.poses, _rejected(graph, found), found.bound)
-        if convincing and name == "drive" and not found.kept.all():
+        if convincing and name in _BENDABLE and not found.kept.all():
             unconfirmed[name] = found
         elif convincing:
             return _cheapest(graph, {**unconfirmed, name: found}, config)
