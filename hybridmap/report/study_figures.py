@@ -281,4 +281,4 @@ def _joined(*parts: str) -> str:
 
 
 def _percent(share: float) -> str:
-    return f"{100.0 * share:g} %"
+    return f"{100.0 * share + 0.0:g} %"  # so that -0 reads as 0

@@ -125,6 +125,10 @@ def test_differences_beyond_the_panels_are_counted_and_names_of_several_words_qu
     assert "2 further groups are left out" in text
 
 
+def test_a_share_of_minus_zero_is_zero(made):
+    assert "0 %" in text_of(made(lambda _: 1.0, false_loops={"rates": [-0.0, 0.2], "kinds": ["random"]}))
+
+
 @pytest.mark.parametrize(("measure", "error"), [("ate_m", "ATE"), ("relation_m", "relation error")])
 def test_the_axis_of_the_differences_names_the_error_that_is_compared(made, monkeypatch, measure, error):
     pairs = study_figures.paired_groups(made(better_by_the_seed, seeds=3).summaries, "ate_m")
