@@ -106,10 +106,14 @@ class SecondOpinion:
         return corrected
 
     def _better(self, loops: Sequence[Edge], since: int, belief: Belief) -> list[GlobalMatch]:
-        """Matches elsewhere on the map, of nodes with loops across `since` that fit clearly worse where the map has them."""
+        """Matches elsewhere on the map, of nodes with loops across `since` that fit clearly worse where the map has them.
+
+        There are none if as many of these nodes fit clearly better where the map has them.
+        """
         nodes = np.unique([loop.source for loop in loops if loop.source >= since > loop.target])
         asked = nodes[np.unique(np.linspace(0, len(nodes) - 1, ASKED).round().astype(np.int64))]
         out: list[GlobalMatch] = []
+        better, clearly, dissent = 0, 0.5 * self._witness.worse, 0
         for node in asked.tolist():
             found = self._witness.matches(node, since)
             is_here = [
@@ -117,10 +121,12 @@ class SecondOpinion:
             ]
             there = [match for match, yes in zip(found, is_here, strict=True) if not yes]
             here = [match.mismatch for match, yes in zip(found, is_here, strict=True) if yes]
-            here += [self._witness.misfit(loop) for loop in loops if loop.source == node]
-            if min((match.mismatch for match in there), default=np.inf) + 0.5 * self._witness.worse <= min(here):
-                out += there
-        return out
+            here += [self._witness.misfit(loop) for loop in loops if loop.source == node and loop.target < since]
+            best_there, best_here = min((match.mismatch for match in there), default=np.inf), float(np.nanmin(here))
+            dissent += best_here + clearly <= best_there
+            if best_there + clearly <= best_here:
+                better, out = better + 1, out + there
+        return out if better > dissent else []
 
 
 def _contradicted(edges: Sequence[Edge], carried_to: int, travel_m: Array, reach_m: float) -> list[Edge]:
@@ -128,7 +134,7 @@ def _contradicted(edges: Sequence[Edge], carried_to: int, travel_m: Array, reach
     out = []
     for edge in edges:
         across = min(edge.source, edge.target) < carried_to <= max(edge.source, edge.target)
-        blurred = abs(travel_m[edge.source] - travel_m[carried_to]) < reach_m
+        blurred = min(abs(travel_m[end] - travel_m[carried_to]) for end in (edge.source, edge.target)) < reach_m
         if across or (blurred and edge.kind is EdgeKind.LOOP):
             out.append(replace(edge.settled(lack=Lack.KIDNAPPED), contradicts_odometry=False))
     return out
@@ -148,7 +154,8 @@ def worse_since(loops: Sequence[Edge], registrations: Sequence[Edge], witness: W
     """
     seen = [(loop.source, loop.target, witness.misfit(loop)) for loop in loops]
     sources, targets, misfits = np.array([one for one in seen if np.isfinite(one[2])]).reshape(-1, 3).T
-    usual = float(np.nanmean([witness.misfit(edge) for edge in registrations])) if registrations else 0.0
+    steps = np.array([witness.misfit(edge) for edge in registrations])
+    usual = float(steps[np.isfinite(steps)].mean()) if np.isfinite(steps).any() else 0.0
     worst, since = witness.worse, None
     for node in np.unique(sources).astype(np.int64).tolist():
         across: NDArray[np.bool_] = (sources >= node) & (targets < node)

@@ -21,7 +21,7 @@ from hybridmap.backends.gtsam.covariance import expected_loops
 from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph, factors, noise_models, poses_of, values
 from hybridmap.backends.gtsam.initial import best_start, trusted_start
 from hybridmap.backends.gtsam.robust import WarmKernel, with_kernel
-from hybridmap.backends.judging.clusters import lone_loops, rejected_clusters
+from hybridmap.backends.judging.clusters import bypassed, lone_loops, rejected_clusters
 from hybridmap.backends.objective import (
     SLACK,
     gate_of,
@@ -49,10 +49,8 @@ _ROUGHLY = 10.0  # of the bound, before the first iteration
 _QUICK = (2, 12)  # iterations before each look: where loops agree few are needed, where they do not they are of no use
 _MOSTLY, _ALMOST_ALL = 0.9, 0.97  # share of loops that least squares must agree with, on the way and in the end
 
-_BENDABLE = ("least squares", "drive")
-"""Attempts whose start false loops may have bent, until other true loops fit no better than these."""
-_LAST_RESORT = "headings of all loops"
-"""Begins with all loops, also false ones: only where the other attempts, from dead reckoning, reject most loops."""
+_BENDABLE = ("least squares", "drive")  # attempts whose start false loops may have bent
+_LAST_RESORT = "headings of all loops"  # begins with false loops too: only where those from dead reckoning reject most loops
 _GIVES_UP = (RuntimeError, BackendError, np.linalg.LinAlgError)  # gtsam raises nothing more specific than the first
 
 Whole = Callable[[PoseGraph, BackendsConfig, Array | None], Outcome]
@@ -293,8 +291,7 @@ def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outc
     false loops: if a run from either rejects loops, it only competes with the next convincing result. An attempt that fails is
     left out; if all fail, the result is that of least squares with all loops, and the status says so.
     """
-    results: dict[str, Truncated] = {}
-    unconfirmed: dict[str, Truncated] = {}
+    results, unconfirmed = dict[str, Truncated](), dict[str, Truncated]()
     failures: list[str] = []
     tearable = config.robust.odometry != "none"
     for name, attempt in attempts(graph, config, driven).items():
@@ -308,8 +305,8 @@ def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outc
         if found is None:
             continue
         found = _without_lone(graph, found, config) if found.kept.all() else _tested(graph, found, config)
-        agreed = name == "grown" and any(np.array_equal(found.kept, other.kept) for other in results.values())
-        agreed = agreed and _share(found.kept) > 0.5
+        sides = results.values() if name == "grown" and _share(found.kept) > 0.5 else ()
+        agreed = any(np.array_equal(found.kept, other.kept) for other in sides)
         if tearable:
             convincing = found.kept.all() and unit_variance(graph, squared_norms(graph, found.poses)) <= SLACK
         else:
@@ -331,13 +328,12 @@ def _tested(graph: PoseGraph, found: Truncated, config: BackendsConfig) -> Trunc
 
 
 def _without_lone(graph: PoseGraph, found: Truncated, config: BackendsConfig) -> Truncated:
-    """A result that keeps all loops, or the one without lone loops that bend it, if that is cheaper.
+    """A result that keeps all loops, or the one without lone loops that bend it, if that is cheaper and other loops contradict.
 
-    Where a file overstates its noise, one false loop bends the map until all loops fit. So the costs are compared at the bound
-    that the residuals of the map without it suggest.
+    Where a file overstates its noise, one false loop bends the map until all fit: the costs are compared at an honest bound.
     """
     rival = _tested(graph, found, config)
-    if rival.kept.all():
+    if rival.kept.all() or not bypassed(graph, np.flatnonzero(graph.is_loop)[~rival.kept]).all():
         return found
     bound = found.bound * min(1.0, SLACK * _variance(graph, rival, config))
     bent, straight = (truncated_cost(graph, one.poses, bound, config.robust) for one in (found, rival))
@@ -345,17 +341,13 @@ def _without_lone(graph: PoseGraph, found: Truncated, config: BackendsConfig) ->
 
 
 def _least_squares(graph: PoseGraph, config: BackendsConfig, why: str) -> Outcome:
-    """Least squares with all loops, where no attempt of graduated non-convexity came to an end."""
+    """Least squares with all loops, where no attempt came to an end."""
     start = best_start(graph, graph.initial)
     outcome = run("lm", factor_graph(graph, NoiseModels()), start, config.max_iterations)
     message = f"gnc could not go on ({why}); least squares with all loops instead; {outcome.message}"
     weights = dict.fromkeys(graph.edge_ids[graph.is_loop].tolist(), 1.0)
-    return replace(
-        outcome,
-        status=SolveStatus.FELL_BACK if outcome.status.has_map else outcome.status,
-        message=message,
-        weights=weights,
-    )
+    status = SolveStatus.FELL_BACK if outcome.status.has_map else outcome.status
+    return replace(outcome, status=status, message=message, weights=weights)
 
 
 def attempts(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> dict[str, Callable[[], Truncated | None]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from hybridmap.backends.objective import parts
@@ -45,6 +45,30 @@ def lone_loops(graph: PoseGraph) -> NDArray[np.int64]:
     lone = np.delete(loops, np.unique(neighbouring_pairs(graph, loops)))
     part = parts(graph, tuple(graph.edge_ids[lone].tolist()))
     return np.asarray(lone[part[graph.sources[lone]] == part[graph.targets[lone]]])
+
+
+def bypassed(graph: PoseGraph, loops: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which (L,) of some loops other loops speak for or against: not only dead reckoning says where their ends are.
+
+    The other edges join the ends of such a loop by a way that is at most half as long as that of motion alone.
+    """
+    if not len(loops):
+        return np.zeros(0, dtype=bool)
+    rest = graph.with_edges(np.setdiff1d(np.arange(graph.n_edges), loops))
+    first, ends = np.unique(graph.sources[loops], return_inverse=True)
+    ways = [_lengths(one, first)[ends, graph.targets[loops]] for one in (rest, rest.with_edges(rest.is_motion))]
+    return np.asarray(np.isfinite(ways[0]) & (ways[0] <= 0.5 * ways[1]))
+
+
+def _lengths(graph: PoseGraph, nodes: NDArray[np.int64]) -> Array:
+    """(n, N) length of the shortest way from some nodes (n,) to each node along the edges, m; infinite where there is none."""
+    length = np.hypot(*graph.deltas[:, :2].T) + 1e-9  # an edge of no length is one all the same
+    ends = np.sort(np.stack([graph.sources, graph.targets]), axis=0)
+    order = np.lexsort((length, *ends))
+    ends, length = ends[:, order], length[order]
+    shortest = np.any(np.diff(ends, axis=1, prepend=-1) != 0, axis=0)
+    matrix = coo_array((length[shortest], tuple(ends[:, shortest])), shape=(graph.n_nodes, graph.n_nodes))
+    return np.asarray(dijkstra(matrix.tocsr(), directed=False, indices=nodes))
 
 
 def loops_of(graph: PoseGraph, edges: NDArray[np.int64]) -> Loops:

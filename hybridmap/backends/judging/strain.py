@@ -99,6 +99,10 @@ def optimum(graph: PoseGraph, poses: Array) -> Array:
     return run("lm", factor_graph(graph, NoiseModels()), poses, _ITERATIONS, tolerance=_TOLERANCE).poses
 
 
+MOST_PAIRS = 20_000
+"""Most pairs of lone loops that are asked whether they confirm each other: of more, some would by chance."""
+
+
 @dataclass(frozen=True, slots=True)
 class Pull:
     """What the rejected loops of a map do to it.
@@ -242,7 +246,7 @@ def _confirmed(loops: Loops, chain: Chain, variance: float) -> NDArray[np.bool_]
     """
     confirmed = np.zeros(len(loops.older), dtype=bool)
     first, second = np.triu_indices(len(confirmed), 1)
-    if not len(first):
+    if not 0 < len(first) <= MOST_PAIRS:
         return confirmed
     off = log(between(loops.relative.delta, between(chain.poses[loops.older], chain.poses[loops.newer])))
     chance = np.zeros(len(first))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -68,9 +70,10 @@ class Reviser:
                 found.append(self.register(int(node), other, belief.poses_map_node))
         return found
 
-    def restart(self) -> None:
-        """Begin the rounds anew: the map is another one."""
-        self._rounds, self._done = 0, set()
+    def restart(self, carried_to: int, retracted: Collection[tuple[int, int]]) -> None:
+        """Begin the rounds anew with pairs across a carry, to the node `carried_to`, and those whose loops were retracted."""
+        across = {(node, other) for node, other in self._done if other < carried_to <= node}
+        self._rounds, self._done = 0, self._done - across - set(retracted)
 
     def _grid(self) -> NDArray[np.int64]:
         """Nodes about every so many metres of travel."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from hybridmap.graph.edges import Edge, EdgeKind
+from hybridmap.graph.edges import Edge, EdgeKind, Lack
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.hypotheses import LENGTH_M, Prober
 from hybridmap.vision.laser.kidnapping import RECENT_M, SPAN_M, Continuity, GlobalLocalisation
@@ -20,7 +20,7 @@ class ScanWitness:
 
     worse = 2.0 * MISMATCH_SCALE
     span_m = SPAN_M
-    reach_m = LENGTH_M
+    reach_m = 0.5 * LENGTH_M
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class ScanWitness:
         recent = self._atlas.along(node, RECENT_M, 0.0)
         probe = self._atlas.submap(node, recent[recent >= since])
         found = self._prober.probe_anywhere(probe, self._localisation.most_similar(node, anchors))
-        return self._localisation.matches([hypothesis for hypothesis in found if hypothesis.passed])
+        return [GlobalMatch(h.proposed(self.new_key(), Lack.WAITING), h.misfit) for h in found if h.passed]
 
     def carried_to(self, matches: Sequence[Edge], since: int, belief: Belief) -> range:
         """The first node whose scan fits the scans from well before `since` better where the matches put it."""
@@ -64,4 +64,4 @@ class ScanWitness:
         for edge in edges:
             if edge.kidnapped_m is not None:
                 self._atlas.part(edge.target)
-        self._reviser.restart()
+                self._reviser.restart(edge.target, [(e.source, e.target) for e in edges if e.lack is Lack.KIDNAPPED])
