@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from hybridmap.calibration.legs import Motion, corrected
 from hybridmap.calibration.regression import Sighting, regress, require_leg
 from hybridmap.config import Config
 from hybridmap.config.gone import without_gone
-from hybridmap.errors import EvaluationError, counted
+from hybridmap.errors import EvaluationError, StoreError, counted
 from hybridmap.geometry import Array, between
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
@@ -72,7 +73,7 @@ def read_drive(folder: Path) -> Drive:
     """Read a session folder.
 
     Raises:
-        StoreError: the folder holds no session.
+        StoreError: the folder holds no session, or its map file has no number for the offset of the clocks.
         ConfigError: gains, delay or back-ends of its configuration are invalid.
         EvaluationError: the session holds no odometry.
     """
@@ -82,7 +83,10 @@ def read_drive(folder: Path) -> Drive:
         tree = store.config_tree
         config = _understood(tree, f"{store.path}: configuration")
         changes, primary = store.info(GAIN_CHANGES) or [], store.primary
-        delay_s = (config.sensors.odometry_delay_s or 0.0) + float(store.info(CLOCK_OFFSET) or 0.0)
+        offset_s = store.info(CLOCK_OFFSET) or 0.0
+        if not isinstance(offset_s, int | float) or not math.isfinite(offset_s):
+            raise StoreError(f"{store.path}: {CLOCK_OFFSET}: expected a number of seconds, found {str(offset_s)[:40]}")
+        delay_s = (config.sensors.odometry_delay_s or 0.0) + float(offset_s)
         sensors = " and ".join(words(store.rig)) or "no sensor but odometry"
     if len(track) < 2:
         raise EvaluationError(f"{folder}: holds no odometry to calibrate; give a session of a drive with wheel odometry")

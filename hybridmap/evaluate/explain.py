@@ -262,7 +262,9 @@ class Explainer:
         after = self._map.node(node + 1) if node + 1 < len(self._map) else None
         believed = {ODOMETRY: track.poses_odom[at]}
         for name in self._store.online_backends():
-            believed[name] = self._store.online(name).at(np.array([stamp]))[0]
+            online = self._store.online(name)
+            if len(online):
+                believed[name] = online.at(np.array([stamp]))[0]
         return FrameStory(
             stamp_ns=stamp,
             time_s=self._since_start(stamp),

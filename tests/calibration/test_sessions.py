@@ -1,12 +1,14 @@
 """Whole sessions: the gains in use are taken out, maps and references give the same answer."""
 
+import sqlite3
+
 import numpy as np
 import pytest
 
 from hybridmap.calibration.estimate import Estimate
 from hybridmap.calibration.legs import corrected
 from hybridmap.calibration.sessions import common_tree, estimate_of, read_drive
-from hybridmap.errors import EvaluationError
+from hybridmap.errors import EvaluationError, StoreError
 from hybridmap.geometry import between
 from hybridmap.odometry_model import NEUTRAL, Gains
 from hybridmap.trajectory import Trajectory
@@ -64,6 +66,16 @@ def test_a_map_of_odometry_alone_is_refused(tmp_path):
     read = read_drive(write_session(tmp_path / "s", one, np.random.default_rng(0), registered=False))
     with pytest.raises(EvaluationError, match="holds odometry edges only"):
         estimate_of([read], [], "alternating")
+
+
+@pytest.mark.parametrize("value", ['{"a": 1}', '"late"', "NaN"])
+def test_a_clock_offset_that_is_no_number_is_refused(one, tmp_path, value):
+    folder = write_session(tmp_path / "s", one, np.random.default_rng(0))
+    with sqlite3.connect(folder / "map.db") as written:
+        written.execute("INSERT OR REPLACE INTO info VALUES ('clock_offset', ?)", (value,))
+    written.close()
+    with pytest.raises(StoreError, match="clock_offset: expected a number of seconds, found"):
+        read_drive(folder)
 
 
 def test_a_reference_of_another_clock_is_refused(one, tmp_path):
