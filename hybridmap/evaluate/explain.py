@@ -262,8 +262,7 @@ class Explainer:
         after = self._map.node(node + 1) if node + 1 < len(self._map) else None
         believed = {ODOMETRY: track.poses_odom[at]}
         for name in self._store.online_backends():
-            online = self._store.online(name)
-            if len(online):
+            if len(online := self._store.online(name)):
                 believed[name] = online.at(np.array([stamp]))[0]
         return FrameStory(
             stamp_ns=stamp,
