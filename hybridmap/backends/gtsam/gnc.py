@@ -302,7 +302,7 @@ def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outc
         except _GIVES_UP as error:
             failures.append(f"{name}: {first_line(error)}")
             continue
-        if found is None:
+        if found is None or (name == _LAST_RESORT and _variance(graph, found, config) > 1.0):  # it tears the chain
             continue
         found = _without_lone(graph, found, config) if found.kept.all() else _tested(graph, found, config)
         sides = results.values() if name == "grown" and _share(found.kept) > 0.5 else ()
