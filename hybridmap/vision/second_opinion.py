@@ -87,7 +87,7 @@ class SecondOpinion:
             way of the matches across the carry; empty if the robot was not carried.
         """
         accepted = [e for e in edges if e.status is Status.ACCEPTED and e.key >= 0 and e.kidnapped_m is None]
-        loops = [edge for edge in accepted if edge.kind is EdgeKind.LOOP]
+        loops = [edge for edge in accepted if edge.kind is EdgeKind.LOOP and np.isfinite(self._witness.misfit(edge))]
         steps = [edge for edge in accepted if edge.kind is EdgeKind.REGISTRATION]
         since = worse_since(loops, steps, self._witness) if self._left > 0 else None
         if since is None:
@@ -122,7 +122,7 @@ class SecondOpinion:
             there = [match for match, yes in zip(found, is_here, strict=True) if not yes]
             here = [match.mismatch for match, yes in zip(found, is_here, strict=True) if yes]
             here += [self._witness.misfit(loop) for loop in loops if loop.source == node and loop.target < since]
-            best_there, best_here = min((match.mismatch for match in there), default=np.inf), float(np.nanmin(here))
+            best_there, best_here = min((match.mismatch for match in there), default=np.inf), min(here)
             dissent += best_here + clearly <= best_there
             if best_there + clearly <= best_here:
                 better, out = better + 1, out + there

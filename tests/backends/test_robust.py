@@ -13,9 +13,10 @@ from hybridmap.backends.gtsam.gnc import Truncated
 from hybridmap.backends.objective import gate_of
 from hybridmap.config.backends import BackendsConfig, GncConfig
 from hybridmap.errors import BackendError, GraphError
-from hybridmap.geometry import align, transform_points
+from hybridmap.geometry import align, between, compose, transform_points
+from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.io import read_graph
-from hybridmap.graph.pose_graph import prefix
+from hybridmap.graph.pose_graph import PoseGraph, prefix
 from hybridmap.study.false_loops import inject
 from tests.backends.graphs_for_tests import laps
 
@@ -220,6 +221,36 @@ def test_a_few_false_loops_do_not_move_the_map(data_dir, file, count, seed):
     solution = backends.create("gtsam-gnc").solve(false)
     assert set(false.edge_ids[-count:].tolist()) <= set(solution.report.rejected_edge_ids)
     assert ate(solution.poses, backends.create("gtsam-lm").solve(graph).poses) < 0.05
+
+
+def test_the_lone_loop_that_closes_a_ring_is_kept_against_dead_reckoning():
+    """Of 400 loops 399 span two steps and tell nothing of the ring. Noise is overstated, and the odometry turns too much."""
+    rng, size = np.random.default_rng(0), 400
+    true = chain_poses([np.array([0.3, 0.0, 2 * np.pi / size])] * size)
+    steps = [(i, i + 1, [0.0, 0.0, 0.001]) for i in range(size)] + [(i, i + 2, [0.0, 0.0, 0.0]) for i in range(size - 1)]
+    sources, targets = np.array([*((i, j) for i, j, _ in steps), (size, 0)]).T
+    deltas = between(true[sources], true[targets])
+    deltas[:-1] += [bias + rng.normal(0.0, 0.001, 3) for _, _, bias in steps]
+    kinds = np.array([EdgeKind.ODOMETRY] * size + [EdgeKind.LOOP] * size, dtype=np.int8)
+    graph = PoseGraph(
+        initial=chain_poses(deltas[:size]),
+        sources=sources,
+        targets=targets,
+        deltas=deltas,
+        information=np.tile(np.diag([100.0, 100.0, 400.0]), (2 * size, 1, 1)),
+        kinds=kinds,
+        edge_ids=np.arange(2 * size),
+    )
+    solution = backends.create("gtsam-gnc").solve(graph)
+    assert solution.report.rejected_edge_ids == ()
+    assert ate(solution.poses, true) < 0.05
+
+
+def chain_poses(deltas):
+    poses = [np.zeros(3)]
+    for delta in deltas:
+        poses.append(compose(poses[-1], delta))
+    return np.array(poses)
 
 
 def test_a_lone_loop_that_bends_a_map_of_overstated_noise_is_left_out():

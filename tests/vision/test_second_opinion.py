@@ -114,6 +114,19 @@ def test_loops_that_nobody_measured_tell_nothing():
     assert worse_since([*loops(GOOD), *unmeasured], steps(), FakeWitness()) is None
 
 
+def test_loops_among_nodes_after_the_carry_say_nothing_of_the_place():
+    among = [edge(node, node - 10) for node in range(71, 80, 3)]
+    witness = FakeWitness()
+    assert SecondOpinion(witness).ask([*steps(), *loops(BAD), *among], BELIEF) == witness.told != []
+
+
+def test_as_many_nodes_that_fit_where_the_map_has_them_speak_against_a_carry():
+    here = [edge(node, node - CARRIED_TO + ALIKE, misfit=0.0) for node in (63, 66, 69, 72, 75, 78)]
+    witness = FakeWitness(mismatch=0.05)
+    assert SecondOpinion(witness).ask([*steps(), *loops(4 * BAD), *here], BELIEF) == []
+    assert witness.asked
+
+
 def test_nothing_is_searched_where_loops_fit():
     witness = FakeWitness()
     assert SecondOpinion(witness).ask([*steps(), *loops(GOOD)], BELIEF) == []
