@@ -36,6 +36,7 @@ _OURS = dict(
         _ours("relaxation-paper", "relaxation.linear:paper"),
         _ours("relaxation-normalised", "relaxation.linear:normalised"),
         _ours("relaxation-ratslam", "relaxation.ratslam:plain"),
+        _ours("relaxation-weighted", "relaxation.weighted:weighted"),
         _ours("relaxation-robust", "relaxation.ratslam:robust"),
         _ours("relaxation-gtsam-lm", "relaxation.ratslam:then_least_squares"),
         _ours("gtsam-lm", "gtsam.batch:create", method="lm"),

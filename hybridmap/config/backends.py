@@ -17,7 +17,7 @@ class RelaxationConfig(Section):
 
     Watch: `relaxation-paper` is stable only below 2 / lambda_max of the graph's Laplacian, which real graphs exceed."""
     theta_decay: float = Field(default=1.0, gt=0, le=1)
-    """`relaxation-ratslam`, `-robust`: factor on theta after every sweep of one call.
+    """`relaxation-ratslam`, `-robust`, and `-weighted` while driving: factor on theta after every sweep of one call.
 
     Watch: with 1 the last sweeps end in a limit cycle; far below 1 they stop before the map has converged.
     """
@@ -27,7 +27,7 @@ class RelaxationConfig(Section):
     Watch: the time of a sweep grows with the edges of the whole graph.
     """
     solve_sweeps: int = Field(default=5000, ge=1, le=10_000_000)
-    """Most sweeps when a whole graph is solved at once.
+    """Most sweeps when a whole graph is solved at once; the last third of them is at a falling rate in `relaxation-weighted`.
 
     Watch: a long chain needs many.
     """

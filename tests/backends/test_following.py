@@ -18,7 +18,7 @@ from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import difference, prefix
 from tests.backends.graphs_for_tests import graph_of, laps
 
-FOLLOWERS = ["gtsam-lm", "gtsam-cauchy", "gtsam-gnc", "gtsam-isam2", "relaxation-ratslam", "odometry"]
+FOLLOWERS = ["gtsam-lm", "gtsam-cauchy", "gtsam-gnc", "gtsam-isam2", "relaxation-ratslam", "relaxation-weighted", "odometry"]
 
 
 @pytest.mark.parametrize("name", FOLLOWERS)

@@ -27,7 +27,7 @@ def graph():
     return laps(np.random.default_rng(0), nodes=40, per_lap=15)[0]
 
 
-@pytest.mark.parametrize("name", ["gtsam-lm", "gtsam-isam2", "relaxation-ratslam", "gtsam-gnc"])
+@pytest.mark.parametrize("name", ["gtsam-lm", "gtsam-isam2", "relaxation-ratslam", "relaxation-weighted", "gtsam-gnc"])
 def test_a_session_solves_what_the_back_end_solves(graph, name):
     session = fill(GraphSession(name), graph)
     assert np.allclose(session.poses(), graph.initial)

@@ -90,7 +90,9 @@ def test_the_paper_s_theta_diverges_and_leaves_the_map_as_it_was():
     assert "normalised" in normalised.report.message
 
 
-@pytest.mark.parametrize("name", ["relaxation-paper", "relaxation-normalised", "relaxation-ratslam", "relaxation-robust"])
+@pytest.mark.parametrize(
+    "name", ["relaxation-paper", "relaxation-normalised", "relaxation-ratslam", "relaxation-weighted", "relaxation-robust"]
+)
 @pytest.mark.parametrize("make", [lambda: star(50), lambda: laps(np.random.default_rng(0), noise=40.0)[0]])
 def test_relaxation_never_gives_anything_but_finite_poses(name, make):
     graph = make()

@@ -210,7 +210,7 @@ def test_a_run_beyond_all_bounds_ends_at_once_and_is_no_map():
     outcome = swept(rule, 100)(absurd, graph.initial)
     assert outcome.status == "diverged"
     assert np.array_equal(outcome.poses, graph.initial)
-    for name in ("relaxation-ratslam", "relaxation-robust"):
+    for name in ("relaxation-ratslam", "relaxation-weighted", "relaxation-robust"):
         with pytest.raises(GraphError, match=r"edge 0 .*beyond 1e\+09"):
             backends.create(name).solve(absurd)
 

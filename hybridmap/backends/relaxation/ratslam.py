@@ -32,7 +32,7 @@ false loop that is off by a metre then pulls with less than a hundredth."""
 ROBUST_START = 8.0
 """Factor on both scales at the first sweep of a call, from which they shrink to themselves: loops of 2 m still pull."""
 
-_LINKS = "int64[::1], int64[::1], float64[:, ::1], boolean[::1]"
+_LINKS = "int64[::1], int64[::1], float64[:, ::1], float64[:, ::1], boolean[::1]"
 _RULE = "float64, float64, int64, float64, float64, float64, float64"
 _SIGNATURE = f"Tuple((int64, boolean))(float64[:, ::1], float64[:, ::1], {_LINKS}, {_RULE})"
 
@@ -55,7 +55,16 @@ class Relaxed:
     settled: bool
 
 
-def relax_links(graph: PoseGraph, start: Array, sweeps: int, config: RelaxationConfig, *, robust: bool = False) -> Relaxed:
+def relax_links(
+    graph: PoseGraph,
+    start: Array,
+    sweeps: int,
+    config: RelaxationConfig,
+    *,
+    robust: bool = False,
+    shares: Array | None = None,
+    settles: bool = True,
+) -> Relaxed:
     """Sweep over the links, in the order of source node and then of age, as OpenRatSLAM does.
 
     Each link moves both of its ends by theta times its error: x and y in the world frame, and yaw wrapped to +-pi.
@@ -68,6 +77,8 @@ def relax_links(graph: PoseGraph, start: Array, sweeps: int, config: RelaxationC
         robust: multiply theta by the Geman-McClure weight 1 / (1 + r^2)^2 of a loop's error, r^2 being the sum of its squared
             components in units of the scales. The scales shrink geometrically from `ROBUST_START` times their value to
             their value during the first half of the sweeps; in that half the tolerance does not end the run.
+        shares: (E, 2) factors on theta for the position and the heading of each edge; None: one.
+        settles: end the run where a sweep moves nothing by more than the tolerance.
     """
     order = np.argsort(graph.sources, kind="stable")
     poses = np.array(start, dtype=np.float64, order="C")
@@ -77,11 +88,12 @@ def relax_links(graph: PoseGraph, start: Array, sweeps: int, config: RelaxationC
         graph.sources[order],
         graph.targets[order],
         np.ascontiguousarray(graph.deltas[order]),
+        np.ones((graph.n_edges, 2)) if shares is None else np.ascontiguousarray(shares[order]),
         graph.is_loop[order] & robust,
         config.theta,
         config.theta_decay,
         sweeps,
-        TOLERANCE_M,
+        TOLERANCE_M if settles else -1.0,
         ROBUST_SCALE_M,
         ROBUST_SCALE_RAD,
         ROBUST_START if robust else 1.0,
@@ -110,6 +122,7 @@ def _sweep(
     sources: NDArray[np.int64],
     targets: NDArray[np.int64],
     deltas: Array,
+    shares: Array,
     weighed: NDArray[np.bool_],
     theta: float,
     theta_decay: float,
@@ -142,12 +155,13 @@ def _sweep(
                 x, y, angle = dx * per_m, dy * per_m, turn * per_rad
                 falloff = 1.0 + x * x + y * y + angle * angle
                 rate /= falloff * falloff
-            poses[source, 0] += rate * dx
-            poses[source, 1] += rate * dy
-            poses[source, 2] += rate * turn
-            poses[target, 0] -= rate * dx
-            poses[target, 1] -= rate * dy
-            poses[target, 2] -= rate * turn
+            shift, twist = rate * shares[link, 0], rate * shares[link, 1]
+            poses[source, 0] += shift * dx
+            poses[source, 1] += shift * dy
+            poses[source, 2] += twist * turn
+            poses[target, 0] -= shift * dx
+            poses[target, 1] -= shift * dy
+            poses[target, 2] -= twist * turn
         moved = _most_moved(poses, before)
         settled = scale == 1.0 and moved <= tolerance
         if settled or not moved < np.inf:
@@ -245,7 +259,7 @@ def _squared(graph: PoseGraph, poses: Array) -> Array:
 
 
 def _relaxed(config: RelaxationConfig, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
-    return _outcome(relax_links(graph, start, sweeps, config))
+    return outcome_of(relax_links(graph, start, sweeps, config))
 
 
 def _in_rounds(config: RelaxationConfig, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
@@ -294,12 +308,13 @@ def _judged(graph: PoseGraph, relaxed: Relaxed) -> Outcome:
     loops = graph.only(EdgeKind.LOOP)
     by_id = dict(zip(loops.edge_ids.tolist(), weights(loops, relaxed.poses).tolist(), strict=True))
     rejected = tuple(edge for edge, weight in by_id.items() if weight < _REJECTED)
-    outcome = _outcome(relaxed)
+    outcome = outcome_of(relaxed)
     message = f"{outcome.message}; {len(rejected)} of {counted(len(by_id), 'loop')} rejected"
     return replace(outcome, message=message, weights=by_id, rejected=rejected)
 
 
-def _outcome(relaxed: Relaxed) -> Outcome:
+def outcome_of(relaxed: Relaxed) -> Outcome:
+    """What a back-end reports of a run of sweeps: `converged` if the last sweep moved nothing, else `max-iterations`."""
     if relaxed.settled:
         message = f"no node moved more than {TOLERANCE_M} m"
         return Outcome(relaxed.poses, SolveStatus.CONVERGED, message, relaxed.sweeps)
