@@ -55,6 +55,7 @@ class Driver:
         follow: Solver | None = None,
         last: Solver | None = None,
         onward: Solver | None = None,
+        given: Solver | None = None,
         works: Works = Works.ON_CLOSURES,
         place: Extend = extend,
         most_rise: float = np.inf,
@@ -70,6 +71,7 @@ class Driver:
             last: if given, the end of the drive is one more update by this function. Default: a whole solution.
             onward: if given, the end of the drive is a whole solution by this function, from the poses reached so far.
                 Default: by `solve`, from the graph's `initial`.
+            given: solves a whole graph from its `initial` and no other poses, for comparisons. Default: `solve`.
             works: when an update calls the solver.
             place: places new nodes.
             most_rise: relative rise of chi2 above that of the start beyond which a solution is refused, and an update is
@@ -78,6 +80,7 @@ class Driver:
         """
         self._name, self._config = name, config
         self._solve, self._follow, self._last, self._onward = solve, follow or solve, last, onward
+        self._given = given or solve
         self._works, self._place, self._most_rise, self._softens = works, place, most_rise, softens
         self._graph: PoseGraph | None = None
         self._poses: Array = np.zeros((0, 3))
@@ -122,6 +125,15 @@ class Driver:
         """
         frozen = graph if isinstance(graph, PoseGraph) else graph.pose_graph()
         return self._whole(frozen, self._solve, frozen.initial)
+
+    def solve_as_given(self, graph: PoseGraph) -> Solution:
+        """As `solve`, but from the graph's `initial` and no other poses, also where the back-end would look for better ones.
+
+        Raises:
+            GraphError: the graph is malformed or not connected.
+            BackendError: the solver failed.
+        """
+        return self._whole(graph, self._given, graph.initial)
 
     def _advance(self, graph: PoseGraph, always: Solver | None) -> Solution:
         """Follow the graph: by `always` if given, else by `follow` when the graph calls for the solver."""

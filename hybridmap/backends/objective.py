@@ -94,6 +94,19 @@ def truncated_cost(graph: PoseGraph, poses: Array, bound: float, config: RobustC
     return float(np.where(graph.is_loop, np.minimum(every, bound), motion).sum())
 
 
+def truncated_weights(squared: Array, mu: float, bound: float) -> Array:
+    """Weights (L,) of the surrogate of truncated least squares at control parameter mu (Yang et al., eq. 14).
+
+    Args:
+        squared: (L,) squared residuals.
+        mu: control parameter; small: nearly convex; large: close to the truncated cost.
+        bound: squared residual at which the cost is truncated.
+    """
+    between_ = np.sqrt(bound * mu * (mu + 1.0) / np.maximum(squared, 1e-300)) - mu
+    inside, outside = squared <= bound * mu / (mu + 1.0), squared >= bound * (mu + 1.0) / mu
+    return np.asarray(np.where(inside, 1.0, np.where(outside, 0.0, np.clip(between_, 0.0, 1.0))))
+
+
 def gate_of(config: BackendsConfig) -> float:
     """Squared residual beyond which a loop is an outlier: the configured quantile of chi2 with 3 degrees of freedom."""
     return chi2_quantile(config.gnc.quantile)

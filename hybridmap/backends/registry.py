@@ -19,6 +19,8 @@ LEAST_SQUARES, ROBUST, RELAXATION = "gtsam-lm", "gtsam-gnc", "relaxation-ratslam
 
 _NOT_SEQUENTIAL = {ODOMETRY, "gtsam-isam2", "gtsam-gnc", "gtsam-calibrated"}
 
+_OWN_STARTS = {"gtsam-calibrated"}
+
 
 def _ours(name: str, path: str, **given: Any) -> tuple[str, Factory]:
     """An entry of the table; its module is imported when the back-end is made."""
@@ -92,3 +94,8 @@ def create(backend: str | Backend, config: BackendsConfig | None = None) -> Back
 def is_sequential(name: str) -> bool:
     """Whether the back-end of this name is one of ours that iterates on one objective from start to end, in steps or sweeps."""
     return name in _OURS and name not in _NOT_SEQUENTIAL
+
+
+def takes_start(name: str) -> bool:
+    """Whether the back-end of this name can solve a whole graph from given poses and no others (`Driver.solve_as_given`)."""
+    return name not in _OWN_STARTS

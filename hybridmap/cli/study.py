@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -105,8 +106,7 @@ def _show(done: Study) -> None:
 
     from hybridmap.errors import counted
     from hybridmap.report.study_figures import ERRORS
-    from hybridmap.report.study_page import error_of, remarks
-    from hybridmap.study.model import quoted
+    from hybridmap.report.study_page import baseline_of, error_of, remarks
 
     console = Console()
     if not console.is_terminal:
@@ -120,7 +120,7 @@ def _show(done: Study) -> None:
     measure, others = error_of(done), [name for name in _COLUMNS if _known(done, name)]
     table.add_column("source / setting / false loops")
     table.add_column("back-end")
-    for column in ("known in", f"median {ERRORS[measure]} (m)", f"mean minus {quoted(done.head['baseline'])} (m)"):
+    for column in ("own map in", f"median {ERRORS[measure]} (m)", f"median minus {baseline_of(done)} (m)", "p"):
         table.add_column(column, justify="right")
     for name in others:
         table.add_column(_COLUMNS[name], justify="right")
@@ -153,6 +153,8 @@ def _lines(done: Study, measure: str, others: list[str]) -> list[list[str]]:
         error = found[measure]
         apart = error.difference
         paired = "" if apart is None or not apart.count else interval(apart)
-        median, *figures = (number(one.median) if one.solved else "" for one in (found[name] for name in (measure, *others)))
-        lines.append([label, backend, f"{error.solved}/{error.cells}", median, paired, *figures])
+        p = "" if math.isnan(error.p) else f"{error.p:.2g}"
+        each = (found[name] for name in (measure, *others))
+        median, *figures = (number(one.median.value) if one.solved else "" for one in each)
+        lines.append([label, backend, f"{error.solved - error.lost}/{error.cells}", median, paired, p, *figures])
     return lines

@@ -76,9 +76,9 @@ def number(value: float) -> str:
 
 
 def interval(found: Interval) -> str:
-    """A mean with its confidence interval, with as many decimals as the interval justifies, at most six.
+    """A median with its confidence interval, with as many decimals as the interval justifies, at most six.
 
-    Without an interval: the mean, and why there is none.
+    Without an interval: the median, and why there is none.
     """
     if not found.count:
         return number(found.value)

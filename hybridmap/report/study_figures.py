@@ -12,7 +12,6 @@ import numpy as np
 from hybridmap.report import style
 from hybridmap.study.cell import CellResult
 from hybridmap.study.cells import Cell
-from hybridmap.study.model import quoted
 from hybridmap.study.statistics import Summary
 from hybridmap.study.study import Study
 
@@ -163,13 +162,14 @@ def paired_groups(summaries: Sequence[Summary], measure: str) -> dict[str, list[
     return groups
 
 
-def difference_figure(groups: Mapping[str, Sequence[Summary]]) -> str:
-    """Draw the mean paired difference of the error to the baseline with its confidence interval, one panel per group.
+def difference_figure(groups: Mapping[str, Sequence[Summary]], baseline: str) -> str:
+    """Draw the median paired difference of the error to the baseline with its confidence interval, one panel per group.
 
     A difference without an interval is a single dot. Groups beyond `MOST_PANELS` are left out.
 
     Args:
         groups: what `paired_groups` returns.
+        baseline: what the back-ends are compared with, in words.
 
     Returns:
         A `data:` URI; an empty string if there is no group.
@@ -188,7 +188,7 @@ def difference_figure(groups: Mapping[str, Sequence[Summary]]) -> str:
             axes.set_yticks(range(len(ones)), [one.cell.backend for one in ones])
             axes.set_ylim(len(ones) - 0.5, -0.5)
             axes.set_title(label, fontsize=9.0)
-            axes.set_xlabel(f"{ERRORS[ones[0].measure]} minus that of {quoted(ones[0].baseline)} (m)")
+            axes.set_xlabel(f"{ERRORS[ones[0].measure]} minus that of {baseline} (m)")
             axes.grid(True, axis="x", linewidth=0.5)
             axes.tick_params(axis="x", labelsize=7.5)
         return style.svg_uri(picture)
@@ -204,7 +204,7 @@ def _reach(ones: Sequence[Summary]) -> tuple[float, float]:
 def _draw_interval(axes: Any, row: int, one: Summary) -> None:
     apart = one.difference
     assert apart is not None
-    colour = "#666666" if not apart.excludes_zero else style.ACCEPTED if apart.high < 0.0 else style.REJECTED
+    colour = {"lower": style.ACCEPTED, "higher": style.REJECTED}.get(one.verdict, "#666666")
     if apart.known:
         axes.plot([apart.low, apart.high], [row, row], color=colour, linewidth=2.2, solid_capstyle="butt")
     axes.plot([apart.value], [row], "o", color=colour, markersize=4.5)
@@ -230,7 +230,9 @@ def _draw_rows(axes: Any, panel: Panel, figure: Figure, looks: dict[str, dict[st
     """One row per back-end, a dot per cell, and a bar at the median."""
     for position, backend in enumerate(panel.ticks):
         values = _values(panel, position, backend, figure)
-        axes.plot(values, [position] * len(values), ".", color=looks[backend]["color"], markersize=5.0, alpha=0.6)
+        for lost, mark in ((False, "."), (True, "x")):
+            shown = _values(panel, position, backend, figure, lost=lost)
+            axes.plot(shown, [position] * len(shown), mark, color=looks[backend]["color"], markersize=5.0, alpha=0.6)
         if len(values):
             axes.plot([np.median(values)], [position], "|", color=looks[backend]["color"], markersize=13, markeredgewidth=2)
         if without := _without(panel, position, backend, figure):
@@ -240,8 +242,10 @@ def _draw_rows(axes: Any, panel: Panel, figure: Figure, looks: dict[str, dict[st
     axes.set_ylim(len(panel.ticks) - 0.5, -0.5)
 
 
-def _values(panel: Panel, position: int, backend: str, figure: Figure) -> Any:
-    found = [figure(result) for at, name, result in panel.cells if (at, name) == (position, backend)]
+def _values(panel: Panel, position: int, backend: str, figure: Figure, lost: bool | None = None) -> Any:
+    """The figure in all cells, or only in those whose back-end did (`lost`) or did not end without a map."""
+    cells = [result for at, name, result in panel.cells if (at, name) == (position, backend)]
+    found = [figure(result) for result in cells if lost is None or result.lost is lost]
     return np.array([value for value in found if value is not None])
 
 
@@ -258,9 +262,9 @@ def _axes(count: int, panel_height_in: float) -> Iterator[tuple[Any, list[Any]]]
 
 
 def _without(panel: Panel, position: int, backend: str, figure: Figure) -> str:
-    """The number of cells without the figure, and their statuses."""
+    """The number of cells without a figure of their own, and their statuses."""
     cells = [result for at, name, result in panel.cells if (at, name) == (position, backend)]
-    statuses = [result.status for result in cells if figure(result) is None]
+    statuses = [result.status for result in cells if result.lost or figure(result) is None]
     return ", ".join(f"{statuses.count(status)} of {len(cells)} {status}" for status in sorted(set(statuses)))
 
 

@@ -27,12 +27,10 @@ from hybridmap.study.study import Study
 _TEMPLATE = "study.html.j2"
 _SOLVED = ("converged", "waiting", "max-iterations", "fell-back", "mapped")
 _HEADS = ERRORS | {"chi2_own": "χ² own"}
-SHOWN_M = 5e-7
-"""Differences below it are shown as 0."""
 _NAMED = 4  # places or back-ends that a remark names
 _SUMMED = (
     *("relation_m", "relation_loop_m", "chi2_own", "loop_recall", "false_kept", "wrong_loops", "own_lost", "iterations"),
-    *("loop_chi2_ratio", "found_m", "clock_offset_s"),
+    *("loop_chi2_ratio", "found_m", "clock_offset_s", "theta_max", "theta_max_measured", "shrinks", "shrinks_measured"),
 )
 
 
@@ -42,20 +40,23 @@ class Line:
 
     Attributes:
         backend: title of the back-end.
-        solved: how many of its cells have the error that the page compares.
-        median, mean: of that error, the mean with its confidence interval.
-        difference: mean of the paired differences to the baseline, with its interval; empty for the baseline.
-        verdict: `lower` or `higher` if the interval of the difference excludes zero; else empty.
+        start: where it begins.
+        solved: in how many of its cells it has a map of its own with the error that the page compares.
+        median: of that error, with its confidence interval.
+        difference: median of the paired differences to the baseline, with its interval; empty for a baseline.
+        verdict: `lower` or `higher` if the signed-rank test says so; else empty.
+        p: of that test, corrected for the back-ends of the table; empty if unknown.
         better: share of the seeds in which its error is lower; empty if unknown.
         others: medians of the further figures of the table.
     """
 
     backend: str
+    start: str
     solved: str
     median: str
-    mean: str
     difference: str
     verdict: str
+    p: str
     better: str
     others: tuple[str, ...]
 
@@ -140,7 +141,7 @@ def _render(study: Study) -> str:
     return rendered(
         _TEMPLATE,
         head=study.head,
-        baseline=quoted(study.head["baseline"]),
+        baseline=baseline_of(study),
         description=config.description,
         tiles=_tiles(study),
         along=plan.along,
@@ -158,11 +159,10 @@ def _render(study: Study) -> str:
         by_false_loops=any(share is not None for share in kept),
         kept=_shares(study, plan, "false loops kept (%)", _kept) if any(share not in (None, 100.0) for share in kept) else "",
         lost=_shares(study, plan, "own loops lost (%)", _lost) if any(_lost(result) for _, result in study.rows) else "",
-        differences=study_figures.difference_figure(pairs),
+        differences=study_figures.difference_figure(pairs, baseline_of(study)),
         pairs_left_out=max(0, len(pairs) - MOST_PANELS),
         confidence=f"{100.0 * config.statistics.confidence:g}",
-        method={"t": "Student's t", "bootstrap": "BCa bootstrap"}[config.statistics.method],
-        least=LEAST[config.statistics.method],
+        least=LEAST,
         groups=shown,
         groups_without=len(groups) - len(shown),
         measures=[(name, unit, text) for name, (unit, text) in (measures_of(config) | TIMINGS).items()],
@@ -172,13 +172,22 @@ def _render(study: Study) -> str:
     )
 
 
+def baseline_of(study: Study) -> str:
+    """What each back-end of a study is compared with, in words."""
+    config = study.grid.study
+    titles = {config.baseline_of(variant.title) for variant in config.backends}
+    if len(titles) == 1:
+        return quoted(study.head["baseline"])
+    return f"{quoted(config.backends[0].backend)} from the same start"
+
+
 def _shares(study: Study, plan: study_figures.Layout, label: str, figure: study_figures.Figure) -> str:
     return study_figures.merit_figure(study, plan, label, figure, logarithmic=False)
 
 
 def _tiles(study: Study) -> list[tuple[str, str]]:
     config = study.grid.study
-    solved = sum(result.status in _SOLVED or "chi2" in result.figures for _, result in study.rows)
+    solved = sum(result.status in _SOLVED or ("chi2" in result.figures and not result.lost) for _, result in study.rows)
     counts = [
         (len(study.grid.cells), "cells"),
         (solved, "cells with a map"),
@@ -263,23 +272,21 @@ def _group(label: str, by_backend: dict[str, dict[str, Summary]], measure: str, 
 def _line(by_measure: dict[str, Summary], measure: str, others: Sequence[str]) -> Line:
     ate = by_measure[measure]
     apart = ate.difference
-    verdict = ""
-    if apart is not None and apart.excludes_zero and abs(apart.value) >= SHOWN_M:
-        verdict = "lower" if apart.high < 0.0 else "higher"
     return Line(
         backend=ate.cell.backend,
-        solved=f"{ate.solved} of {ate.cells}",
-        median=tables.number(ate.median),
-        mean=_mean(ate.mean, ate.cells),
-        difference="" if apart is None else _mean(apart, ate.cells),
-        verdict=verdict,
+        start=ate.cell.start,
+        solved=f"{ate.solved - ate.lost} of {ate.cells}",
+        median=_median(ate.median, ate.cells),
+        difference="" if apart is None else _median(apart, ate.cells),
+        verdict=ate.verdict,
+        p="" if math.isnan(ate.p) else f"{ate.p:.2g}",
         better="" if math.isnan(ate.better) else f"{100.0 * ate.better:.0f} %",
-        others=tuple(tables.number(by_measure[name].median) for name in others),
+        others=tuple(tables.number(by_measure[name].median.value) for name in others),
     )
 
 
-def _mean(found: Interval, cells: int) -> str:
-    """A mean with its interval, or why there is none; a single cell, where nothing is left to chance, needs none."""
+def _median(found: Interval, cells: int) -> str:
+    """A median with its interval, or why there is none; a single cell, where nothing is left to chance, needs none."""
     return tables.interval(found) if cells > 1 else tables.number(found.value)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from hybridmap.backends.base import ODOMETRY
 from hybridmap.study.cell import CellResult
 from hybridmap.study.cells import Cell, Grid, Group
-from hybridmap.study.measures import unit_of
+from hybridmap.study.measures import OF_ODOMETRY, unit_of
 from hybridmap.study.model import BarConfig
 
 _ROUND_OFF = 1e-6  # a map without any loop is that of odometry; by so much may rounding part them
@@ -103,10 +103,10 @@ def _verdict(
     groups: Mapping[tuple[Group, str], Sequence[Cell]],
     results: Mapping[str, CellResult],
 ) -> Verdict:
-    values = tuple(results[cell.key].figure(bar.figure) for cell in cells)
+    values = tuple(_own(results[cell.key], bar.figure) for cell in cells)
     slack = 0.0
     if isinstance(bar.at_most, str):
-        others = (results[cell.key].figure(bar.figure) for cell in groups[cells[0].group, bar.at_most])
+        others = (_own(results[cell.key], bar.figure) for cell in groups[cells[0].group, bar.at_most])
         limits, slack = tuple(math.nan if other is None else other for other in others), _ROUND_OFF
     else:
         limit = bar.at_most if bar.at_least is None else bar.at_least
@@ -121,6 +121,11 @@ def _verdict(
         value, limit = float(statistic(found)), float(statistic(held))
     passed = value >= limit - slack if bar.side == "at least" else value <= limit + slack
     return Verdict(bar, cells[0], values, limits, value, limit, bool(passed))
+
+
+def _own(result: CellResult, figure: str) -> float | None:
+    """A cell's figure; None for one that it has from odometry: who has no map misses every bar."""
+    return None if result.lost and figure in OF_ODOMETRY else result.figure(figure)
 
 
 def _whole(values: Sequence[float | None]) -> np.ndarray:

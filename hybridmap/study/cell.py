@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.base import ODOMETRY, Solution, SolveStatus
-from hybridmap.backends.driver import replay
+from hybridmap.backends.driver import Driver, replay
 from hybridmap.backends.gtsam.initial import angular_start
 from hybridmap.backends.objective import chi2
 from hybridmap.backends.odometry import dead_reckoning
 from hybridmap.backends.registry import create
+from hybridmap.backends.relaxation.linear import convergence
 from hybridmap.errors import BackendError, HybridMapError, counted
 from hybridmap.geometry import Array, align, between, compose
 from hybridmap.graph.paths import chain
@@ -22,7 +23,7 @@ from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.study import provenance
 from hybridmap.study.false_loops import Kind, with_drift, with_false_loops
 from hybridmap.study.frozen import Frozen
-from hybridmap.study.measures import KEPT, NEAR_M
+from hybridmap.study.measures import KEPT, NEAR_M, OF_ODOMETRY
 from hybridmap.study.model import BackendVariant, DriftConfig, backend_settings
 from hybridmap.verdict import Facts, reasons_of, verdict_of
 
@@ -75,6 +76,11 @@ class CellResult:
     timings: dict[str, float] = field(default_factory=dict)
     code: str = field(default_factory=lambda: provenance.solving())
 
+    @property
+    def lost(self) -> bool:
+        """Whether the back-end had a graph and no map of it: the figures `measures.OF_ODOMETRY` are those of odometry."""
+        return self.status in (SolveStatus.FAILED, SolveStatus.DIVERGED, SolveStatus.SINGULAR) and "ate_m" in self.figures
+
     def figure(self, name: str) -> float | None:
         """Value of the figure or timing of this name; None if missing."""
         return self.figures.get(name, self.timings.get(name))
@@ -109,30 +115,53 @@ def key_of(source_key: str, drift: DriftConfig, false_loops: tuple[str, float, i
 def run(task: CellTask) -> CellResult:
     """Disturb the graph, solve it and compute the errors; with `way: mapped` only the figures of the drive are looked up.
 
-    A `HybridMapError` becomes a result with the status `failed`; other exceptions are raised.
+    A `HybridMapError` becomes a result with the status `failed`; other exceptions are raised. A back-end without a map gets the
+    errors of odometry, as a robot has that: a method that is left out where it fails looks better than it is.
     """
     frozen = Frozen.unpack(task.frozen)
     if frozen.graph is None:
         return CellResult(task.key, UNMAPPED, frozen.failure)
     if task.variant.way == "mapped":
         return _as_mapped(task, frozen)
-    started, counts = time.process_time(), dict[str, float | None]()
+    started = time.process_time()
     try:
         drifted = with_drift(frozen.graph, task.drift, task.seed)
         graph = with_false_loops(drifted, task.kind, task.rate, task.seed)
-        counts = _counts(drifted, graph)
-        started = time.process_time()
-        solution = _solve(task, _begun(graph, task.variant.start, frozen.reference))
     except HybridMapError as error:
-        spent = {"cpu_s": time.process_time() - started}
-        return CellResult(task.key, str(SolveStatus.FAILED), " ".join(str(error).split()), counts, spent)
-    spent = {"cpu_s": time.process_time() - started}
-    report = solution.report
+        return _failed(task, error, {}, started)
+    counts, started = _counts(drifted, graph), time.process_time()
+    try:
+        solution = _solve(task, graph, frozen.reference)
+    except HybridMapError as error:
+        return _failed(task, error, counts | _of_odometry(drifted, graph, frozen.reference), started)
+    spent, report = {"cpu_s": time.process_time() - started}, solution.report
     figures = counts | {"iterations": float(report.iterations), "chi2_initial": _finite(report.chi2_initial)}
     figures["verdict"] = float(verdict_of(reasons_of(Facts.of_graph(graph, solution))).grade)
-    if report.status not in (SolveStatus.FAILED, SolveStatus.DIVERGED):
+    if report.status.has_map:
         figures |= judge(drifted, graph, solution, frozen.reference)
-    return CellResult(task.key, str(report.status), report.message, figures, spent)
+    else:
+        figures |= _of_odometry(drifted, graph, frozen.reference)
+    return CellResult(task.key, str(report.status), report.message, figures | _convergence(task.variant, graph), spent)
+
+
+def _convergence(variant: BackendVariant, graph: PoseGraph) -> dict[str, float | None]:
+    """What theory says of a relaxation rule on this graph, and what its sweeps do; empty for other back-ends."""
+    found = convergence(variant.backend, graph, backend_settings(variant).relaxation.theta)
+    return {name: _finite(value) for name, value in found.items()}
+
+
+def _failed(task: CellTask, error: HybridMapError, figures: dict[str, float | None], started: float) -> CellResult:
+    message = " ".join(str(error).split())
+    return CellResult(task.key, str(SolveStatus.FAILED), message, figures, {"cpu_s": time.process_time() - started})
+
+
+def _of_odometry(own: PoseGraph, graph: PoseGraph, reference: Array) -> dict[str, float | None]:
+    """The errors of odometry, which count for a back-end without a map; none if the graph itself cannot be used."""
+    try:
+        figures = judge(own, graph, create(ODOMETRY).solve(graph), reference)
+    except HybridMapError:
+        return {}
+    return {name: figures[name] for name in OF_ODOMETRY}
 
 
 def _as_mapped(task: CellTask, frozen: Frozen) -> CellResult:
@@ -190,22 +219,30 @@ def errors(poses: Array, reference: Array) -> tuple[float, float]:
     return float(np.sqrt(np.mean(position**2))), float(np.degrees(np.sqrt(np.mean(apart[:, 2] ** 2))))
 
 
-def _solve(task: CellTask, graph: PoseGraph) -> Solution:
+def _solve(task: CellTask, graph: PoseGraph, reference: Array) -> Solution:
     """Solve in batch, incrementally, or incrementally with `finish`; the report covers everything."""
-    backend = create(task.variant.backend, backend_settings(task.variant))
-    if task.variant.way == "solve":
+    variant = task.variant
+    backend = create(variant.backend, backend_settings(variant))
+    if variant.way == "solve" and variant.start == "own":
         return backend.solve(graph)
-    iterations, last = 0, None
-    for last in replay(backend, graph):
-        iterations += last.report.iterations
-    if task.variant.way == "drive":
+    if variant.way == "solve" and not isinstance(backend, Driver):
+        raise BackendError(f"{backend.name}: chooses its start itself; found `start: {variant.start}`, expected own")
+    iterations, initial = 0, graph
+    if variant.way != "solve" or variant.start == "replay":
+        for last in replay(backend, graph):
+            iterations += last.report.iterations
+    if variant.way == "drive":
         last = backend.finish(graph)
         iterations += last.report.iterations
-    assert last is not None
-    return replace(last, report=replace(last.report, iterations=iterations, chi2_initial=chi2(graph, graph.initial)))
+    if variant.way == "solve":
+        assert isinstance(backend, Driver)
+        initial = replace(graph, initial=last.poses) if variant.start == "replay" else _begun(graph, variant.start, reference)
+        last = backend.solve_as_given(initial)
+        iterations += last.report.iterations
+    return replace(last, report=replace(last.report, iterations=iterations, chi2_initial=chi2(graph, initial.initial)))
 
 
-def _begun(graph: PoseGraph, start: str, reference: Array) -> PoseGraph:
+def _begun(graph: PoseGraph, start: str | None, reference: Array) -> PoseGraph:
     """The graph with its initial poses; node 0 keeps its pose.
 
     Raises:

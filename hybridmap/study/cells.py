@@ -25,6 +25,7 @@ class Cell:
         kind: kind of the added false loops; empty string at rate 0.
         rate: share of false loops among all loops, 0 <= rate < 1.
         seed: seed of everything random; None if nothing in the cell is random.
+        start: where the back-end begins (`BackendVariant.begins`).
         source_key: cache key of the clean graph.
         key: cache key of the result; cells whose results are necessarily equal share a key.
     """
@@ -35,6 +36,7 @@ class Cell:
     rate: float
     seed: int | None
     backend: str
+    start: str
     source_key: str
     key: str
 
@@ -104,7 +106,9 @@ def lay_out(study: StudyConfig) -> Grid:
                 source_key = key_at((seed or 0) if drawn else 0)
                 for variant in study.backends:
                     key = key_of(source_key, setting.drift, (kind, rate, seed or 0), variant)
-                    cells.append(Cell(source.title, setting.name, kind, rate, seed, variant.title, source_key, key))
+                    cells.append(
+                        Cell(source.title, setting.name, kind, rate, seed, variant.title, variant.begins, source_key, key)
+                    )
     return Grid(study, tuple(cells), tasks)
 
 

@@ -11,6 +11,9 @@ KEPT = 0.5
 NEAR_M = 0.05
 """A map this close to its reference counts as whole, m."""
 
+OF_ODOMETRY = ("ate_m", "yaw_deg", "within_5_cm", "chi2", "chi2_own")
+"""Figures that are those of odometry where a back-end failed or diverged."""
+
 VERDICT = ("1", "verdict on the map: 0 trusted, 1 doubtful, 2 failed")
 
 MEASURES = {
@@ -27,6 +30,10 @@ MEASURES = {
     "unit_variance": SOLUTION["unit_variance/"],
     "verdict": VERDICT,
     "iterations": SOLUTION["iterations/"],
+    "theta_max": ("1", "the paper's rule and the normalised one: rate from which it diverges, predicted: 2 / lambda_max"),
+    "theta_max_measured": ("1", "the same, by trial"),
+    "shrinks": ("1", "the same rules: factor on the error a sweep in the long run, predicted: 1 - theta lambda_2"),
+    "shrinks_measured": ("1", "the same, over sweeps 2,700 to 3,000 from the start"),
 }
 """Figures of a back-end on a graph, in the order of the tables."""
 

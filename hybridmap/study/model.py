@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
+from hybridmap.backends.base import ODOMETRY
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.config.section import Section, read_mapping, said
 from hybridmap.errors import ConfigError
@@ -36,7 +37,7 @@ KINDS = ("simulated", "recording", "session", "graph", "synthetic")
 DRIVES = ("simulated", "recording")
 """Kinds of sources that are mapped."""
 Rate = Annotated[float, Field(ge=0, lt=1)]
-Start = Literal["graph", "odometry", "chain", "angular", "reference"]
+Start = Literal["own", "graph", "odometry", "chain", "angular", "reference", "replay"]
 Way = Literal["solve", "replay", "drive", "mapped"]
 
 
@@ -175,9 +176,10 @@ class BackendVariant(Section):
     """Its settings (the section `backends` of a configuration, without `names`), as sections or dotted keys."""
     vary: dict[str, Annotated[tuple[Any, ...], Field(min_length=1)]] = Field(default_factory=dict)
     """Dotted key -> values: the entry stands for one variant per combination, named by its values."""
-    start: Start = "graph"
-    """Initial poses: the graph's own, dead reckoning, the chain of the most certain consecutive edges, rotation averaging, or
-    the reference. (`gtsam-lm` and its like also compute a start of their own when they solve a whole graph.)
+    start: Start | None = None
+    """Initial poses, and no others: the graph's own, dead reckoning, the chain of the most certain consecutive edges, rotation
+    averaging, the reference, or the back-end's own map of the graph as it grew node by node (`replay`). `own`: the graph's,
+    from which the back-end may look for better ones. Default: each of the study's `starts`, without these `own`.
     """
     way: Way = "solve"
     """The whole graph at once, node by node as while driving, or node by node with the final solution at the end of the drive.
@@ -189,6 +191,13 @@ class BackendVariant(Section):
     def title(self) -> str:
         """Title of the variant in the tables."""
         return self.name if self.name is not None else self.backend
+
+    @property
+    def begins(self) -> str:
+        """Where it begins, for the tables: its start, or `driven` where it gets the graph as it grew."""
+        if self.backend == ODOMETRY and self.way != "mapped":
+            return ODOMETRY
+        return self.start or "own" if self.way == "solve" else "driven"
 
 
 class FalseLoopsConfig(Section):
@@ -205,8 +214,6 @@ class StatisticsConfig(Section):
 
     confidence: float = Field(default=0.95, gt=0.5, lt=1)
     """Level of the confidence intervals."""
-    method: Literal["t", "bootstrap"] = "t"
-    """Student's t, or the bias-corrected and accelerated bootstrap."""
     resamples: int = Field(default=2000, ge=100, le=1_000_000)
     """Resamples of the bootstrap."""
 
@@ -261,6 +268,8 @@ class StudyConfig(Section):
     """Variants of the mapping and of disturbances."""
     backends: Annotated[tuple[BackendVariant, ...], Field(min_length=1)] = MAPPED
     """Back-ends; the first one is the baseline of the paired differences. Default: each drive as it was mapped."""
+    starts: tuple[Start, ...] = ()
+    """Each back-end that solves whole graphs and names no start of its own stands for one variant per start."""
     false_loops: FalseLoopsConfig = FalseLoopsConfig()
     """False loops."""
     statistics: StatisticsConfig = StatisticsConfig()
@@ -272,6 +281,13 @@ class StudyConfig(Section):
     def maps(self) -> bool:
         """Whether a back-end is evaluated on its map of the drive itself, rather than on the frozen graph."""
         return any(variant.way == "mapped" for variant in self.backends)
+
+    def baseline_of(self, title: str) -> str:
+        """Title of the back-end with which this one is compared: the first one, from the same start if there is that."""
+        first = self.backends[0]
+        asked = next(variant for variant in self.backends if variant.title == title)
+        alike = first.model_copy(update={"name": None, "start": asked.start})
+        return next((one.title for one in self.backends if one.model_copy(update={"name": None}) == alike), first.title)
 
     @classmethod
     def load(cls, source: str | Path, overrides: Mapping[str, Any] | None = None) -> StudyConfig:

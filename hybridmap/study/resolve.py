@@ -10,7 +10,8 @@ from math import prod
 from pathlib import Path
 from typing import TypeVar
 
-from hybridmap.backends.registry import names
+from hybridmap.backends.base import ODOMETRY
+from hybridmap.backends.registry import names, takes_start
 from hybridmap.errors import ConfigError
 from hybridmap.simulation import world_names
 from hybridmap.study import disturb
@@ -48,6 +49,7 @@ def resolved(study: StudyConfig, origin: str, folder: Path) -> StudyConfig:
     """
     sources = tuple(_located(source, origin, folder) for source in study.sources)
     variants = tuple(single for entry in study.backends for single in _expanded(entry, "settings", "backends", origin))
+    variants = tuple(single for entry in variants for single in _begun(entry, study))
     settings = tuple(single for entry in study.settings for single in _expanded(entry, "overrides", "settings", origin))
     study = study.model_copy(update={"sources": sources, "settings": settings, "backends": variants})
     _check(study, origin)
@@ -97,11 +99,21 @@ def _expanded(entry: _Entry, field: str, origin_key: str, origin: str) -> list[_
     return entries
 
 
+def _begun(variant: BackendVariant, study: StudyConfig) -> list[BackendVariant]:
+    """One variant per start of the study, for one that solves whole graphs from a start and names none."""
+    if variant.start is not None or variant.way != "solve":
+        return [variant]
+    if not study.starts or variant.backend == ODOMETRY:
+        return [variant.model_copy(update={"start": "own"})]
+    return [variant.model_copy(update={"name": f"{variant.title}, {start}", "start": start}) for start in study.starts]
+
+
 def _check(study: StudyConfig, origin: str) -> None:
     lists: dict[str, list[str]] = {
         "sources": [source.title for source in study.sources],
         "settings": [setting.name for setting in study.settings],
         "backends": [variant.title for variant in study.backends],
+        "starts": list(study.starts),
         "seeds": [str(seed) for seed in study.seeds],
         "false_loops.rates": [str(rate) for rate in study.false_loops.rates],
         "false_loops.kinds": list(study.false_loops.kinds),
@@ -110,7 +122,7 @@ def _check(study: StudyConfig, origin: str) -> None:
         twice = next((title for title, count in Counter(titles).items() if count > 1), None)
         if twice is not None:
             raise ConfigError(f"{origin}: {key}: {twice!r} is given twice; give each a name of its own")
-    cells = prod(map(len, lists.values()))
+    cells = prod(len(titles) for key, titles in lists.items() if key != "starts")
     if cells > _MOST_CELLS:
         raise ConfigError(
             f"{origin}: found {cells} cells (sources x settings x back-ends x false loops x seeds), expected at most"
@@ -133,8 +145,12 @@ def _check(study: StudyConfig, origin: str) -> None:
 def _check_backend(variant: BackendVariant, origin: str) -> None:
     if variant.backend not in names() and (variant.backend, variant.way) != ("primary", "mapped"):
         raise ConfigError(f"{origin}: unknown back-end {variant.backend!r}; there are {', '.join(names())}")
-    if variant.way == "mapped" and (variant.settings or variant.start != "graph"):
+    if variant.way == "mapped" and (variant.settings or variant.start is not None):
         raise ConfigError(f"{origin}: {variant.title}: `way: mapped` takes no settings and no start; set them for the drive")
+    if variant.start not in (None, "own") and not takes_start(variant.backend):
+        raise ConfigError(f"{origin}: {variant.title}: begins at several poses of its own; found {variant.start}, expected own")
+    if variant.start == "replay" and variant.way != "solve":
+        raise ConfigError(f"{origin}: {variant.title}: `start: replay` is solved as a whole; found `way: {variant.way}`")
     backend_settings(variant)
 
 

@@ -1,33 +1,41 @@
-"""Summaries over the seeds, and paired differences to the first back-end, each with a confidence interval."""
+"""Medians over the seeds, and of paired differences to the first back-end, with bootstrap intervals and a signed-rank test.
+
+Errors of maps have heavy tails: one lost map of twenty moves the mean and its interval anywhere. So nothing here is of means,
+and whether a back-end is better is asked of the ranks of the paired differences.
+"""
 
 from __future__ import annotations
 
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridmap.errors import counted
 from hybridmap.geometry import Array
 from hybridmap.study.cell import CellResult
-from hybridmap.study.cells import Cell, Grid
-from hybridmap.study.measures import measures_of, unit_of
+from hybridmap.study.cells import Cell, Grid, Group
+from hybridmap.study.measures import OF_ODOMETRY, measures_of, unit_of
 from hybridmap.study.model import StatisticsConfig, StudyConfig
 
-LEAST = {"t": 3, "bootstrap": 5}
-"""Method -> values that an interval needs. Two give Student's t one degree of freedom, hence limits of no use; of a few
-values the bootstrap's limits are the least and the greatest of them, whatever the confidence asked for."""
+LEAST = 5
+"""Values that an interval needs: the limits of fewer would be the least and the greatest of them, whatever is asked for."""
+
+SAME = 5e-7
+"""Figures that differ by less (m, for an error) are equal: two optimisers that stop at one optimum are parted by rounding."""
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A mean with its confidence interval.
+    """A median with its confidence interval.
 
     Attributes:
-        value: the mean; NaN without any value.
-        low, high: limits of the interval; NaN if there are fewer values than the method needs (`LEAST`).
+        value: the median; NaN without any value.
+        low, high: limits of the interval; NaN if there are fewer values than it needs (`LEAST`).
         count: number of values.
         confidence: confidence level of the interval, e.g. 0.95.
     """
@@ -48,11 +56,6 @@ class Interval:
         """Whether there were enough values for limits."""
         return math.isfinite(self.low) and math.isfinite(self.high)
 
-    @property
-    def excludes_zero(self) -> bool:
-        """Whether the interval has limits and does not contain zero."""
-        return self.low > 0.0 or self.high < 0.0
-
 
 @dataclass(frozen=True, slots=True)
 class Summary:
@@ -62,22 +65,35 @@ class Summary:
         cell: first cell of the group; all cells of the group share its labels, except for the seed.
         measure: name of the measure.
         cells, solved: number of cells in the group, and of those that have the measure; the others are left out.
-        median, mean: median and mean over the seeds that have the measure; NaN if none has.
-        baseline: title of the study's first back-end, with which the others are compared.
-        difference: mean over the seeds of this back-end's measure minus the baseline's, for seeds in which both have one; None
-            for the baseline itself.
+        lost: number of those in which the back-end failed or diverged, so that the figure is that of odometry.
+        median: over the seeds that have the measure, with its interval.
+        mean: over the same; NaN if there are none.
+        baseline: title of the back-end with which this one is compared (`StudyConfig.baseline_of`).
+        difference: median over the seeds of this back-end's measure minus the baseline's, for seeds in which both have one;
+            None for a baseline itself.
         better: share of these seeds in which this back-end's measure is lower; NaN without any.
+        p: of Wilcoxon's signed-rank test of these differences, two-sided, corrected by Holm for all back-ends of the group;
+            NaN for a baseline and for fewer than `LEAST` pairs.
     """
 
     cell: Cell
     measure: str
     cells: int
     solved: int
-    median: float
-    mean: Interval
+    lost: int
+    median: Interval
+    mean: float
     baseline: str
     difference: Interval | None
     better: float
+    p: float
+
+    @property
+    def verdict(self) -> str:
+        """`lower` or `higher` than the baseline if the test says so at the confidence of the intervals; else empty."""
+        if self.difference is None or not self.p < 1.0 - self.difference.confidence or not self.difference.value:
+            return ""
+        return "lower" if self.difference.value < 0.0 else "higher"
 
     @property
     def unit(self) -> str:
@@ -92,58 +108,74 @@ def summarise(grid: Grid, results: Mapping[str, CellResult]) -> list[Summary]:
         grid: the cells of the study.
         results: `Cell.key` -> result, for every cell of the grid.
     """
-    baseline, groups = grid.study.backends[0].title, grid.groups()
-    return [
-        _summary(cells, None if backend == baseline else groups[group, baseline], measure, results, grid.study)
-        for (group, backend), cells in groups.items()
-        for measure in measures_of(grid.study)
-    ]
+    groups = grid.groups()
+    by_place: dict[Group, list[Summary]] = {}
+    for (group, backend), cells in groups.items():
+        baseline = grid.study.baseline_of(backend)
+        against = None if backend == baseline else groups[group, baseline]
+        by_place.setdefault(group, []).extend(
+            _summary(cells, against, measure, results, grid.study) for measure in measures_of(grid.study)
+        )
+    return [one for ones in by_place.values() for one in _corrected(ones)]
 
 
-def mean_of(values: Array, config: StatisticsConfig) -> Interval:
-    """Mean of (N,) values with its confidence interval, by Student's t or the BCa bootstrap; the result is deterministic.
+def median_of(values: Array, config: StatisticsConfig) -> Interval:
+    """Median of (N,) values with the percentile interval of its bootstrap; the same values give the same limits.
 
     With fewer values than `LEAST` the limits are NaN; if enough values are all equal, the interval has zero width.
     """
     count = len(values)
-    mean = float(np.mean(values)) if count else math.nan
-    if count < LEAST[config.method]:
-        return Interval(mean, math.nan, math.nan, count, config.confidence)
-    if np.ptp(values) == 0.0:
-        return Interval(mean, mean, mean, count, config.confidence)
-    low, high = _student(values, config) if config.method == "t" else _bootstrap(values, config)
-    return Interval(mean, low, high, count, config.confidence)
+    median = float(np.median(values)) if count else math.nan
+    if count < LEAST:
+        return Interval(median, math.nan, math.nan, count, config.confidence)
+    tail = 0.5 * (1.0 - config.confidence)
+    medians = np.median(values[_drawn(count, config.resamples)], axis=1)
+    low, high = np.quantile(medians, [tail, 1.0 - tail])
+    return Interval(median, float(low), float(high), count, config.confidence)
 
 
-def _student(values: Array, config: StatisticsConfig) -> tuple[float, float]:
-    from scipy.stats import t
+def signed_rank(differences: Array) -> float:
+    """Two-sided p of Wilcoxon's signed-rank test that (N,) paired differences are symmetric about zero; NaN below `LEAST`.
 
-    reach = (
-        float(t.ppf(0.5 + 0.5 * config.confidence, len(values) - 1)) * float(np.std(values, ddof=1)) / math.sqrt(len(values))
-    )
-    mean = float(np.mean(values))
-    return mean - reach, mean + reach
+    Differences of zero speak for neither side and are left out; if all are zero, p is 1.
+    """
+    from scipy.stats import wilcoxon
+
+    if len(differences) < LEAST:
+        return math.nan
+    if not np.any(differences):
+        return 1.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # few values with ties: the normal approximation is said to be rough
+        return float(wilcoxon(differences, zero_method="wilcox").pvalue)
 
 
-def _bootstrap(values: Array, config: StatisticsConfig) -> tuple[float, float]:
-    """Bias-corrected and accelerated; plain percentiles if the sample is too degenerate."""
-    from scipy.stats import bootstrap
+def holm(ps: Sequence[float]) -> list[float]:
+    """P values corrected by Holm's step-down method for all of them that are known; NaN stay, and are no part of the family."""
+    known = sorted((p, at) for at, p in enumerate(ps) if not math.isnan(p))
+    corrected, least = list(ps), 0.0
+    for rank, (p, at) in enumerate(known):
+        least = max(least, min(1.0, p * (len(known) - rank)))
+        corrected[at] = least
+    return corrected
 
-    for method in ("BCa", "percentile"):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # degenerate samples give NaN, which is looked at
-            found = bootstrap(
-                (values,),
-                np.mean,
-                n_resamples=config.resamples,
-                confidence_level=config.confidence,
-                method=method,
-                vectorized=True,
-                rng=np.random.default_rng(0),
-            ).confidence_interval
-        if math.isfinite(found.low) and math.isfinite(found.high):
-            break
-    return float(found.low), float(found.high)
+
+@cache
+def _drawn(count: int, resamples: int) -> NDArray[np.int64]:
+    """(resamples, count) indices of the bootstrap, the same in every run."""
+    return np.random.default_rng(0).integers(0, count, (resamples, count))
+
+
+def _corrected(summaries: Sequence[Summary]) -> list[Summary]:
+    """The summaries of one group, their p corrected for the back-ends that are compared by the same measure."""
+    by_measure: dict[str, list[int]] = {}
+    for at, one in enumerate(summaries):
+        by_measure.setdefault(one.measure, []).append(at)
+    found = list(summaries)
+    for ones in by_measure.values():
+        for at, p in zip(ones, holm([summaries[at].p for at in ones]), strict=True):
+            found[at] = replace(summaries[at], p=p)
+    return found
 
 
 def _summary(
@@ -154,16 +186,27 @@ def _summary(
     study: StudyConfig,
 ) -> Summary:
     values = _figures(cells, measure, results)
-    difference, better = None, math.nan
+    difference, better, p = None, math.nan, math.nan
     if against is not None:
         other = _figures(against, measure, results)
         pairs = np.array([[values[seed], other[seed]] for seed in values if seed in other]).reshape(-1, 2)
-        difference = mean_of(pairs[:, 0] - pairs[:, 1], study.statistics)
-        better = float(np.mean(pairs[:, 0] < pairs[:, 1])) if len(pairs) else math.nan
+        apart = np.where(np.abs(pairs[:, 0] - pairs[:, 1]) < SAME, 0.0, pairs[:, 0] - pairs[:, 1])
+        difference, p = median_of(apart, study.statistics), signed_rank(apart)
+        better = float(np.mean(apart < 0.0)) if len(apart) else math.nan
     every = np.array(list(values.values()))
-    median = float(np.median(every)) if len(every) else math.nan
-    mean, baseline = mean_of(every, study.statistics), study.backends[0].title
-    return Summary(cells[0], measure, len(cells), len(values), median, mean, baseline, difference, better)
+    return Summary(
+        cell=cells[0],
+        measure=measure,
+        cells=len(cells),
+        solved=len(values),
+        lost=sum(results[cell.key].lost for cell in cells) if measure in OF_ODOMETRY else 0,
+        median=median_of(every, study.statistics),
+        mean=float(np.mean(every)) if len(every) else math.nan,
+        baseline=study.baseline_of(cells[0].backend),
+        difference=difference,
+        better=better,
+        p=p,
+    )
 
 
 def _figures(cells: Sequence[Cell], measure: str, results: Mapping[str, CellResult]) -> dict[int | None, float]:

@@ -114,17 +114,17 @@ def _head(grid: Grid, results: dict[str, CellResult]) -> dict[str, Any]:
 
 
 def _metrics(summaries: Sequence[Summary], verdicts: Sequence[Verdict]) -> list[Metric]:
-    """Median and mean of each measure, the mean difference to the baseline, and every bar: `<figure>/<group>/<back-end>`."""
+    """Median and mean of each measure, the median difference to the baseline, and every bar: `<figure>/<group>/<back-end>`."""
     metrics = []
     for one in summaries:
         stage = f"{one.cell.label}/{one.cell.backend}"
         stem = _stem(one.measure, one.unit)
-        metrics.append(
-            Metric(f"{stem}_median/{stage}", one.median, one.unit, f"median of {one.solved} of {counted(one.cells, 'cell')}")
-        )
-        metrics.append(Metric(f"{stem}_mean/{stage}", one.mean.value, one.unit, f"mean, {one.mean}"))
+        of = f"{one.solved} of {counted(one.cells, 'cell')}" + (f", {one.lost} lost" if one.lost else "")
+        metrics.append(Metric(f"{stem}_median/{stage}", one.median.value, one.unit, f"median of {of}, {one.median}"))
+        metrics.append(Metric(f"{stem}_mean/{stage}", one.mean, one.unit, f"mean of {counted(one.solved, 'value')}"))
         if one.difference is not None:
-            what = f"mean of the paired differences to {quoted(one.baseline)}, {one.difference}"
+            what = f"median of the paired differences to {quoted(one.baseline)}, {one.difference}"
+            what += "" if math.isnan(one.p) else f"; Wilcoxon's p, by Holm, {one.p:.3g}"
             metrics.append(Metric(f"{stem}_difference/{stage}", one.difference.value, one.unit, what))
     for verdict in verdicts:
         name = f"{_stem(verdict.bar.figure, verdict.unit)}_{verdict.bar.statistic}/{verdict.label}"

@@ -14,13 +14,13 @@ from hybridmap.study.cells import Cell
 from hybridmap.study.measures import TIMINGS
 from hybridmap.study.statistics import Summary
 
-_LABELS = ("source", "setting", "false_loop_kind", "false_loop_rate", "seed", "backend")
+_LABELS = ("source", "setting", "false_loop_kind", "false_loop_rate", "seed", "backend", "start")
 _GROUP_LABELS = tuple(label for label in _LABELS if label != "seed")
 _COUNTS = ("nodes", "edges", "own_loops", "false_loops")
 SUMMARY_COLUMNS = (
     *_GROUP_LABELS,
-    *("measure", "unit", "cells", "solved", "median", "mean", "mean_low", "mean_high"),
-    *("baseline", "pairs", "difference_mean", "difference_low", "difference_high", "share_lower"),
+    *("measure", "unit", "cells", "solved", "lost", "median", "median_low", "median_high", "mean"),
+    *("baseline", "pairs", "difference_median", "difference_low", "difference_high", "share_lower", "p_holm"),
 )
 """Of `summary.csv`."""
 TIMING_COLUMNS = (*_LABELS, *TIMINGS, "key")
@@ -64,12 +64,12 @@ def shown(value: float | None) -> str:
 
 
 def _labels(cell: Cell) -> tuple[str, ...]:
-    *group, backend = _group_labels(cell)
-    return *group, "" if cell.seed is None else str(cell.seed), backend
+    *group, backend, start = _group_labels(cell)
+    return *group, "" if cell.seed is None else str(cell.seed), backend, start
 
 
 def _group_labels(cell: Cell) -> tuple[str, ...]:
-    return cell.source, cell.setting, cell.kind, shown(cell.rate), cell.backend
+    return cell.source, cell.setting, cell.kind, shown(cell.rate), cell.backend, cell.start
 
 
 def _cell_row(cell: Cell, result: CellResult, names: Sequence[str]) -> tuple[str, ...]:
@@ -92,12 +92,13 @@ def summary_csv(summaries: Sequence[Summary]) -> str:
 
 def _summary_row(one: Summary) -> tuple[str, ...]:
     labels = (*_group_labels(one.cell), one.measure, one.unit)
-    sums = (one.cells, one.solved, *(_known(value) for value in (one.median, one.mean.value, one.mean.low, one.mean.high)))
+    middle = (_known(value) for value in (one.median.value, one.median.low, one.median.high, one.mean))
+    sums = (*map(str, (one.cells, one.solved, one.lost)), *middle, one.baseline)
     if one.difference is None:
-        return (*labels, *map(str, sums), one.baseline, *[""] * 5)
+        return (*labels, *sums, *[""] * 6)
     apart = one.difference
-    paired = tuple(_known(value) for value in (apart.value, apart.low, apart.high, one.better))
-    return (*labels, *map(str, sums), one.baseline, str(apart.count), *paired)
+    paired = tuple(_known(value) for value in (apart.value, apart.low, apart.high, one.better, one.p))
+    return (*labels, *sums, str(apart.count), *paired)
 
 
 def _known(value: float) -> str:

@@ -13,6 +13,7 @@ from hybridmap.study.cell import CellResult
 from hybridmap.study.cells import Cell, lay_out
 from hybridmap.study.folder import STUDY_FOLDER, StudyFolder
 from hybridmap.study.pools import ThisProcess
+from hybridmap.study.statistics import summarise
 from hybridmap.study.study import Study, run_study
 from tests.study.studies import TREE, small
 
@@ -67,16 +68,37 @@ def better_by_the_seed(cell: Cell) -> float:
     return 1.0 if cell.backend == "gtsam-lm" else 0.5 - 0.01 * (cell.seed or 0)
 
 
-@pytest.mark.parametrize(("method", "seeds", "judged"), [("bootstrap", 2, 0), ("bootstrap", 5, 2), ("t", 2, 0), ("t", 3, 2)])
-def test_few_seeds_have_no_verdict_and_the_page_says_so(made, method, seeds, judged):
-    study = made(better_by_the_seed, seeds=seeds, statistics={"method": method}, false_loops={})
+@pytest.mark.parametrize(("seeds", "interval", "judged"), [(2, False, 0), (5, True, 0), (8, True, 2)])
+def test_few_seeds_have_no_verdict_and_the_page_says_so(made, seeds, interval, judged):
+    study = made(better_by_the_seed, seeds=seeds, false_loops={})
     page = write_study_page(study).read_text()
     assert page.count('class="n lower"') == judged
-    assert (f"({seeds} values: no interval)" in page) == (judged == 0)
+    assert (f"({seeds} values: no interval)" in page) is not interval
     told = next(metric.description for metric in study.metrics if metric.name.startswith("ate_difference/"))
-    assert ("95 % interval" in told) == (judged > 0)
+    assert ("95 % interval" in told) is interval
+    assert ("Wilcoxon's p, by Holm" in told) is interval
     assert "mix of false loops" not in page
     assert "mixes of false loops" not in page
+
+
+def test_a_back_end_that_diverged_has_the_error_of_odometry_and_a_cross(made, monkeypatch):
+    study = made(lambda cell: 1.0, seeds=8, false_loops={})
+    for cell in study.grid.cells:
+        if cell.backend == "relaxed" and cell.seed == 3:
+            study.results[cell.key] = replace(study.results[cell.key], status="diverged")
+    study = replace(study, summaries=summarise(study.grid, study.results))
+    (group,) = groups_of(study)
+    assert [(line.backend, line.start, line.solved) for line in group.lines] == [
+        ("gtsam-lm", "own", "8 of 8"),
+        ("odometry", "odometry", "8 of 8"),
+        ("relaxed", "own", "7 of 8"),
+    ]
+    drawn: list[Any] = []
+    monkeypatch.setattr(style, "svg_uri", drawn.append)
+    study_figures.merit_figure(study, study_figures.layout(study), "ATE (m)", error_of, logarithmic=True)
+    crosses = [len(line.get_xdata()) for axes in drawn[0].axes for line in axes.lines if line.get_marker() == "x"]
+    assert crosses == [0, 0, 1]
+    assert [text.get_text() for axes in drawn[0].axes for text in axes.texts] == ["1 of 8 diverged"]
 
 
 def test_what_failed_is_said_once_and_not_shown_empty(made):
@@ -134,5 +156,7 @@ def test_the_axis_of_the_differences_names_the_error_that_is_compared(made, monk
     pairs = study_figures.paired_groups(made(better_by_the_seed, seeds=3).summaries, "ate_m")
     drawn: list[Any] = []
     monkeypatch.setattr(style, "svg_uri", drawn.append)
-    study_figures.difference_figure({label: [replace(one, measure=measure) for one in ones] for label, ones in pairs.items()})
+    study_figures.difference_figure(
+        {label: [replace(one, measure=measure) for one in ones] for label, ones in pairs.items()}, "gtsam-lm"
+    )
     assert {axes.get_xlabel() for axes in drawn[0].axes} - {""} == {f"{error} minus that of gtsam-lm (m)"}

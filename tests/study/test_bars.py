@@ -69,6 +69,14 @@ def test_a_seed_without_the_figure_misses_every_bar(statistic, side):
     assert "1 without a figure" in one.said
 
 
+def test_who_has_no_map_misses_every_bar_though_it_has_the_error_of_odometry():
+    grid = lay_out(small(bars=[{"figure": "ate_m", "at_most": "odometry"}], false_loops={}, seeds=1))
+    results = {cell.key: CellResult(cell.key, "diverged", "", {"ate_m": 0.25}, {}, "") for cell in grid.cells}
+    odometry = next(cell for cell in grid.cells if cell.backend == "odometry")
+    results[odometry.key] = CellResult(odometry.key, "converged", "", {"ate_m": 0.25}, {}, "")
+    assert not any(one.passed for one in bars.judge(grid, results))
+
+
 def test_the_table_has_a_line_a_group_with_the_value_of_each_seed():
     lines = list(csv.DictReader(io.StringIO(bars_csv(list(verdicts({"figure": "ate_m", "at_most": 0.35}).values())))))
     assert [(line["backend"], line["passed"], line["median"], line["worst"]) for line in lines] == [

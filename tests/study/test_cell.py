@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from hybridmap.backends.base import Outcome, SolveStatus
-from hybridmap.backends.gtsam import batch
-from hybridmap.errors import BackendError
+from hybridmap.backends.gtsam import batch, gnc, robust
+from hybridmap.backends.registry import names, takes_start
+from hybridmap.backends.relaxation import ratslam
+from hybridmap.errors import BackendError, ConfigError
 from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.study import cell as cells
@@ -15,6 +17,7 @@ from hybridmap.study.cells import lay_out
 from hybridmap.study.drive import MappedDrive
 from hybridmap.study.false_loops import with_drift, with_false_loops
 from hybridmap.study.frozen import Frozen
+from hybridmap.study.measures import OF_ODOMETRY
 from hybridmap.study.model import DriftConfig, SyntheticConfig
 from hybridmap.study.sources import SourceTask, laps, prepare
 from tests.narrowing import known
@@ -65,38 +68,98 @@ def test_errors_are_those_after_alignment_where_the_truth_is_known():
     assert np.isnan(cells.errors(moved, truth)).all()
 
 
-def test_a_typed_error_and_divergence_are_results_without_a_map(frozen, monkeypatch):
+def test_a_back_end_without_a_map_has_the_error_of_odometry(frozen, monkeypatch):
+    odometry = figures_of(frozen, backends=["odometry"])["odometry", "random"].figures
+
     def fail(*_):
         raise BackendError("gtsam-lm: had a\nbad day")
 
     monkeypatch.setattr(batch, "best_start", fail)
     found = figures_of(frozen, backends=["gtsam-lm"])["gtsam-lm", "random"]
-    assert (found.status, found.message) == ("failed", "gtsam-lm: had a bad day")
-    assert "ate_m" not in found.figures
+    assert (found.status, found.message, found.lost) == ("failed", "gtsam-lm: had a bad day", True)
+    assert {name: found.figures[name] for name in OF_ODOMETRY} == {name: odometry[name] for name in OF_ODOMETRY}
     assert found.figures["false_loops"] == 10
 
-    def diverge(_method, _factors, start, _max_iterations):
-        return Outcome(start, SolveStatus.DIVERGED, "away", 1)
+    for status in (SolveStatus.DIVERGED, SolveStatus.SINGULAR):
 
-    monkeypatch.setattr(batch, "best_start", lambda _, start: start)
-    monkeypatch.setattr(batch, "run", diverge)
-    found = figures_of(frozen, backends=["gtsam-lm"])["gtsam-lm", ""]
-    assert (found.status, found.message) == ("diverged", "away")
-    assert not {"ate_m", "chi2", "own_lost"} & set(found.figures)
+        def stop(_method, _factors, start, _max_iterations, status=status):
+            return Outcome(start, status, "away", 1)
+
+        monkeypatch.setattr(batch, "best_start", lambda _, start: start)
+        monkeypatch.setattr(batch, "run", stop)
+        found = figures_of(frozen, backends=["gtsam-lm"])["gtsam-lm", "random"]
+        assert (found.status, found.message, found.lost) == (status, "away", True)
+        assert {name: found.figures[name] for name in OF_ODOMETRY} == {name: odometry[name] for name in OF_ODOMETRY}
+        assert not {"own_lost", "false_kept"} & set(found.figures)  # it judged no loop
+
+
+def test_a_graph_that_cannot_be_made_gives_no_back_end_an_error(frozen):
+    bare = Frozen(frozen.graph.with_edges(~frozen.graph.is_loop), frozen.reference)
+    found = figures_of(bare, backends=["gtsam-lm"])["gtsam-lm", "random"]
+    assert (found.status, found.lost, found.figures) == ("failed", False, {})
 
 
 def test_every_start_and_way_solves_the_same_problem(frozen):
-    starts = [{"name": start, "backend": "gtsam-lm", "start": start} for start in ("odometry", "chain", "angular", "reference")]
-    ways = [{"name": way, "backend": "gtsam-isam2", "way": way} for way in ("replay", "drive")]
+    starts = [
+        {"name": start, "backend": "gtsam-lm", "start": start}
+        for start in ("graph", "odometry", "chain", "angular", "reference", "replay")
+    ]
+    ways = [{"name": f"isam2, {way}", "backend": "gtsam-isam2", "way": way} for way in ("replay", "drive")]
     found = figures_of(frozen, backends=["gtsam-lm", *starts, *ways], false_loops={})
     chi2 = {name: result.figures["chi2"] for (name, _), result in found.items()}
     for name, value in chi2.items():
         assert value == pytest.approx(chi2["gtsam-lm"], rel=1e-3), name
     initial = {name: result.figures["chi2_initial"] for (name, _), result in found.items()}
     assert initial["odometry"] == pytest.approx(initial["gtsam-lm"])  # the graph's own start is the chain
-    assert initial["angular"] < 0.5 * initial["odometry"]
-    assert initial["reference"] < 0.5 * initial["odometry"]
-    assert found["replay", ""].figures["iterations"] > found["gtsam-lm", ""].figures["iterations"]
+    assert initial["graph"] == initial["gtsam-lm"]
+    for start in ("angular", "reference", "replay"):
+        assert initial[start] < 0.5 * initial["odometry"]
+    assert found["isam2, replay", ""].figures["iterations"] > found["gtsam-lm", ""].figures["iterations"]
+
+
+@pytest.mark.parametrize("name", [name for name in names() if takes_start(name) and name != "odometry"])
+def test_a_back_end_begins_where_it_is_told_and_nowhere_else(frozen, monkeypatch, name):
+    def elsewhere(*_):
+        raise AssertionError("looked for another start")
+
+    for module in (batch, robust, gnc, ratslam):
+        for looked in ("best_start", "trusted_start"):
+            monkeypatch.setattr(module, looked, elsewhere, raising=False)
+    backends = [{"name": start, "backend": name, "start": start} for start in ("odometry", "angular", "replay")]
+    found = figures_of(frozen, backends=backends)
+    for (start, kind), result in found.items():
+        assert result.figures["chi2_initial"] is not None, (start, kind)
+        assert result.figures["ate_m"] is not None
+    if name != "relaxation-paper":  # which diverges from anywhere
+        assert not found["odometry", ""].lost
+
+
+def test_a_start_that_a_back_end_cannot_take_is_refused():
+    with pytest.raises(ConfigError, match=r"gtsam-calibrated: begins at several poses of its own; found angular, expected own"):
+        small(backends=[{"backend": "gtsam-calibrated", "start": "angular"}])
+    with pytest.raises(ConfigError, match=r"`start: replay` is solved as a whole; found `way: drive`"):
+        small(backends=[{"backend": "gtsam-lm", "start": "replay", "way": "drive"}])
+    titles = [
+        one.title for one in small(backends=[{"backend": "gtsam-calibrated", "start": "own"}], starts=["angular"]).backends
+    ]
+    assert titles == ["gtsam-calibrated"]
+
+
+def test_a_relaxation_rule_says_what_theory_says_of_it_and_what_it_does(frozen):
+    rules = [
+        {"backend": "relaxation-paper", "settings": {"relaxation.theta": 0.2}},
+        {"name": "too fast", "backend": "relaxation-paper", "settings": {"relaxation.theta": 0.5}},
+        "relaxation-normalised",
+        "relaxation-ratslam",
+    ]
+    found = {name: result for (name, _), result in figures_of(frozen, backends=rules, false_loops={}).items()}
+    for name in ("relaxation-paper", "too fast", "relaxation-normalised"):
+        figures = found[name].figures
+        assert figures["theta_max_measured"] == pytest.approx(figures["theta_max"], rel=0.005)
+        assert figures["shrinks_measured"] == pytest.approx(figures["shrinks"], rel=0.001)
+    assert found["relaxation-paper"].figures["shrinks"] < 1.0 < found["too fast"].figures["shrinks"]
+    assert found["too fast"].status == "diverged"
+    assert "theta_max" not in found["relaxation-ratslam"].figures
 
 
 def test_drift_bends_the_odometry_and_nothing_else(frozen):

@@ -54,8 +54,8 @@ def test_every_cell_has_its_line_and_nothing_is_computed_twice(alone, tmp_path):
     assert done.computed == 18
     lines = told["cells.csv"].decode().splitlines()
     assert len(lines) == 19
-    assert lines[0].startswith("source,setting,false_loop_kind,false_loop_rate,seed,backend,status,ate_m,")
-    assert lines[1].startswith("laps,default,,0,3,gtsam-lm,converged,0.0")
+    assert lines[0].startswith("source,setting,false_loop_kind,false_loop_rate,seed,backend,start,status,ate_m,")
+    assert lines[1].startswith("laps,default,,0,3,gtsam-lm,own,converged,0.0")
     assert b"cpu" not in told["cells.csv"] + told["metrics.json"] + told["summary.csv"]
     assert (done.folder.path / "timings.csv").read_text().count("\n") == 19
     again = run_study(small(), done.folder.path, ThisProcess())

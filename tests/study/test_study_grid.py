@@ -61,6 +61,7 @@ def test_names_are_no_part_of_a_key_and_everything_else_is():
         {"backends": [{"backend": "gtsam-lm", "settings": {"consistency.enabled": True}}]},
         {"backends": [{"backend": "gtsam-lm", "settings": {"max_iterations": 7}}]},
         {"backends": [{"backend": "gtsam-lm", "start": "angular"}]},
+        {"backends": ["gtsam-lm"], "starts": ["graph"]},
         {"backends": [{"backend": "gtsam-lm", "way": "replay"}]},
     ]
     for change in changed:

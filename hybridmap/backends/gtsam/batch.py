@@ -38,12 +38,16 @@ def create(name: str, config: BackendsConfig, method: str) -> Driver:
         method: `lm` (which computes initial poses of its own, and falls back on Dogleg), `gn` or `dogleg`.
     """
 
+    def given(graph: PoseGraph, start: Array) -> Outcome:
+        return run(method, factor_graph(graph, NoiseModels()), start, config.max_iterations)
+
     def solve(graph: PoseGraph, initial: Array) -> Outcome:
         start = best_start(graph, initial)
-        outcome = run(method, factor_graph(graph, NoiseModels()), start, config.max_iterations)
+        outcome = given(graph, start)
         return outcome if start is initial else replace(outcome, message=f"{outcome.message} (start: rotation averaging)")
 
-    return Driver(name, config, solve, follow=WarmStart(method, NoiseModels(), config.max_iterations), most_rise=1e-9)
+    warm = WarmStart(method, NoiseModels(), config.max_iterations)
+    return Driver(name, config, solve, follow=warm, given=given, most_rise=1e-9)
 
 
 def run(

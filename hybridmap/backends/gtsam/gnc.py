@@ -28,6 +28,7 @@ from hybridmap.backends.objective import (
     softened,
     squared_norms,
     truncated_cost,
+    truncated_weights,
     unit_variance,
     weak_edges,
 )
@@ -104,19 +105,6 @@ class _Problem:
                 ends = int(self.graph.sources[edge]), int(self.graph.targets[edge])
                 out.push_back(gtsam.BetweenFactorPose2(*ends, gtsam.Pose2(*self.graph.deltas[edge]), model))
         return out
-
-
-def truncated_weights(squared: Array, mu: float, bound: float) -> Array:
-    """Weights (L,) of the surrogate of truncated least squares at control parameter mu (Yang et al., eq. 14).
-
-    Args:
-        squared: (L,) squared residuals.
-        mu: control parameter; small: nearly convex; large: close to the truncated cost.
-        bound: squared residual at which the cost is truncated.
-    """
-    between_ = np.sqrt(bound * mu * (mu + 1.0) / np.maximum(squared, 1e-300)) - mu
-    inside, outside = squared <= bound * mu / (mu + 1.0), squared >= bound * (mu + 1.0) / mu
-    return np.asarray(np.where(inside, 1.0, np.where(outside, 0.0, np.clip(between_, 0.0, 1.0))))
 
 
 def graduate(graph: PoseGraph, start: Array, config: BackendsConfig, negligible: float) -> Truncated:
@@ -279,7 +267,12 @@ def create(name: str, config: BackendsConfig, whole: Whole | None = None) -> Dri
     def onward(graph: PoseGraph, driven: Array) -> Outcome:
         return solve(graph, config, driven)
 
-    return Driver(name, config, anew, follow=WarmKernel("cauchy", config), onward=onward, softens=True)
+    def given(graph: PoseGraph, start: Array) -> Outcome:
+        found = graduate(graph, start, config, _PATIENT)
+        found = _without_lone(graph, found, config) if found.kept.all() else _tested(graph, found, config)
+        return _cheapest(graph, {"given": found}, config)
+
+    return Driver(name, config, anew, follow=WarmKernel("cauchy", config), onward=onward, given=given, softens=True)
 
 
 def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outcome:

@@ -55,7 +55,11 @@ def create(name: str, config: BackendsConfig) -> Driver:
         message = f"isam2: {counted(updates, 'update')}"
         return Outcome(end.poses, report.status, message, updates, report.weights, report.rejected_edge_ids)
 
-    return Driver(name, config, solve, follow=isam2.follow, last=isam2.conclude, most_rise=most_rise, softens=True)
+    def given(graph: PoseGraph, start: Array) -> Outcome:
+        return Isam2(config).conclude(graph, start)
+
+    follow, last = isam2.follow, isam2.conclude
+    return Driver(name, config, solve, follow=follow, last=last, given=given, most_rise=most_rise, softens=True)
 
 
 class Isam2:

@@ -21,12 +21,15 @@ from hybridmap.graph.pose_graph import PoseGraph
 def create(name: str, config: BackendsConfig, kernel: str) -> Driver:
     """A back-end with the kernel `cauchy`, `huber`, `dcs` or `geman-mcclure`."""
 
+    def given(graph: PoseGraph, start: Array) -> Outcome:
+        return with_kernel(kernel, graph, start, config)
+
     def solve(graph: PoseGraph, initial: Array) -> Outcome:
         start = trusted_start(graph, initial, gate_of(config))
-        outcome = with_kernel(kernel, graph, start, config)
+        outcome = given(graph, start)
         return outcome if start is initial else replace(outcome, message=f"{outcome.message} (start: consecutive edges)")
 
-    return Driver(name, config, solve, follow=WarmKernel(kernel, config), softens=True)
+    return Driver(name, config, solve, follow=WarmKernel(kernel, config), given=given, softens=True)
 
 
 def judged(outcome: Outcome, kernel: Any, graph: PoseGraph, gate: float) -> Outcome:

@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import eigsh
 
 from hybridmap.backends.base import Outcome, SolveStatus
@@ -24,6 +24,9 @@ from hybridmap.errors import counted
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
 
+_DENSE = 400  # nodes up to which all eigenvalues are computed at once
+_TRIAL_SWEEPS = 1000  # after which the fastest growing mode of a graph of some hundred nodes outweighs the others
+_LONG_SWEEPS = 3000  # after which its slowest one does
 _CHECK_EVERY = 50  # sweeps between two looks at the objective
 
 Rate = tuple[float | Array | None, str]
@@ -84,6 +87,101 @@ def lambda_max(laplacian: csr_array) -> float:
     return float(eigsh(laplacian, k=1, which="LA", v0=start, tol=1e-6, return_eigenvectors=False)[0])
 
 
+@dataclass(frozen=True, slots=True)
+class Spectrum:
+    """What decides how a linear rule converges: eigenvalues of its rate per theta times the Laplacian.
+
+    Attributes:
+        second: the smallest one above zero, lambda_2: of the slowest way in which the map bends. 0 for a graph in parts.
+        largest: lambda_max.
+    """
+
+    second: float
+    largest: float
+
+    @classmethod
+    def of(cls, rule: LinearRule, scale: Array) -> Spectrum:
+        """The spectrum of a rule whose node i has the rate theta times scale[i], (N,); N is 2 or more."""
+        root = diags_array(np.sqrt(scale))
+        alike = csr_array(root @ rule.laplacian @ root)  # symmetric, with the eigenvalues of scale times the Laplacian
+        n = alike.shape[0]
+        if n <= _DENSE:
+            values = np.linalg.eigvalsh(alike.toarray())
+            return cls(max(float(values[1]), 0.0), float(values[-1]))
+        start = np.cos(np.arange(n))  # fixed, so that runs agree to the bit
+        near = -1e-3 * lambda_max(alike) / n**2  # a little below zero, where the matrix can be factorised
+        low = eigsh(alike.tocsc(), k=2, sigma=near, which="LM", v0=start, return_eigenvectors=False)
+        return cls(max(float(low.max()), 0.0), lambda_max(alike))
+
+    @property
+    def theta_max(self) -> float:
+        """The rate from which the rule diverges."""
+        return 2.0 / self.largest if self.largest > 0.0 else np.inf
+
+    def factor(self, theta: float) -> float:
+        """Factor of a sweep on the error in the long run: 1 - theta lambda_2, or that of the largest one where it is more."""
+        return max(abs(1.0 - theta * self.second), abs(1.0 - theta * self.largest))
+
+
+def measured_factor(rule: LinearRule, positions: Array, rate: Array, sweeps: int) -> float:
+    """By what the correction shrinks a sweep, measured: the mean over the last tenth of these sweeps.
+
+    NaN if there is nothing to correct.
+
+    Args:
+        rule: the correction.
+        positions: (N, 2) where to begin, m.
+        rate: (N,) rate of each node.
+        sweeps: number of sweeps; the slowest mode must have outlived the others by then.
+    """
+    each, still = rate[:, None], (1.0 / rate)[:, None] / np.sum(1.0 / rate)  # no sweep moves this mean of all nodes
+    step, sizes = each * rule.correction(positions), []
+    for _ in range(sweeps):
+        step = step - np.sum(still * step, axis=0)  # which rounding would let outlive every mode
+        sizes.append(float(np.linalg.norm(step)))
+        if not 0.0 < sizes[-1] < np.inf:
+            return np.nan
+        step = step / sizes[-1]  # of length one, so that nothing overflows
+        step = step - each * (rule.laplacian @ step)
+    return float(np.exp(np.mean(np.log(sizes[-max(sweeps // 10, 1) :]))))
+
+
+def measured_theta_max(rule: LinearRule, positions: Array, scale: Array, sweeps: int) -> float:
+    """The rate theta from which the corrections grow, measured to a thousandth by halving an interval.
+
+    Args:
+        rule: the correction.
+        positions: (N, 2) where to begin, m.
+        scale: (N,) rate of each node per theta.
+        sweeps: of each trial.
+    """
+    low, high = 0.0, 4.0 / float(np.max(scale * rule.degree))  # lambda_max is not below this entry of the diagonal
+    while high - low > 1e-3 * high:
+        middle = 0.5 * (low + high)
+        grows = measured_factor(rule, positions, middle * scale, sweeps) > 1.0
+        low, high = (low, middle) if grows else (middle, high)
+    return 0.5 * (low + high)
+
+
+def convergence(name: str, graph: PoseGraph, theta: float) -> dict[str, float]:
+    """Figures of how the back-end `name` converges on a graph from its `initial`; empty if it is none of this module's.
+
+    `theta_max` and `shrinks` are predicted from eigenvalues (`Spectrum`); `theta_max_measured` and `shrinks_measured` are what
+    sweeps do.
+    """
+    if name not in _SCALES or graph.n_nodes < 2 or graph.n_edges == 0:
+        return {}
+    rule = LinearRule.of(graph)
+    scale, positions = _SCALES[name](rule), graph.initial[:, :2]
+    spectrum = Spectrum.of(rule, scale)
+    return {
+        "theta_max": spectrum.theta_max,
+        "theta_max_measured": measured_theta_max(rule, positions, scale, _TRIAL_SWEEPS),
+        "shrinks": spectrum.factor(theta),
+        "shrinks_measured": measured_factor(rule, positions, theta * scale, _LONG_SWEEPS),
+    }
+
+
 def relax(rule: LinearRule, positions: Array, rate: float | Array, sweeps: int, tolerance_m: float) -> tuple[Array | None, int]:
     """Run up to `sweeps` sweeps of positions += rate * correction; returns the positions and the number of sweeps.
 
@@ -107,6 +205,13 @@ def relax(rule: LinearRule, positions: Array, rate: float | Array, sweeps: int, 
             if (done % _CHECK_EVERY == 0 or done == sweeps) and not rule.objective(positions) <= 1.000001 * before + 1e-12:
                 return None, done
     return positions, sweeps
+
+
+_SCALES: dict[str, Callable[[LinearRule], Array]] = {
+    "relaxation-paper": lambda rule: np.ones(len(rule.degree)),
+    "relaxation-normalised": lambda rule: 1.0 / np.maximum(rule.degree, 1.0),
+}
+"""Back-end -> rate of each node (N,) per theta."""
 
 
 def paper(name: str, config: BackendsConfig) -> Driver:
@@ -155,4 +260,4 @@ def _relaxed(
 
 
 def _by_degree(rule: LinearRule, config: RelaxationConfig) -> Array:
-    return np.asarray((config.theta / np.maximum(rule.degree, 1.0))[:, None])
+    return (config.theta * _SCALES["relaxation-normalised"](rule))[:, None]

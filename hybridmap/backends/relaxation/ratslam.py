@@ -214,6 +214,7 @@ def robust(name: str, config: BackendsConfig) -> Driver:
     """
     rules = config.relaxation
     solve = swept(partial(_in_rounds, rules), rules.solve_sweeps)
+    given = swept(partial(_in_rounds, rules, anywhere=False), rules.solve_sweeps)
 
     def follow(graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
         return _judged(graph, relax_links(graph, start, sweeps, rules, robust=True))
@@ -225,7 +226,8 @@ def robust(name: str, config: BackendsConfig) -> Driver:
         kept = _judged(graph, Relaxed(driven, settled.iterations, settled=False))
         return replace(kept, message=f"kept the map of the drive; {kept.message}")
 
-    return Driver(name, config, solve, follow=swept(follow, rules.sweeps_per_node), onward=onward, works=Works.ON_GROWTH)
+    following = swept(follow, rules.sweeps_per_node)
+    return Driver(name, config, solve, follow=following, onward=onward, given=given, works=Works.ON_GROWTH)
 
 
 def then_least_squares(name: str, config: BackendsConfig) -> Driver:
@@ -262,19 +264,20 @@ def _relaxed(config: RelaxationConfig, graph: PoseGraph, start: Array, sweeps: i
     return outcome_of(relax_links(graph, start, sweeps, config))
 
 
-def _in_rounds(config: RelaxationConfig, graph: PoseGraph, start: Array, sweeps: int) -> Outcome:
+def _in_rounds(config: RelaxationConfig, graph: PoseGraph, start: Array, sweeps: int, *, anywhere: bool = True) -> Outcome:
     """Relax with weighted loops; where that rejects any, also with all loops at first, and return the better map.
 
     A weight trusts the start more than the loops. After a long drift it rejects true ones, and so it may not have the last
     word. A map that keeps most loops is better than one that does not; else the one with the lower `_cost` is. False
-    loops bend the map of all loops, which costs far more than to reject them.
+    loops bend the map of all loops, which costs far more than to reject them. With all loops it begins at `best_start`, unless
+    it may not begin `anywhere` but at `start`.
     """
     quarter = max(sweeps // 4, 1)
     weighted = _pruned(config, graph, relax_links(graph, start, min(sweeps, quarter), config, robust=True), sweeps, quarter)
     judged = _judged(graph, weighted)
     if not judged.rejected:
         return judged
-    trusting = relax_links(graph, best_start(graph, start), max(sweeps - quarter, 1), config)
+    trusting = relax_links(graph, best_start(graph, start) if anywhere else start, max(sweeps - quarter, 1), config)
     other = _judged(graph, _pruned(config, graph, trusting, sweeps, quarter))
     if not np.isfinite(other.poses).all():
         return judged
