@@ -17,7 +17,6 @@ from hybridmap.backends.relaxation.ratslam import outcome_of, relax_links, swept
 from hybridmap.config.backends import BackendsConfig, RelaxationConfig
 from hybridmap.errors import counted
 from hybridmap.geometry import Array
-from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.pose_graph import PoseGraph
 
 FALLING_PART = 3
@@ -47,18 +46,17 @@ def weighted(name: str, config: BackendsConfig) -> Driver:
 def shares(graph: PoseGraph) -> Array:
     """Factors (E, 2) in (0, 1] on the rate of each link, for position and heading: min(1, usual variance / own variance).
 
-    Usual is the median of the odometry edges; without these that of the registrations, else that of all edges. The variance
-    of a position is the mean of those of x and y: the rule moves both alike, in the world frame, where only their sum does
-    not depend on the heading. Links that are surer than usual get 1: rates above theta are not stable.
+    Usual is the median of the edges of motion, odometry and registrations; without any, that of all edges. The variance of a
+    position is the mean of those of x and y: the rule moves both alike, in the world frame, where only their sum does not
+    depend on the heading. Links that are surer than usual get 1: rates above theta are not stable. A smaller usual variance
+    would tell sure links apart, but a chain of links with small rates takes ever more sweeps to bend.
 
     Args:
         graph: a valid one with one edge or more.
     """
     variances = _variances(graph.information)
-    for usual in (graph.kinds == EdgeKind.ODOMETRY, graph.is_motion):
-        if usual.any():
-            return np.asarray(np.minimum(1.0, np.median(variances[usual], axis=0) / variances))
-    return np.asarray(np.minimum(1.0, np.median(variances, axis=0) / variances))
+    usual = variances[graph.is_motion] if graph.is_motion.any() else variances
+    return np.asarray(np.minimum(1.0, np.median(usual, axis=0) / variances))
 
 
 def _variances(information: Array) -> Array:
