@@ -75,6 +75,8 @@ FIGURES: dict[str, tuple[str, str]] = {
     "rejected_together/": ("1", "of those, the ones that agree with each other"),
     "weak_edges/": ("1", "odometry and registration edges down-weighted to less than a tenth"),
     "hanging_nodes/": ("1", "nodes that only such edges and rejected loops join to the first node"),
+    "chi2_bound/": ("1", "proved: no map has a lower chi2 over the inlier edges"),
+    "chi2_gap/": ("1", "proved: largest share of this map's chi2 over the inlier edges that another map could save"),
     "certificate_gap/": (
         "1",
         "proved relative gap of the isotropised objective at its optimum near the map, over the inlier edges",

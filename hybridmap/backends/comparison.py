@@ -95,7 +95,7 @@ def compare(
         backends: names, or back-ends that have solved nothing yet.
         config: settings of the back-ends given by name.
         ways: ways of giving the graph to each; dead reckoning is the same in every way and gets only the first.
-        certified: try to prove each solution optimal (`backends.judging.certificate`).
+        certified: prove how far each solution is from the best map (`backends.judging.certificate`).
         traced: compute convergence curves, which makes batch solvers about three times slower.
         progress: called with the number of finished parts of the work and their total.
 
@@ -196,6 +196,15 @@ def _own_figure(measure: str, title: str, value: float) -> Metric:
     return figure(name, value) if f"{measure}/" in FIGURES else Metric(name, float(value), "1", f"{measure} by the solver")
 
 
+def _proved_figures(proof: Certificate) -> dict[str, float | None]:
+    bounded, certified = proof.chi2_gap < 1.0, np.isfinite(proof.gap)
+    return {
+        "chi2_bound": proof.chi2_bound if bounded else None,
+        "chi2_gap": proof.chi2_gap if bounded else None,
+        "certificate_gap": proof.gap if certified else None,
+    }
+
+
 def metrics_of(rows: Sequence[Row]) -> list[Metric]:
     """Metrics of the rows with a solution, named `<measure>/<title of the row>`."""
     metrics = []
@@ -215,8 +224,8 @@ def metrics_of(rows: Sequence[Row]) -> list[Metric]:
             "weak_edges": len(report.weak_edges) or None,
             "hanging_nodes": report.hanging_nodes if report.weak_edges else None,
         }
-        if row.certificate is not None and np.isfinite(row.certificate.gap):
-            figures["certificate_gap"] = row.certificate.gap
+        if row.certificate is not None:
+            figures |= _proved_figures(row.certificate)
         known = {measure: value for measure, value in figures.items() if value is not None}
         title = row.title or row.backend
         metrics += [figure(f"{measure}/{title}", value, what="the solution") for measure, value in known.items()]

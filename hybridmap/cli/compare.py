@@ -70,11 +70,12 @@ def compare(
     setting: SolverSetting = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare back-ends on one graph: chi2, status, iterations, CPU seconds, rejected loops, and proof of optimality if found.
+    """Compare back-ends on one graph: chi2, status, iterations, CPU seconds, rejected loops.
 
-    Each map gets a verdict with its reasons, on the graph alone. A session with ground truth or verified relations also gets
-    errors (m). A session's graph is solved in batch and incrementally: two rows per back-end. A back-end that fails keeps its
-    row, with the reason. The input is not changed.
+    Beside the chi2 of each map stands the proved gap to the least chi2 of any map over the edges that the back-end keeps. Each
+    map gets a verdict with its reasons, on the graph alone. A session with ground truth or verified relations also gets errors
+    (m). A session's graph is solved in batch and incrementally: two rows per back-end. A back-end that fails keeps its row,
+    with the reason. The input is not changed.
     """
     from hybridmap.backends import comparison
     from hybridmap.cli.graphs import open_graph, settings_of
@@ -154,6 +155,7 @@ def _emit(
         "verdicts": {title: one["verdict"] for title, one in said.items()},
         "reasons": {title: one["reasons"] for title, one in said.items()},
         "message": {row.title: row.message for row in rows},
+        "chi2_bound": {row.title: row.certificate.chi2_message for row in rows if row.certificate is not None},
         "certificate": {row.title: row.certificate.message for row in rows if row.certificate is not None},
     }
     emit(head, [*metrics_of(rows), *judged], as_json=True)
@@ -181,17 +183,30 @@ def _table(rows: Sequence[Row], reasons: dict[str, Sequence[Reason]], judged: Se
 
     by_name = {metric.name: f"{metric.value:.4f}" if isfinite(metric.value) else "–" for metric in judged}
     errors = {name: title for name, title in _ERRORS.items() if any(key.startswith(f"{name}/") for key in by_name)}
-    columns = ["back-end", "way", "chi2", "unit variance", *errors.values(), "status", "verdict", "iterations", "CPU (s)"]
-    table = [[*columns, "rejected loops", "certificate"]]
+    columns = [
+        "back-end",
+        "way",
+        "chi2",
+        "gap of chi2",
+        "unit variance",
+        *errors.values(),
+        "status",
+        "verdict",
+        "iterations",
+        "CPU (s)",
+    ]
+    table = [[*columns, "rejected loops", "certificate of F"]]
     for row in rows:
         if row.solution is None:
-            table.append([row.backend, str(row.way), "", "", *("" for _ in errors), row.status, "", "", "", "", ""])
+            table.append([row.backend, str(row.way), "", "", "", *("" for _ in errors), row.status, "", "", "", "", ""])
             continue
         report = row.solution.report
         against = [by_name.get(f"{name}/{row.title}", "") for name in errors]
         variance = "" if report.unit_variance is None else number(report.unit_variance)
+        proof = row.certificate
         figures = [
             f"{report.chi2:.7g}",
+            proof.chi2_word if proof is not None else "",
             variance,
             *against,
             row.status,
@@ -199,8 +214,8 @@ def _table(rows: Sequence[Row], reasons: dict[str, Sequence[Reason]], judged: Se
             str(report.iterations),
             f"{report.cpu_s:.2f}",
         ]
-        proof = row.certificate.word if row.certificate is not None else ""
-        table.append([row.backend, str(row.way), *figures, str(len(report.rejected_edge_ids)), proof])
+        isotropic = proof.word if proof is not None else ""
+        table.append([row.backend, str(row.way), *figures, str(len(report.rejected_edge_ids)), isotropic])
     return table
 
 

@@ -30,7 +30,7 @@ def optimize(
     setting: SolverSetting = None,
     as_json: AsJson = False,
 ) -> None:
-    """Optimise a pose graph. Shows chi2 before and after, status, iterations, CPU seconds, proof of optimality, and a verdict.
+    """Optimise a pose graph. Shows chi2 before, after and at least (proved), status, iterations, CPU seconds, and a verdict.
 
     The verdict is on the graph alone: what a drive knew beside it, such as lost messages, is in the verdict of `map`. It does
     not change the exit code.
@@ -53,6 +53,7 @@ def optimize(
         "backend": backend,
         "status": str(report.status),
         "message": report.summary,
+        "chi2_bound": proof.chi2_message,
         "certificate": proof.message,
         "rejected_edge_ids": list(report.rejected_edge_ids),
         "rejected_clusters": [list(cluster) for cluster in report.rejected_clusters],
@@ -61,7 +62,7 @@ def optimize(
     figures = metrics_of([Row(backend, solution, certificate=proof)])
     emit(head, figures, as_json=as_json, title=f"{graph}: {backend}: {report.status}")
     if not as_json:
-        typer.echo(f"{report.summary}\ncertificate: {proof.message}")
+        typer.echo(f"{report.summary}\nchi2: {proof.chi2_message}\ncertificate of F: {proof.message}")
     if not report.status.has_map:
         raise typer.Exit(1)
 

@@ -10,28 +10,24 @@ from hybridmap import backends
 from hybridmap.backends.comparison import compare, metrics_of
 from hybridmap.backends.gtsam.batch import run
 from hybridmap.backends.gtsam.factors import NoiseModels, factor_graph
-from hybridmap.backends.judging.certificate import certify
-from hybridmap.backends.judging.dual import prove, quadratic_form
+from hybridmap.backends.judging.certificate import Certificate, certify
+from hybridmap.backends.judging.dual import isotropised, prove, stacked
+from hybridmap.backends.objective import chi2
 from hybridmap.geometry import compose
 from hybridmap.graph.io import read_graph
 from hybridmap.study.false_loops import inject
 from tests.backends.graphs_for_tests import laps
 
 
-def stacked(poses):
-    return np.concatenate([poses[:, 0] + 1j * poses[:, 1], np.exp(1j * poses[:, 2])])
-
-
 def test_the_quadratic_form_is_the_sum_over_edges():
     graph, _ = laps(np.random.default_rng(0), noise=3.0)
-    x = stacked(graph.initial)
     total = 0.0
     for s, t, (dx, dy, turn), information in zip(graph.sources, graph.targets, graph.deltas, graph.information, strict=True):
         predicted = compose(graph.initial[s], [dx, dy, turn])
         off = graph.initial[t] - predicted
         tau = 2.0 / np.trace(np.linalg.inv(information[:2, :2]))
         total += 2.0 * information[2, 2] * (2.0 - 2.0 * np.cos(off[2])) + tau * (off[0] ** 2 + off[1] ** 2)
-    assert np.vdot(x, quadratic_form(graph) @ x).real == pytest.approx(total, rel=1e-9)
+    assert isotropised(graph)(stacked(graph.initial)) == pytest.approx(total, rel=1e-9)
 
 
 def test_least_squares_on_a_mild_graph_is_certified_from_any_frame():
@@ -57,6 +53,36 @@ def test_a_local_optimum_is_not_certified():
         trapped = run("lm", factor_graph(graph, NoiseModels()), start, 100).poses
         proof = certify(graph, trapped)
         assert not proof.certified or proof.objective <= best * (1.0 + 1e-6)
+
+
+def test_a_map_in_a_wrong_optimum_is_told_how_much_better_another_may_be():
+    graph, _ = laps(np.random.default_rng(1), nodes=40, per_lap=20, noise=2.0)
+    best = chi2(graph, backends.create("gtsam-lm").solve(graph).poses)
+    start = np.random.default_rng(3).normal(size=(40, 3)) * 3.0
+    trapped = run("lm", factor_graph(graph, NoiseModels()), start, 100).poses
+    worse = chi2(graph, trapped)
+    assert worse > 10.0 * best
+    proof = certify(graph, trapped)
+    assert proof.chi2 == worse
+    assert (1.0 - 1e-3) * best < proof.chi2_bound <= best
+    assert proof.chi2_gap == pytest.approx(1.0 - best / worse, rel=1e-3)
+    assert f"this one has {worse:.7g}" in proof.chi2_message
+
+
+def test_the_gap_of_chi2_is_of_the_edges_kept():
+    graph, _ = laps(np.random.default_rng(0), nodes=90, per_lap=30)
+    false = inject(graph, 0.2, "random", np.random.default_rng(1))
+    solution = backends.create("gtsam-gnc").solve(false)
+    rejected = solution.report.rejected_edge_ids
+    proof = certify(false, solution.poses, rejected)
+    assert proof.chi2 == chi2(false.with_edges(~np.isin(false.edge_ids, rejected)), solution.poses)
+    assert proof.chi2_gap < 1e-3
+    assert certify(false, solution.poses).chi2_gap > 0.1
+
+
+@pytest.mark.parametrize(("gap", "word"), [(2.4e-6, "<= 2.4e-06"), (0.44, "<= 44 %"), (1.0, "not proved"), (-1e-12, "<= 0")])
+def test_a_gap_of_chi2_in_words(gap, word):
+    assert Certificate(np.inf, "", chi2=2.0, chi2_bound=2.0 * (1.0 - gap)).chi2_word == word
 
 
 def test_a_proved_gap_is_never_below_the_true_one():
@@ -95,8 +121,9 @@ def test_a_map_that_meets_every_measurement_is_optimal():
     graph, _ = laps(np.random.default_rng(1), noise=2.0)
     exact = graph.with_edges(~graph.is_loop)
     proof = certify(exact, exact.initial)
-    assert (proof.certified, proof.gap) == (True, 0.0)
+    assert (proof.certified, proof.gap, proof.chi2_gap) == (True, 0.0, 0.0)
     assert "chi2 is zero" in proof.message
+    assert "chi2 is zero" in proof.chi2_message
 
 
 def test_edges_that_a_back_end_rejected_do_not_count():
@@ -113,6 +140,7 @@ def test_poses_that_are_none_are_not_certified():
     proof = certify(graph, np.full((20, 3), np.nan))
     assert not proof.certified
     assert proof.word == "not certified"
+    assert (proof.chi2_gap, proof.chi2_word) == (1.0, "not proved")
 
 
 def test_a_comparison_carries_the_proof():
@@ -121,6 +149,12 @@ def test_a_comparison_carries_the_proof():
     assert rows[0].certificate is not None
     gaps = {m.name: m.value for m in metrics_of(rows) if m.name.startswith("certificate_gap")}
     assert gaps == {"certificate_gap/gtsam-lm": rows[0].certificate.gap}
+    figures = {m.name: m.value for m in metrics_of(rows)}
+    assert figures["chi2_gap/gtsam-lm"] == rows[0].certificate.chi2_gap < 1e-3
+    assert figures["chi2_bound/gtsam-lm"] == rows[0].certificate.chi2_bound <= figures["chi2/gtsam-lm"]
+    assert figures["chi2_gap/odometry"] == pytest.approx(
+        1.0 - figures["chi2_bound/gtsam-lm"] / figures["chi2/odometry"], rel=1e-6
+    )
     assert compare(graph, ["gtsam-lm"])[0].certificate is None
 
 
@@ -140,9 +174,9 @@ def test_the_standard_graphs_are_certified_at_their_known_objective(data_dir, fi
     graph = read_graph(data_dir / "posegraphs" / file)
     poses = backends.create("gtsam-lm").solve(graph).poses
     started = time.process_time()
-    proof = certify(graph, poses)
+    proof = prove(graph, poses)
     assert time.process_time() - started < 2.0
-    assert proof.gap <= 1e-6
+    assert certify(graph, poses).gap == proof.gap <= 1e-6
     assert proof.objective == pytest.approx(objective, rel=1e-5)
 
 

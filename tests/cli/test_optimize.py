@@ -48,6 +48,9 @@ def test_json_holds_the_figures_and_the_file_has_the_poses_they_are_of(monkeypat
     assert told["status"] == "converged"
     assert told["certificate"].startswith("F = ")
     assert figures["certificate_gap/gtsam-lm"] <= 1e-6
+    assert "no map has less than" in told["chi2_bound"]
+    assert figures["chi2_bound/gtsam-lm"] <= figures["chi2/gtsam-lm"]
+    assert figures["chi2_gap/gtsam-lm"] <= 1e-4
     assert (told["nodes"], told["edges"], told["loops"]) == (4, 4, 1)
     assert (told["verdict"], told["reasons"]) == ("trusted", [])
     before, after = read_graph(square), read_graph(out)

@@ -76,7 +76,8 @@ def test_the_page_says_what_its_pictures_hide_and_show(graph, rows, tmp_path):
     page = " ".join(page_of(tmp_path, graph, rows).split())
     assert "can all be seen" not in page
     assert "of maps that coincide the last one is seen" in page
-    assert "isotropised: with noise of each edge's position" in page
+    assert "Gap of chi2: proved of this map" in page
+    assert "F, which is chi2 with noise of each edge's position" in page
     assert "<h2>What the edges cost</h2> <p>The share of all edges" in page
 
 
