@@ -299,13 +299,19 @@ TOPICS = (
         tuple(
             Step(
                 f"hybridmap optimize $HYBRIDMAP_DATA/posegraphs/{name} --backend gtsam-lm",
-                (Figure("chi2/gtsam-lm", bar), Figure("certificate_gap/gtsam-lm", gap), Figure("cpu_s/gtsam-lm", 2.0)),
+                (
+                    Figure("chi2/gtsam-lm", bar),
+                    Figure("chi2_gap/gtsam-lm", 1e-3),
+                    Figure("certificate_gap/gtsam-lm", gap),
+                    Figure("cpu_s/gtsam-lm", 2.0),
+                ),
             )
             for name, bar, gap in _GRAPHS
         ),
         _asked(
             ("chi2, held against 1.001 of the best known", "chi2/gtsam-lm"),
-            ("proved gap to the optimum", "certificate_gap/gtsam-lm"),
+            ("proved gap of chi2 to the least of any map", "chi2_gap/gtsam-lm"),
+            ("proved gap of the objective with isotropic noise", "certificate_gap/gtsam-lm"),
             ("CPU time", "cpu_s/gtsam-lm"),
         ),
         needs="posegraphs/city10000.g2o",
