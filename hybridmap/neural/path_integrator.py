@@ -58,22 +58,29 @@ class PathIntegrator:
         head_direction, bands, grid, place, attractor: the populations of cells.
     """
 
-    def __init__(self, config: NeuralConfig, rng: np.random.Generator | None = None, dtype: DTypeLike = np.float64) -> None:
+    def __init__(
+        self,
+        config: NeuralConfig,
+        rng: np.random.Generator | None = None,
+        dtype: DTypeLike = np.float64,
+        heading_concentration: float = 0.0,
+    ) -> None:
         """Make every population of cells and let it settle at the origin.
 
         Args:
             config: settings of the cells.
             rng: random generator of the neuron noise; by default one is made from `NEURON_NOISE_SEED`.
             dtype: floating-point type of every population.
+            heading_concentration: of the head-direction cells' von Mises tuning; 0: the paper's cosine. The pose is the same.
 
         Raises:
-            ConfigError: the grid sheets do not settle with this kernel.
+            ConfigError: the grid sheets do not settle with this kernel, or the head-direction cells are too few.
         """
         self.config = config
         self.gains = Gains.of(config)
         self.spacings_m: NDArray[np.float64] = np.geomspace(config.spacing_min_m, config.spacing_max_m, config.modules)
         turned = np.radians(ORIENTATION_DEG + ORIENTATION_STEP_DEG * np.arange(config.modules))
-        self.head_direction = HeadDirectionRing(config.head_direction_cells, dtype)
+        self.head_direction = HeadDirectionRing(config.head_direction_cells, dtype, heading_concentration)
         self.bands = BandRings(self.spacings_m, turned, dtype=dtype, metric=config.metric)
         self.grid = _grid(config, dtype)
         place = config.place

@@ -8,6 +8,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from hybridmap.errors import ConfigError
+
 Metric = Literal["hexagonal", "square"]
 BAND_CELLS = 32
 """Cells of a band ring (three rings a module): a stripe is then some three cells wide."""
@@ -15,8 +17,14 @@ BAND_WIDTH = 0.1
 """Stripe width r as a share of the period; the rate is exp(-(s - l/2)^2 / (2 r^2))."""
 MODULATION_S = 0.1
 """Gain of the head-direction rates per turn rate, s: real cells fire more while the head turns."""
+_COSINE_CELLS, _CELLS_AT_LEAST, _CELLS_PER_ROOT = 3, 6.0, 8.0
 ORIENTATIONS_DEG = (0.0, 60.0, 120.0)
 SQUARE_ORIENTATIONS_DEG = (0.0, 45.0, 90.0)
+
+
+def cells_needed(concentration: float) -> int:
+    """Fewest head-direction cells whose population vector gives the heading to 1e-13 rad, with a tuning so concentrated."""
+    return math.ceil(_CELLS_AT_LEAST + _CELLS_PER_ROOT * math.sqrt(concentration)) if concentration > 0.0 else _COSINE_CELLS
 
 
 class HeadDirectionRing:
@@ -26,18 +34,38 @@ class HeadDirectionRing:
     (2/m) D d is exactly (cos phi, sin phi). A turn acts through the rank-two recurrent weights (2/m) D' R(dphi) D; the
     length of the population vector is restored at each turn (divisive inhibition), so rounding cannot let it grow or fade.
 
+    The mean vector length of every such cosine is 0.5; real cells are sharper. With a concentration k the net input
+    cos(theta_i - phi) passes through the transfer function h -> 2 exp(k (h - 1)), and the tuning is von Mises's. Its population
+    vector still points exactly along phi if there are enough cells: what is missed is of order I_(m-1)(k) / I_1(k).
+
     Attributes:
         activity: (m,) firing rates, 0..2; the whole state.
+        concentration: k of the von Mises tuning; 0: the paper's cosine.
     """
 
-    def __init__(self, cells: int, dtype: DTypeLike = np.float64) -> None:
+    def __init__(self, cells: int, dtype: DTypeLike = np.float64, concentration: float = 0.0) -> None:
+        """Make a ring of m `cells` that points along 0.
+
+        Args:
+            cells: m.
+            dtype: floating-point type of the rates.
+            concentration: k of a von Mises tuning; 0: the paper's cosine.
+
+        Raises:
+            ConfigError: a concentration below 0, or one for which there are too few cells to decode the heading exactly.
+        """
+        if not 0.0 <= concentration < math.inf:
+            raise ConfigError(f"head-direction cells: expected a concentration of at least 0, found {concentration:g}")
+        if cells < (needed := cells_needed(concentration)):
+            raise ConfigError(f"head-direction cells: a concentration of {concentration:g} needs {needed} cells, found {cells}")
         preferred = 2.0 * np.pi * np.arange(cells) / cells
         self.preferred_rad: NDArray[np.float64] = preferred
         self._kernel = np.stack([np.cos(preferred), np.sin(preferred)]).astype(dtype)
         self._readout = (self._kernel * (2.0 / cells)).astype(dtype)
         self._tuning = np.concatenate([self._kernel, np.ones_like(self._kernel[:1])])
         self._vector = np.ones(3, dtype=dtype)
-        self.activity: NDArray[np.floating] = 1.0 + self._kernel[0]
+        self.concentration = concentration
+        self.activity: NDArray[np.floating] = 1.0 + self._kernel[0] if concentration == 0.0 else self.rates_at(0.0)
 
     def direction(self) -> tuple[float, float]:
         """Return (cos, sin) of the decoded heading."""
@@ -51,9 +79,16 @@ class HeadDirectionRing:
         return math.atan2(s, c)
 
     def rates_at(self, heading_rad: float) -> NDArray[np.floating]:
-        """The rates (m,), 1 + cos(theta_i - heading), 0..2, at a heading, rad; no state changes."""
+        """The rates (m,), 0..2, at a heading, rad; no state changes."""
         vector = np.array([math.cos(heading_rad), math.sin(heading_rad), 1.0])
-        return np.asarray(vector.astype(self._tuning.dtype).dot(self._tuning))
+        return self._rates(vector.astype(self._tuning.dtype))
+
+    def _rates(self, vector: NDArray[np.floating]) -> NDArray[np.floating]:
+        """The rates (m,) of a ring that points along a vector (cos, sin, 1)."""
+        cosines = np.asarray(vector.dot(self._tuning))
+        if self.concentration == 0.0:
+            return cosines
+        return np.asarray(2.0 * np.exp(self.concentration * (cosines - 2.0)), dtype=cosines.dtype)
 
     @property
     def heading_rad(self) -> float:
@@ -73,7 +108,7 @@ class HeadDirectionRing:
         middle_c, middle_s = c * cos - s * sin, c * sin + s * cos
         self._vector[0] = middle_c * cos - middle_s * sin
         self._vector[1] = middle_c * sin + middle_s * cos
-        self.activity = self._vector.dot(self._tuning)
+        self.activity = self._rates(self._vector)
         return middle_c, middle_s
 
     def rates(self, turn_rate_rad_s: float = 0.0) -> NDArray[np.floating]:

@@ -94,10 +94,16 @@ _NOISE_COLOURS = ("#fde725", "#5ec962", "#21918c", "#3b528b", "#440154")
 
 
 def heading_figure(heading: HeadDirectionResult) -> str:
-    """Draw the tuning curves of six head-direction cells, and the ring's activity at four turn rates. Returns a `data:` URI."""
+    """Draw tuning curves of head-direction cells, and the ring's activity at four turn rates.
+
+    The curves are of six cells of the paper's ring, and of one cell of it beside one with von Mises's tuning.
+
+    Returns:
+        A `data:` URI.
+    """
     degrees = np.degrees(heading.preferred_rad)
     with style.figure(style.PAGE_WIDTH_IN, 2.7) as picture:
-        ring, one = picture.subplots(1, 2)
+        ring, one, sharper = picture.subplots(1, 3)
         for rates in heading.tuning:
             ring.plot(range(360), rates, linewidth=1.4)
         ring.set(title="Six cells of the ring", xlabel="heading (deg)", ylabel="rate")
@@ -106,8 +112,14 @@ def heading_figure(heading: HeadDirectionResult) -> str:
             one.plot(degrees, rates, color=colour, linewidth=1.4, label=f"{turn_rate:g} rad/s")
         one.set(title="The population while turning", xlabel="preferred direction (deg)")
         one.legend(title="turn rate", title_fontsize=8.5)
+        for (name, rates), colour in zip(heading.curves.items(), (style.ODOMETRY, style.PRIMARY), strict=True):
+            sharper.plot(range(-180, 180), np.roll(rates, 180), color=colour, linewidth=1.4, label=name.replace("_", " "))
+        sharper.set(title="Two kinds of tuning", xlabel="heading (deg)")
+        sharper.legend(loc="upper right")
+        sharper.set_ylim(top=2.5)
         for axes in (ring, one):
             axes.set_xticks(range(0, 361, 90))
+        sharper.set_xticks(range(-180, 181, 90))
         return style.svg_uri(picture)
 
 

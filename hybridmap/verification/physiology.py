@@ -1,9 +1,9 @@
-"""Measures of rate maps used in physiology: gridness, stripes, single fields."""
+"""Measures of rate maps and tuning curves used in physiology: gridness, stripes, single fields, information, tuning."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,13 @@ _FIELD_THRESHOLD = 0.2
 _SMALLEST_FIELD_BINS = 3
 _LARGEST_SHARE = 0.5
 _CENTRAL_PEAK = 0.5
+_WIDEST_CIRCLE = 0.9
+"""Radius of Langston's largest circle over the shorter side of the map: 90 cm in her arena of 1 m."""
+_CENTRE_ENDS = 0.2
+"""Mean correlation below which the central peak ends for Langston."""
+_CIRCLES = 3
+"""Circles of neighbouring radii whose mean is one score: a single thin ring around the centre scores anything."""
+_TURNS_DEG = (60.0, 120.0, 30.0, 90.0, 150.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,17 +39,20 @@ class Stripe:
 def autocorrelogram(rates: Array) -> Array:
     """Pearson correlation of a rate map (H, W) with itself at every lag, (2H-1, 2W-1), zero lag in the middle.
 
-    Only bins that both shifted maps cover count; lags with fewer than 20 such bins are 0 (Sargolini et al. 2006).
+    Only bins that both shifted maps cover count, and of these the ones that are not NaN (never visited); lags with fewer than
+    20 such bins are 0 (Sargolini et al. 2006).
     """
-    height, width = rates.shape
-    shape = (2 * height - 1, 2 * width - 1)
+    from scipy import fft
+
+    shape = [fft.next_fast_len(2 * count - 1, real=True) for count in rates.shape]
+    lags = np.ix_(*[np.arange(1 - count, count) for count in rates.shape])
 
     def correlate(a: Array, b: Array) -> Array:
-        product = np.fft.rfft2(a, shape) * np.conj(np.fft.rfft2(b, shape))
-        return np.asarray(np.fft.fftshift(np.fft.irfft2(product, shape)))
+        return np.asarray(np.fft.irfft2(np.fft.rfft2(a, shape) * np.conj(np.fft.rfft2(b, shape)), shape)[lags])
 
-    map_ = rates - rates.mean()
-    one = np.ones_like(map_)
+    visited = np.isfinite(rates)
+    one = visited.astype(np.float64)
+    map_ = np.where(visited, rates - rates[visited].mean(), 0.0)
     n = np.round(correlate(one, one))
     first, second = correlate(map_, one), correlate(one, map_)
     square = map_ * map_
@@ -52,36 +62,96 @@ def autocorrelogram(rates: Array) -> Array:
     return np.where(seen, covariance / np.sqrt(np.where(seen, variance, 1.0)), 0.0)
 
 
-def gridness(rates: Array) -> float:
-    """Grid score of a rate map (H, W) (Sargolini et al. 2006).
+class GridScores(NamedTuple):
+    """Two grid scores of one rate map, each at most 2; NaN where there is none.
 
-    The autocorrelogram is masked to the annulus that holds the six inner peaks and not the central one, and correlated with
-    itself turned: min(60, 120 degrees) - max(30, 90, 150 degrees). The annulus goes from the radius of the central peak (where
-    it falls to half) to the mean distance of the six peaks plus that radius.
+    Attributes:
+        sargolini: on the annulus that holds the six inner peaks (Sargolini et al. 2006).
+        langston: the highest on circles that grow around the central peak, without it (Langston et al. 2010).
+    """
+
+    sargolini: float
+    langston: float
+
+
+def gridness(rates: Array) -> float:
+    """Grid score of a rate map (H, W) after Sargolini; see `grid_scores`."""
+    return grid_scores(rates).sargolini
+
+
+def grid_scores(rates: Array) -> GridScores:
+    """Both grid scores of a rate map (H, W), which is NaN where nobody was.
+
+    Part of the autocorrelogram is correlated with itself turned: min(60, 120 degrees) - max(30, 90, 150 degrees). Sargolini's
+    annulus goes from the radius of the central peak, where it falls to a half, to the mean distance of the six inner peaks
+    plus that radius. Langston's circles grow bin by bin, to 0.9 of the map's shorter side. They leave out the central peak as
+    far as the first minimum of the mean correlation over distance, or to where that falls below 0.2. Her score is the
+    highest mean of three neighbouring circles.
 
     Returns:
-        The score, at most 2; NaN where there are no six peaks, or the annulus does not fit into the autocorrelogram.
+        The scores. Sargolini's is NaN where there are no six peaks, or the annulus does not fit into the autocorrelogram.
     """
     from scipy import ndimage
 
     correlation = autocorrelogram(rates)
-    distances, centre_radius = _inner_peaks(correlation)
-    if len(distances) < 6:
-        return float("nan")
-    inner, outer = centre_radius, float(distances.mean()) + centre_radius
-    half = int(np.ceil(outer)) + 1
-    middle = np.array(correlation.shape) // 2
-    if (middle < half).any():
-        return float("nan")
-    window = correlation[middle[0] - half : middle[0] + half + 1, middle[1] - half : middle[1] + half + 1]
+    half = min(correlation.shape) // 2
+    row, column = np.array(correlation.shape) // 2
+    if correlation[row, column] < _CENTRAL_PEAK:  # a map that is the same everywhere
+        return GridScores(float("nan"), float("nan"))
+    window = correlation[row - half : row + half + 1, column - half : column + half + 1]
     radius = np.hypot(*np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1), indexing="ij"))
-    ring = (radius > inner) & (radius <= outer)
+    turned = np.array([ndimage.rotate(window, degrees, reshape=False, order=1, mode="nearest") for degrees in _TURNS_DEG])
+    outward = np.argsort(radius, axis=None, kind="stable")
+    rings = _Rings(radius.flat[outward], window.flat[outward], turned.reshape(len(turned), -1)[:, outward])
 
-    def turned(degrees: float) -> float:
-        other = ndimage.rotate(window, degrees, reshape=False, order=1, mode="nearest")
-        return float(np.corrcoef(window[ring], other[ring])[0, 1])
+    distances, inner = _inner_peaks(correlation)
+    outer = float(distances.mean()) + inner if len(distances) == 6 else np.inf
+    sargolini = float(rings.scores(inner, np.array([np.nextafter(outer, np.inf)]))[0]) if outer <= half - 1 else float("nan")
+    first = _central_radius(window, radius)
+    circles = rings.scores(first, np.arange(first + 1.0, _WIDEST_CIRCLE * (half + 1)))
+    circles = circles[np.isfinite(circles)]
+    if len(circles) < _CIRCLES:
+        return GridScores(sargolini, float("nan"))
+    return GridScores(sargolini, float(np.convolve(circles, np.full(_CIRCLES, 1.0 / _CIRCLES), "valid").max()))
 
-    return min(turned(60.0), turned(120.0)) - max(turned(30.0), turned(90.0), turned(150.0))
+
+class _Rings(NamedTuple):
+    """Lags of an autocorrelogram from the centre outwards: radii (K,), values (K,), and the values turned (5, K)."""
+
+    radius: Array
+    values: Array
+    turned: Array
+
+    def scores(self, inner: float, outer: Array) -> Array:
+        """Grid scores (R,) of the lags beyond a radius and below each of the radii (R,), bins; NaN where there is none."""
+        start = int(np.searchsorted(self.radius, inner, side="right"))
+        end = np.searchsorted(self.radius, outer, side="left") - start - 1
+        most = int(end.max()) + start + 1 if len(end) else start
+        if most <= start:
+            return np.full(len(outer), np.nan)
+        grown = np.array([_growing_correlation(self.values[start:most], other[start:most]) for other in self.turned])
+        score = grown[:2].min(axis=0) - grown[2:].max(axis=0)
+        return np.where(end >= 0, score[end], np.nan)
+
+
+def _central_radius(window: Array, radius: Array) -> float:
+    """Radius, whole bins, of the central peak of an autocorrelogram after Langston; `radius` is that of each of its lags."""
+    bins = np.round(radius).astype(np.int64).ravel()
+    mean = (np.bincount(bins, window.ravel()) / np.bincount(bins))[: len(window) // 2]
+    ends = (mean < _CENTRE_ENDS) | np.append(np.diff(mean) > 0.0, True)
+    at = int(ends.argmax())
+    if mean[at] >= _CENTRE_ENDS:
+        return float(at)
+    return float(np.floor(at - (_CENTRE_ENDS - mean[at]) / (mean[at - 1] - mean[at])))
+
+
+def _growing_correlation(a: Array, b: Array) -> Array:
+    """Pearson correlation (K,) of the first 1, 2, ... K of the values (K,) of two arrays; NaN where one does not vary."""
+    n = np.arange(1, len(a) + 1)
+    sum_a, sum_b = np.cumsum(a), np.cumsum(b)
+    covariance = n * np.cumsum(a * b) - sum_a * sum_b
+    variance = (n * np.cumsum(a * a) - sum_a**2) * (n * np.cumsum(b * b) - sum_b**2)
+    return np.where(variance > 0.0, covariance / np.sqrt(np.where(variance > 0.0, variance, 1.0)), np.nan)
 
 
 def _inner_peaks(correlation: Array) -> tuple[Array, float]:
@@ -154,3 +224,51 @@ def field_counts(maps: NDArray[np.floating]) -> NDArray[np.int64]:
             regions, _ = ndimage.label(firing, structure=np.ones((3, 3)))
             counts[cell] = int((np.bincount(regions.ravel())[1:] >= _SMALLEST_FIELD_BINS).sum())
     return counts
+
+
+def spatial_information(rates: Array, dwell_s: Array) -> float:
+    """Information that one spike carries about the place, bits (Skaggs et al. 1993): sum p_i (r_i / r) log2(r_i / r).
+
+    Args:
+        rates: (H, W) rate map, NaN where nobody was.
+        dwell_s: (H, W) time in each bin, s.
+
+    Returns:
+        The information; NaN for a cell that never fires.
+    """
+    visited = np.isfinite(rates)
+    share = dwell_s[visited] / dwell_s[visited].sum()
+    mean = float(share @ rates[visited])
+    if not mean > 0.0:
+        return float("nan")
+    relative = rates[visited] / mean
+    fires = relative > 0.0
+    return float((share[fires] * relative[fires]) @ np.log2(relative[fires]))
+
+
+def vector_length(curve: Array) -> float:
+    """Length of the mean vector of a tuning curve (n,) over directions evenly spaced round the circle: 0 to 1.
+
+    It is 0.5 for a cosine 1 + cos, and I_1(k) / I_0(k) for von Mises's tuning. NaN for a cell that never fires.
+    """
+    total = float(curve.sum())
+    return float(abs(np.exp(2j * np.pi * np.arange(len(curve)) / len(curve)) @ curve)) / total if total > 0.0 else float("nan")
+
+
+def tuning_width(curve: Array) -> float:
+    """Width, rad, of a tuning curve (n,) round the circle half way between its lowest and its highest rate; NaN if it is flat.
+
+    The half height is interpolated between the first directions on either side of the peak that are below it.
+    """
+    low, high = float(curve.min()), float(curve.max())
+    if not high > low:
+        return float("nan")
+    half, count = 0.5 * (low + high), len(curve)
+    from_peak = np.roll(curve, -int(curve.argmax()))
+
+    def reach(side: Array) -> float:
+        below = int(np.argmax(side < half))
+        return float(below - (half - side[below]) / (side[below - 1] - side[below]))
+
+    right, left = reach(from_peak), reach(np.roll(from_peak[::-1], 1))
+    return float(2.0 * np.pi * (right + left) / count)

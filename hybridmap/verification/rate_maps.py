@@ -13,7 +13,7 @@ from hybridmap.geometry import Array
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural.place import PlaceProjection
 from hybridmap.verification.drives import pixel_order, raster
-from hybridmap.verification.physiology import field_counts, gridness, stripe_of
+from hybridmap.verification.physiology import field_counts, grid_scores, stripe_of
 
 _SETTLING_STEPS = 10
 _LEARNING_STEPS = 4  # theta at 30 Hz
@@ -28,7 +28,7 @@ class LatticeMaps:
         pitch_m: side of a pixel.
         spacings_m: (M,) spacing of each grid module.
         grid: (M, C, H, W) rate maps of C sampled grid cells of each module.
-        gridness: (M, C) grid score of each of these maps.
+        gridness, langston: (M, C) grid scores of each of these maps, Sargolini's and Langston's.
         bands: (M, 3, H, W) rate map of one sampled cell of each band.
         band_orientation_error_deg, band_period_error: (M, 3) deviation of the measured stripes from the orientation and
             period for which the band was made; the period's as a share.
@@ -38,6 +38,7 @@ class LatticeMaps:
     spacings_m: Array
     grid: NDArray[np.float32]
     gridness: Array
+    langston: Array
     bands: NDArray[np.float32]
     band_orientation_error_deg: Array
     band_period_error: Array
@@ -73,11 +74,13 @@ def lattice_maps(
     seen = np.array([[stripe.orientation_rad + angle for stripe in row] for row in stripes])
     turned = np.degrees(seen - integrator.bands.orientations_rad)
     periods = np.array([[stripe.period_m for stripe in row] for row in stripes])
+    scores = np.array([[grid_scores(rates) for rates in row] for row in grid])
     return LatticeMaps(
         pitch_m,
         integrator.spacings_m,
         grid,
-        np.array([[gridness(rates) for rates in row] for row in grid]),
+        scores[..., 0],
+        scores[..., 1],
         bands,
         np.abs((turned + 90.0) % 180.0 - 90.0),
         np.abs(periods / integrator.bands.periods_m - 1.0),

@@ -10,8 +10,8 @@ import numpy as np
 
 from hybridmap.geometry import Array
 from hybridmap.metrics import Metric
-from hybridmap.verification.path_error import PathErrors
-from hybridmap.verification.physiology import gridness, ideal_map
+from hybridmap.verification.path_error import VON_MISES, PathErrors
+from hybridmap.verification.physiology import gridness, ideal_map, tuning_width, vector_length
 from hybridmap.verification.rate_maps import PlaceResult
 from hybridmap.verification.shadow import STEPS_ON
 from hybridmap.verification.verification import CellVerification
@@ -59,6 +59,17 @@ def head_direction_rows(result: CellVerification) -> list[Metric]:
             "head_direction_float64", heading.error_rad["float64"], "rad", "decoded heading against the sum of the turns", 1e-9
         ),
         _row("head_direction_float32", heading.error_rad["float32"], "rad", "the same in float32", 1e-3),
+        _row("head_direction_von_mises", heading.error_rad["von_mises"], "rad", "the same, sharper tuning (von Mises)", 1e-9),
+        *(
+            row
+            for name, tuning in (("cosine", "the paper's cosine"), ("von_mises", f"von Mises, concentration {VON_MISES:g}"))
+            for row in (
+                _row(
+                    f"tuning_width_{name}", np.degrees(tuning_width(heading.curves[name])), "deg", f"at half height: {tuning}"
+                ),
+                _row(f"tuning_vector_{name}", vector_length(heading.curves[name]), "1", f"mean vector length: {tuning}"),
+            )
+        ),
         _row(
             "turn_rate_modulation",
             gain,
@@ -80,7 +91,7 @@ def band_rows(result: CellVerification) -> list[Metric]:
 
 
 def gridness_rows(result: CellVerification) -> list[Metric]:
-    """Rows on the grid score: of the sampled cells, of an ideal map, and of cells on a square lattice."""
+    """Rows on the grid score, mostly Sargolini's: of the sampled cells, of an ideal map, and of cells on a square lattice."""
     scores = result.lattice.gridness
     spacings = result.lattice.spacings_m / result.lattice.pitch_m
     side = result.lattice.grid.shape[-1]
@@ -90,6 +101,7 @@ def gridness_rows(result: CellVerification) -> list[Metric]:
             "gridness", float(scores.min()), "1", f"worst of {scores.size} grid cells in {len(scores)} modules", 1.1, _AT_LEAST
         ),
         _row("gridness_median", float(np.median(scores)), "1", "median of the same cells"),
+        _row("gridness_langston", float(result.lattice.langston.min()), "1", "worst of the same cells by Langston's score"),
         _row("gridness_ideal", ideal, "1", "ideal map (three plane waves) of the same size, by the same code"),
         _row("gridness_square", float(np.median(result.square.gridness)), "1", "median with orthogonal bands, square metric"),
     ]

@@ -107,7 +107,7 @@ def verify_cells(
     """
     PathIntegrator(NeuralConfig.model_validate(settings))  # fails at once if it cannot be made
     tasks = _tasks(np.random.SeedSequence(seed), scale, settings)
-    done = _run(tasks, scale.workers, progress or (lambda _done, _total: None))
+    done = run_tasks(tasks, scale.workers, progress)
     parts: dict[str, Any] = {key[0]: value for key, value in done.items() if len(key) == 1}
     return CellVerification(
         **parts,
@@ -161,11 +161,18 @@ def printed_kernel(settings: dict[str, object]) -> str:
     return ""
 
 
-def _run(
-    tasks: dict[tuple[Any, ...], Task], workers: int | None, progress: Callable[[int, int | None], None]
+def run_tasks(
+    tasks: dict[tuple[Any, ...], Task], workers: int | None, progress: Callable[[int, int | None], None] | None = None
 ) -> dict[tuple[Any, ...], Any]:
-    """Run the tasks in processes, or here if there is to be one only."""
+    """Run the tasks in so many processes (None: one per core), or here if there is to be one only; results by the same keys.
+
+    Args:
+        tasks: key -> function and its arguments, the longest first.
+        workers: number of processes; None: one per core.
+        progress: called with the number of finished tasks and of all.
+    """
     count = min(workers or os.cpu_count() or 1, len(tasks))
+    progress = progress or (lambda _done, _total: None)
     done = {}
     if count == 1:
         for number, (key, (function, arguments)) in enumerate(tasks.items()):

@@ -22,8 +22,9 @@ def rows(result):
 def test_every_row_of_the_table_is_there(rows):
     judged = {name for name, row in rows.items() if row.passed is not None}
     assert judged == {
-        "head_direction_float64", "head_direction_float32", "band_orientation", "band_period", "gridness",
-        "phase_error_relu_30hz", "phase_error_relu_100hz", "phase_error_softplus_30hz", "phase_error_softplus_100hz",
+        "head_direction_float64", "head_direction_float32", "head_direction_von_mises", "band_orientation", "band_period",
+        "gridness", "phase_error_relu_30hz", "phase_error_relu_100hz", "phase_error_softplus_30hz",
+        "phase_error_softplus_100hz",
         "position_room_relu", "position_room_softplus", "position_corridor_relu", "position_corridor_softplus",
         "no_shadow_integrator", "no_shadow_driving_on", "place_single_recruited", "attractor_one_bump_recruited_settled",
         "attractor_one_bump_printed_settled", "standing_still", "printed_kernel_refused",

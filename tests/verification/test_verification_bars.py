@@ -42,6 +42,9 @@ BREAKS = {
     "head_direction_float32": lambda r: with_part(
         r, "head_direction", error_rad=r.head_direction.error_rad | {"float32": 1.1e-3}
     ),
+    "head_direction_von_mises": lambda r: with_part(
+        r, "head_direction", error_rad=r.head_direction.error_rad | {"von_mises": 1.1e-9}
+    ),
     "band_orientation": lambda r: with_part(
         r, "lattice", band_orientation_error_deg=worst(r.lattice.band_orientation_error_deg, 0.6)
     ),
@@ -196,7 +199,7 @@ def test_a_shadow_integrator_that_puts_the_sheets_back_is_found(monkeypatch, res
 def test_the_heading_rows_are_of_the_ring_that_is_configured(cells):
     found = path_error.head_direction(SEED, {"head_direction_cells": cells}, 50)
     assert len(found.preferred_rad) == found.rates.shape[1] == cells
-    assert set(found.error_rad) == {"float64", "float32"}
+    assert set(found.error_rad) == {"float64", "float32", "von_mises"}
 
 
 def test_all_noises_are_measured_on_the_same_drives(result):
