@@ -20,7 +20,7 @@ MAX_GAP_S = 1.0
 """A reference is interpolated between two of its poses only if they are no further apart than this."""
 
 
-_LATEST_S = 9_000_000_000
+LATEST_S = 9_000_000_000
 """The year 2255. Later stamps do not fit into 64 bits of nanoseconds; those of other units than seconds are far beyond."""
 _UNITS = {"milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}
 _MOST_DIGITS = 40
@@ -39,8 +39,8 @@ def read_stamp_ns(text: str) -> int:
         stamp_s = None
     if stamp_s is None or not stamp_s.is_finite():
         raise ValueError(f"expected a stamp in seconds, found {quoted(text)}")
-    if abs(stamp_s) > _LATEST_S:
-        unit = next((name for name, per_s in _UNITS.items() if abs(stamp_s) <= _LATEST_S * per_s), None)
+    if abs(stamp_s) > LATEST_S:
+        unit = next((name for name, per_s in _UNITS.items() if abs(stamp_s) <= LATEST_S * per_s), None)
         guess = f", which would be the year {_year(stamp_s / _UNITS[unit])} in {unit}" if unit else ""
         raise ValueError(f"expected a stamp in seconds, found {quoted(text)}{guess}; convert it to seconds")
     return int((stamp_s * NS_PER_S).to_integral_value())

@@ -2,7 +2,9 @@
 (`hybridmap verify`).
 """
 
-from hybridmap.verification.rows import rows_of
+from hybridmap.verification.recorded import read_path
+from hybridmap.verification.rows import path_rows, rows_of
+from hybridmap.verification.single_cells import verify_along
 from hybridmap.verification.verification import CellVerification, Scale, verify_cells
 
-__all__ = ["CellVerification", "Scale", "rows_of", "verify_cells"]
+__all__ = ["CellVerification", "Scale", "path_rows", "read_path", "rows_of", "verify_along", "verify_cells"]

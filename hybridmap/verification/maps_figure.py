@@ -1,4 +1,4 @@
-"""Pictures of rate maps on the verification's page: stripes of band cells, grid cells and place cells."""
+"""Pictures of rate maps on the verification's pages: stripes of band cells, grid cells, place cells, and spikes on a path."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from hybridmap.report import style
 from hybridmap.verification.physiology import autocorrelogram
 from hybridmap.verification.rate_maps import LatticeMaps, PlaceMaps, PlaceResult
+from hybridmap.verification.single_cells import BAND, GRID, HEADING, HEADING_BINS, PLACE, SCORES, PathVerification
 
 _RATES, _CORRELATION = "viridis", "RdBu_r"
 _LABEL_BOX = {"facecolor": "#000000", "edgecolor": "none", "alpha": 0.55, "pad": 1.0}
@@ -18,6 +19,9 @@ _TIGHT = {"wspace": 0.07, "hspace": 0.07}
 _SPACINGS_SHOWN = 1.9
 _ZOOM_M = 0.4
 _EXAMPLES = 8
+_SPIKE_COLOUR, _PATH_COLOUR = "#d40000", "#b8b8b8"
+_KIND_COLOURS = {GRID: "#0072b2", BAND: "#e69f00", PLACE: "#009e73", HEADING: "#0072b2"}
+_POINT = 3.0
 
 
 def stripes_figure(lattice: LatticeMaps) -> str:
@@ -176,3 +180,122 @@ def _colour_bar(picture: Any, panels: Any, label: str, cmap: str, limits: tuple[
 def _name_rows(panels: Any, names: Sequence[str]) -> None:
     for axes, name in zip(panels[:, 0], names, strict=True):
         axes.set_ylabel(name, fontsize=8.0)
+
+
+def recorded_path_figure(result: PathVerification) -> str:
+    """Draw a recorded path, the time spent in each bin, and the error of the decoded position over distance.
+
+    Returns:
+        A `data:` URI.
+    """
+    arena, errors = result.arena, result.errors
+    with style.figure(style.PAGE_WIDTH_IN, 3.1) as picture:
+        path, time, error = picture.subplots(1, 3)
+        path.plot(*result.track.poses[:, :2].T, color="#444444", linewidth=0.4, rasterized=True)
+        path.set(title="The path", xlabel="x (m)", ylabel="y (m)", aspect="equal")
+        left, bottom = arena.corner_m
+        extent = (left, left + arena.pitch_m * arena.dwell_s.shape[0], bottom, bottom + arena.pitch_m * arena.dwell_s.shape[1])
+        dwell = np.where(arena.reached, arena.smoothed_s, np.nan).T
+        image = time.imshow(dwell, origin="lower", extent=extent, cmap=_RATES, vmin=0.0, interpolation="nearest")
+        picture.colorbar(image, ax=time, label="s in a bin, smoothed", shrink=0.8)
+        time.set(title="Time", xlabel="x (m)")
+        error.plot(errors.distance_m, 1e3 * errors.position_m, color=style.PRIMARY, linewidth=0.9)
+        error.set(title="Error of the decoded position", xlabel="moved (m)", ylabel="mm")
+        error.set_ylim(bottom=0.0)
+        error.grid(visible=True, linewidth=0.5)
+        return style.svg_uri(picture)
+
+
+def spiking_grid_figure(result: PathVerification) -> str:
+    """Draw the spikes of one grid cell of every module on the path, its rate map and its autocorrelogram.
+
+    Returns:
+        A `data:` URI.
+    """
+    grid = result.of_kind(GRID)
+    shown = [next(entry for entry in grid if entry[1].module == module) for module in range(len(result.spacings_m))]
+    with style.figure(style.PAGE_WIDTH_IN, 4.0, (0.03, 0.93, 0.01, 0.93)) as picture:
+        panels = picture.subplots(3, len(shown), gridspec_kw={**_TIGHT, "hspace": 0.16}, squeeze=False)
+        for column, (number, cell, found) in zip(panels.T, shown, strict=True):
+            _spikes_on_path(column[0], result, number, f"{100.0 * cell.spacing_m:.0f} cm")
+            scores = f"S {found.scores['sargolini']:.2f}, L {found.scores['langston']:.2f}"
+            _rate_map(column[1], found.rates, f"{scores}\npeak {np.nanmax(found.rates):.2g} Hz")
+            lags = _middle_of(autocorrelogram(found.rates), _SPACINGS_SHOWN * cell.spacing_m / result.arena.pitch_m)
+            _picture(column[2], lags, "", _CORRELATION, (-1.0, 1.0))
+        _scale_bar(panels[1, 0], 0.5 * float(result.spacings_m.max()) / result.arena.pitch_m, "")
+        _name_rows(panels, ("spikes", "rate", "correlogram"))
+        _rate_bar(picture, panels[1:2])
+        _colour_bar(picture, panels[2:], "correlation", _CORRELATION, (-1.0, 1.0))
+        return style.svg_uri(picture)
+
+
+def spiking_others_figure(result: PathVerification) -> str:
+    """Draw rate maps of band cells and place cells along the path, and tuning curves of head-direction cells.
+
+    Returns:
+        A `data:` URI.
+    """
+    with style.figure(style.PAGE_WIDTH_IN, 4.6, (0.05, 0.93, 0.1, 0.95)) as picture:
+        panels = picture.subplots(3, _EXAMPLES, gridspec_kw={**_TIGHT, "hspace": 0.25}, squeeze=False)
+        for row, kind in zip(panels, (BAND, PLACE), strict=False):
+            entries = result.of_kind(kind)
+            for axes, (_, _, found) in zip(row, entries[:: max(1, len(entries) // _EXAMPLES)], strict=False):
+                information = f"{found.scores['information']:.1f} bits"
+                _rate_map(axes, found.rates, f"{information}, {np.nanmax(found.rates):.2g} Hz")
+        for axes in (*panels[:2].flat, *panels[2]):
+            axes.set_axis_off() if not axes.get_images() else None
+        _name_rows(panels[:2], ("band cells", "place cells"))
+        _rate_bar(picture, panels[:2])
+        _tuning_curves(picture.add_subplot(3, 1, 3), result)
+        return style.svg_uri(picture)
+
+
+def chance_figure(result: PathVerification) -> str:
+    """Draw each score of every cell beside what its own shuffled spikes reach. Returns a `data:` URI."""
+    names = {
+        "sargolini": "Grid score, Sargolini",
+        "langston": "Grid score, Langston",
+        "information": "Spatial information (bits/spike)",
+        "vector_length": "Mean vector length",
+    }
+    with style.figure(style.PAGE_WIDTH_IN, 2.8) as picture:
+        panels = picture.subplots(1, len(names))
+        for axes, (name, title) in zip(panels, names.items(), strict=True):
+            start = 0
+            for kind in (kind for kind, scores in SCORES.items() if name in scores):
+                found = [scores for _, _, scores in result.of_kind(kind)]
+                at = np.arange(start, start + len(found))
+                looks = {"color": _KIND_COLOURS[kind], "linestyle": "none", "marker": "o", "markersize": _POINT}
+                axes.plot(at, [scores.scores[name] for scores in found], label=kind, **looks)
+                axes.plot(at, [scores.chance[name] for scores in found], color="#444444", drawstyle="steps-mid", linewidth=1.0)
+                start += len(found) + 2
+            axes.set_title(title, fontsize=9.0)
+            axes.set_xticks([])
+            axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+            axes.grid(visible=True, linewidth=0.5, axis="y")
+            axes.legend(loc="best", fontsize=_SMALL)
+        return style.svg_uri(picture)
+
+
+def _spikes_on_path(axes: Any, result: PathVerification, number: int, title: str) -> None:
+    """The path in grey, and a dot where a cell fired."""
+    known = result.track.poses[result.track.known, :2]
+    axes.plot(*result.track.poses[:, :2].T, color=_PATH_COLOUR, linewidth=0.25, rasterized=True)
+    axes.plot(
+        *known[result.spikes[number]].T, color=_SPIKE_COLOUR, linestyle="none", marker=".", markersize=1.2, rasterized=True
+    )
+    low = result.arena.corner_m
+    high = low + result.arena.pitch_m * np.array(result.arena.dwell_s.shape)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
+    axes.set_title(title, fontsize=_SMALL, fontweight="normal", loc="center", pad=2.5)
+
+
+def _tuning_curves(axes: Any, result: PathVerification) -> None:
+    """Rate over heading of every head-direction cell."""
+    degrees = 360.0 * np.arange(HEADING_BINS) / HEADING_BINS
+    for _, _, found in result.of_kind(HEADING):
+        axes.plot(degrees, found.tuning, linewidth=1.2)
+    axes.set(xlabel="heading (deg)", ylabel="head-direction cells (Hz)", xlim=(0.0, 354.0))
+    axes.set_xticks(range(0, 360, 90))
+    axes.set_ylim(bottom=0.0)

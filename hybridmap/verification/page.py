@@ -1,4 +1,4 @@
-"""The verification's output: `metrics.json` and one self-contained page with figures."""
+"""The verification's output: `metrics.json` and one self-contained page with figures; along a path also its cells as files."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ from hybridmap.report import style
 from hybridmap.report.page_tables import is_page, rendered
 from hybridmap.verification import CellVerification, maps_figure
 from hybridmap.verification.path_error import HeadDirectionResult, PathErrors
+from hybridmap.verification.recorded import RATE_HZ
 from hybridmap.verification.rows import PHASE_BAR_PERCENT, ROOM_BAR_MM, noise_curve, recurrence_verdict
 from hybridmap.verification.shadow import Cells, Overwriting
+from hybridmap.verification.single_cells import CHANCE, SCORES, PathVerification
 
-PAGE, METRICS = "verify.html", "metrics.json"
-VERIFICATION = Kind("verification", (PAGE, METRICS), lambda folder: is_page(folder / PAGE))
-_TEMPLATE = "verify.html.j2"
+PAGE, METRICS, CELLS, NWB = "verify.html", "metrics.json", "cells.csv", "cells.nwb"
+VERIFICATION = Kind("verification", (PAGE, METRICS, CELLS, NWB), lambda folder: is_page(folder / PAGE))
+_TEMPLATE, _PATH_TEMPLATE = "verify.html.j2", "verify_path.html.j2"
 
 
 def write_verification(place: Held, head: dict[str, Any], rows: Sequence[Metric], result: CellVerification) -> Path:
@@ -46,6 +48,73 @@ def write_verification(place: Held, head: dict[str, Any], rows: Sequence[Metric]
     return place.path / PAGE
 
 
+def write_along(place: Held, head: dict[str, Any], rows: Sequence[Metric], result: PathVerification, *, nwb: bool) -> Path:
+    """Write `metrics.json`, `verify.html`, `cells.csv` (a line a cell) and, if asked for, `cells.nwb`.
+
+    Args:
+        place: the folder, locked against other writers.
+        head: facts about the run, by name; they become keys of `metrics.json` and the head of the page.
+        rows: the metrics in the table.
+        result: the cells along the path.
+        nwb: whether to write `cells.nwb`.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        ExportError: pynwb is not installed.
+        OutputError: the folder cannot be written to.
+    """
+    text = rendered(
+        _PATH_TEMPLATE,
+        **_table_of(head, rows),
+        track=result.track,
+        concentration=result.heading_concentration,
+        chance_percent=f"{100.0 * CHANCE:g}",
+        pixel_cm=f"{100.0 * result.arena.pitch_m:.3g}",
+        path=maps_figure.recorded_path_figure(result),
+        grid=maps_figure.spiking_grid_figure(result),
+        others=maps_figure.spiking_others_figure(result),
+        chance=maps_figure.chance_figure(result),
+    )
+    with place.replaced():
+        write_text(place.path / METRICS, to_json(head, rows) + "\n")
+        write_text(place.path / CELLS, _cells_csv(result))
+        if nwb:
+            from hybridmap.verification.nwb import write_nwb
+
+            write_nwb(place.path / NWB, result, int(head["seed"]))
+        write_text(place.path / PAGE, text)
+    return place.path / PAGE
+
+
+def _cells_csv(result: PathVerification) -> str:
+    """Table of the cells, one a line: what it is, its spikes, its scores, those of chance and of its rate; empty: not asked."""
+    names = list(dict.fromkeys(name for scores in SCORES.values() for name in scores))
+    columns = ["cell", "kind", "module", "spacing_m", "preferred_deg", "spikes", "mean_hz", "peak_hz", "width_deg"]
+    lines = [",".join([*columns, *(f"{name}{end}" for name in names for end in ("", "_chance", "_of_rates"))])]
+    for number, (cell, fired, found) in enumerate(zip(result.cells, result.spikes, result.results, strict=True)):
+        mean_hz = len(fired) * RATE_HZ / len(result.arena.bins)
+        angles = np.degrees([cell.preferred_rad, found.width_rad])
+        values = [cell.spacing_m, angles[0], len(fired), mean_hz, float(np.nanmax(found.rates)), angles[1]]
+        for name in names:
+            values += [part.get(name, float("nan")) for part in (found.scores, found.chance, found.true_scores)]
+        texts = [f"{value:.6g}" if np.isfinite(value) else "" for value in values]
+        lines.append(",".join([str(number), cell.kind, str(cell.module) if cell.module >= 0 else "", *texts]))
+    return "\n".join(lines) + "\n"
+
+
+def _table_of(head: dict[str, Any], rows: Sequence[Metric]) -> dict[str, Any]:
+    """What every page of a verification shows at its top, for the template."""
+    return {
+        "head": head,
+        "rows": [(row.name.removeprefix("verify/"), tables.number(row.value), tables.unit(row), row) for row in rows],
+        "value": {row.name.removeprefix("verify/"): tables.number(row.value) for row in rows},
+        "judged": sum(row.passed is not None for row in rows),
+        "version": version("hybridmap"),
+    }
+
+
 def _scale_of(result: CellVerification) -> dict[str, str]:
     """Sizes and numbers for the captions."""
     lattice, place = result.lattice, result.place
@@ -62,14 +131,10 @@ def _scale_of(result: CellVerification) -> dict[str, str]:
 
 
 def _render(head: dict[str, Any], rows: Sequence[Metric], result: CellVerification) -> str:
-    named = {row.name.removeprefix("verify/"): row for row in rows}
     first = next(iter(result.room.values()))
     return rendered(
         _TEMPLATE,
-        head=head,
-        rows=[(row.name.removeprefix("verify/"), tables.number(row.value), tables.unit(row), row) for row in rows],
-        value={name: tables.number(row.value) for name, row in named.items()},
-        judged=sum(row.passed is not None for row in rows),
+        **_table_of(head, rows),
         drives=len(first),
         scale=_scale_of(result),
         distance=f"{first[0].distance_m[-1]:.0f}",
@@ -84,11 +149,11 @@ def _render(head: dict[str, Any], rows: Sequence[Metric], result: CellVerificati
         shadow=shadow_figure(result.overwritten["softplus"]),
         noise=noise_figure(result),
         printed_kernel=result.printed_kernel,
-        version=version("hybridmap"),
     )
 
 
 _COLOURS = {"relu": "#0072b2", "softplus": "#009e73"}
+_TUNINGS = {"cosine": "cosine", "von_mises": "von Mises"}
 _DASHES: dict[float, Any] = {30.0: "solid", 100.0: (0, (4, 1.2))}
 _NOISE_COLOURS = ("#fde725", "#5ec962", "#21918c", "#3b528b", "#440154")
 
@@ -113,7 +178,7 @@ def heading_figure(heading: HeadDirectionResult) -> str:
         one.set(title="The population while turning", xlabel="preferred direction (deg)")
         one.legend(title="turn rate", title_fontsize=8.5)
         for (name, rates), colour in zip(heading.curves.items(), (style.ODOMETRY, style.PRIMARY), strict=True):
-            sharper.plot(range(-180, 180), np.roll(rates, 180), color=colour, linewidth=1.4, label=name.replace("_", " "))
+            sharper.plot(range(-180, 180), np.roll(rates, 180), color=colour, linewidth=1.4, label=_TUNINGS[name])
         sharper.set(title="Two kinds of tuning", xlabel="heading (deg)")
         sharper.legend(loc="upper right")
         sharper.set_ylim(top=2.5)

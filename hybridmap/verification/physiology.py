@@ -17,7 +17,7 @@ _CENTRAL_PEAK = 0.5
 _WIDEST_CIRCLE = 0.9
 """Radius of Langston's largest circle over the shorter side of the map: 90 cm in her arena of 1 m."""
 _CENTRE_ENDS = 0.2
-"""Mean correlation below which the central peak ends for Langston."""
+"""Correlation below which the central peak ends for Langston."""
 _CIRCLES = 3
 """Circles of neighbouring radii whose mean is one score: a single thin ring around the centre scores anything."""
 _TURNS_DEG = (60.0, 120.0, 30.0, 90.0, 150.0)
@@ -46,18 +46,17 @@ def autocorrelogram(rates: Array) -> Array:
 
     shape = [fft.next_fast_len(2 * count - 1, real=True) for count in rates.shape]
     lags = np.ix_(*[np.arange(1 - count, count) for count in rates.shape])
-
-    def correlate(a: Array, b: Array) -> Array:
-        return np.asarray(np.fft.irfft2(np.fft.rfft2(a, shape) * np.conj(np.fft.rfft2(b, shape)), shape)[lags])
-
     visited = np.isfinite(rates)
-    one = visited.astype(np.float64)
     map_ = np.where(visited, rates - rates[visited].mean(), 0.0)
-    n = np.round(correlate(one, one))
-    first, second = correlate(map_, one), correlate(one, map_)
-    square = map_ * map_
-    variance = (n * correlate(square, one) - first**2) * (n * correlate(one, square) - second**2)
-    covariance = n * correlate(map_, map_) - first * second
+    one, first, square = (np.fft.rfft2(values, shape) for values in (visited.astype(np.float64), map_, map_ * map_))
+
+    def correlate(a: NDArray[np.complexfloating], b: NDArray[np.complexfloating]) -> Array:
+        return np.asarray(np.fft.irfft2(a * np.conj(b), shape)[lags])
+
+    n, sums, squares = np.round(correlate(one, one)), correlate(first, one), correlate(square, one)
+    other_sums, other_squares = sums[::-1, ::-1], squares[::-1, ::-1]  # of the map that is not shifted
+    variance = (n * squares - sums**2) * (n * other_squares - other_sums**2)
+    covariance = n * correlate(first, first) - sums * other_sums
     seen = (n >= 20) & (variance > 1e-12 * variance.max())
     return np.where(seen, covariance / np.sqrt(np.where(seen, variance, 1.0)), 0.0)
 
@@ -84,30 +83,24 @@ def grid_scores(rates: Array) -> GridScores:
 
     Part of the autocorrelogram is correlated with itself turned: min(60, 120 degrees) - max(30, 90, 150 degrees). Sargolini's
     annulus goes from the radius of the central peak, where it falls to a half, to the mean distance of the six inner peaks
-    plus that radius. Langston's circles grow bin by bin, to 0.9 of the map's shorter side. They leave out the central peak as
-    far as the first minimum of the mean correlation over distance, or to where that falls below 0.2. Her score is the
-    highest mean of three neighbouring circles.
+    plus that radius. Langston's circles grow bin by bin, to 0.9 of the map's shorter side. They leave out the central peak to
+    where it falls below 0.2, or to the first minimum of the mean correlation over distance. Her score is the highest mean of
+    three neighbouring circles.
 
     Returns:
         The scores. Sargolini's is NaN where there are no six peaks, or the annulus does not fit into the autocorrelogram.
     """
-    from scipy import ndimage
-
     correlation = autocorrelogram(rates)
     half = min(correlation.shape) // 2
     row, column = np.array(correlation.shape) // 2
     if correlation[row, column] < _CENTRAL_PEAK:  # a map that is the same everywhere
         return GridScores(float("nan"), float("nan"))
     window = correlation[row - half : row + half + 1, column - half : column + half + 1]
-    radius = np.hypot(*np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1), indexing="ij"))
-    turned = np.array([ndimage.rotate(window, degrees, reshape=False, order=1, mode="nearest") for degrees in _TURNS_DEG])
-    outward = np.argsort(radius, axis=None, kind="stable")
-    rings = _Rings(radius.flat[outward], window.flat[outward], turned.reshape(len(turned), -1)[:, outward])
-
+    rings = _rings_of(window)
     distances, inner = _inner_peaks(correlation)
     outer = float(distances.mean()) + inner if len(distances) == 6 else np.inf
     sargolini = float(rings.scores(inner, np.array([np.nextafter(outer, np.inf)]))[0]) if outer <= half - 1 else float("nan")
-    first = _central_radius(window, radius)
+    first = _central_radius(rings)
     circles = rings.scores(first, np.arange(first + 1.0, _WIDEST_CIRCLE * (half + 1)))
     circles = circles[np.isfinite(circles)]
     if len(circles) < _CIRCLES:
@@ -116,7 +109,10 @@ def grid_scores(rates: Array) -> GridScores:
 
 
 class _Rings(NamedTuple):
-    """Lags of an autocorrelogram from the centre outwards: radii (K,), values (K,), and the values turned (5, K)."""
+    """Lags of an autocorrelogram from the centre outwards: radii (K,), values (K,), and the values turned (5, K).
+
+    Of each lag and its opposite, which have the same value, one is here; the centre is not.
+    """
 
     radius: Array
     values: Array
@@ -134,15 +130,28 @@ class _Rings(NamedTuple):
         return np.where(end >= 0, score[end], np.nan)
 
 
-def _central_radius(window: Array, radius: Array) -> float:
-    """Radius, whole bins, of the central peak of an autocorrelogram after Langston; `radius` is that of each of its lags."""
-    bins = np.round(radius).astype(np.int64).ravel()
-    mean = (np.bincount(bins, window.ravel()) / np.bincount(bins))[: len(window) // 2]
-    ends = (mean < _CENTRE_ENDS) | np.append(np.diff(mean) > 0.0, True)
-    at = int(ends.argmax())
-    if mean[at] >= _CENTRE_ENDS:
-        return float(at)
-    return float(np.floor(at - (_CENTRE_ENDS - mean[at]) / (mean[at - 1] - mean[at])))
+def _rings_of(window: Array) -> _Rings:
+    """The lags of the middle of an autocorrelogram (2 half + 1 squared), as far as the circle that fits in."""
+    from scipy import ndimage
+
+    half = len(window) // 2
+    y, x = (lag.ravel()[window.size // 2 + 1 :] for lag in np.mgrid[-half : half + 1, -half : half + 1])
+    radius = np.hypot(y, x)
+    outward = np.argsort(radius, kind="stable")[: np.count_nonzero(radius <= half)]
+    y, x = y[outward], x[outward]
+    angles = np.radians(_TURNS_DEG)[:, None]
+    there = np.stack([np.cos(angles) * y + np.sin(angles) * x, np.cos(angles) * x - np.sin(angles) * y]) + half
+    turned = ndimage.map_coordinates(window, there, order=1, mode="nearest")
+    return _Rings(radius[outward], window[y + half, x + half], turned)
+
+
+def _central_radius(rings: _Rings) -> float:
+    """Radius, whole bins, of the disc that is as large as the central peak above 0.2, up to the first minimum around it."""
+    bins = np.append(0, np.round(rings.radius).astype(np.int64))
+    mean = np.bincount(bins, np.append(1.0, rings.values)) / np.bincount(bins)
+    end = int(((mean < _CENTRE_ENDS) | np.append(np.diff(mean) > 0.0, True)).argmax())
+    area = 1 + 2 * np.count_nonzero(rings.values[rings.radius <= end + 1] >= _CENTRE_ENDS)
+    return float(np.floor(np.sqrt(area / np.pi)))
 
 
 def _growing_correlation(a: Array, b: Array) -> Array:

@@ -14,6 +14,7 @@ from hybridmap.verification.path_error import VON_MISES, PathErrors
 from hybridmap.verification.physiology import gridness, ideal_map, tuning_width, vector_length
 from hybridmap.verification.rate_maps import PlaceResult
 from hybridmap.verification.shadow import STEPS_ON
+from hybridmap.verification.single_cells import CHANCE, HEADING, SCORES, PathVerification
 from hybridmap.verification.verification import CellVerification
 
 PHASE_BAR_PERCENT = {"relu": 0.6, "softplus": 0.02}
@@ -21,6 +22,14 @@ ROOM_BAR_MM, CORRIDOR_BAR_MM = 0.5, 0.1
 _SHADOW_BAR = 1e-6
 _ONE_BUMP_BAR_PERCENT = 99.0
 _LEARNT = {"recruited": "recruited place cells", "printed": "place cells by the printed rule"}
+_SPACING_OF_BARS_M = 0.12  # that of the finest grid for which the bars in metres hold; errors grow with it
+_HEADING_BAR_RAD = 1e-9
+_SCORE_NAMES = {
+    "sargolini": ("1", "grid score after Sargolini"),
+    "langston": ("1", "grid score after Langston"),
+    "information": ("bits/spike", "spatial information"),
+    "vector_length": ("1", "mean vector length of the tuning"),
+}
 _AT_MOST, _AT_LEAST = "at most", "at least"
 
 
@@ -251,3 +260,49 @@ def kernel_rows(result: CellVerification) -> list[Metric]:
     """Rows on whether the instability of the paper's printed kernel is detected and reported."""
     named = float("do not settle" in result.printed_kernel)
     return [_row("printed_kernel_refused", named, "1", "the instability of the printed kernel is named", 1.0, _AT_LEAST)]
+
+
+def path_rows(result: PathVerification) -> list[Metric]:
+    """All rows on the cells along a recorded path, named `verify/<row>`; only path integration has bars."""
+    track, errors = result.track, result.errors
+    spacing_m = float(result.spacings_m.min())
+    position_mm, heading = 1e3 * float(errors.position_m.max()), float(errors.heading_rad.max())
+    bar_mm = ROOM_BAR_MM * spacing_m / _SPACING_OF_BARS_M
+    phase_bar = PHASE_BAR_PERCENT[str(result.settings.get("rectifier", "relu"))]
+    lost_s = float(np.count_nonzero(~track.known)) / track.drive.hz
+    return [
+        _row("path_duration", float(track.stamps_s[-1]), "s", "of the recorded path"),
+        _row("path_unknown", lost_s, "s", "of it without positions less than a second apart: nothing is counted there"),
+        _row("path_length", float(track.drive.distance_m[-1]), "m", "length of the path at the steps of the cells"),
+        _row("path_reached", 100.0 * float(result.arena.reached.mean()), "%", "of the bins of its bounding box have a rate"),
+        _row("path_position", position_mm, "mm", "largest error of the position decoded from the cells", bar_mm),
+        _row("path_phase", 100.0 * float(errors.module.max()), "%", "of the spacing: phase error, worst module", phase_bar),
+        _row("path_heading", heading, "rad", "largest error of the decoded heading", _HEADING_BAR_RAD),
+        *(row for kind, names in SCORES.items() for name in names for row in _score_rows(result, kind, name)),
+        _row("head_direction_width", _median_width_deg(result), "deg", "width of the tuning at half height, median"),
+    ]
+
+
+def _score_rows(result: PathVerification, kind: str, name: str) -> list[Metric]:
+    """Median of a score over the cells of a kind, median of what chance gives them, and how many exceed that."""
+    scores = np.array([found.scores[name] for _, _, found in result.of_kind(kind)])
+    chance = np.array([found.chance[name] for _, _, found in result.of_kind(kind)])
+    stem = f"{kind.replace('-', '_')}_{name}"
+    unit, words = _SCORE_NAMES[name]
+    above = 100.0 * float((scores > chance).mean())  # NaN, a cell without a score, is not above
+    quantile = f"{100.0 * CHANCE:g} % quantile of its spikes shifted in time"
+    return [
+        _row(stem, _median(scores), unit, f"{words}, median of {len(scores)} {kind} cells"),
+        _row(f"{stem}_chance", _median(chance), unit, f"{quantile}, median"),
+        _row(f"{stem}_above", above, "%", "of these cells score above their own quantile"),
+    ]
+
+
+def _median_width_deg(result: PathVerification) -> float:
+    return float(np.degrees(_median(np.array([found.width_rad for _, _, found in result.of_kind(HEADING)]))))
+
+
+def _median(values: Array) -> float:
+    """Median of the values that are numbers; NaN if none is."""
+    there = values[np.isfinite(values)]
+    return float(np.median(there)) if len(there) else float("nan")

@@ -1,3 +1,5 @@
+import csv
+import functools
 import json
 
 import pytest
@@ -6,7 +8,11 @@ import hybridmap.verification as cells
 from hybridmap.cli import main
 from hybridmap.cli.show import emit
 from hybridmap.metrics import Metric
+from hybridmap.verification.single_cells import SCORES
 from tests.verification.cells_for_tests import TINY
+from tests.verification.paths_for_tests import there_and_back, write_csv
+
+FEW = ("--set", "neural.modules=3", "--set", "neural.spacing_max_m=0.2", "--shuffles", 2)
 
 
 @pytest.fixture
@@ -94,3 +100,53 @@ def test_a_verification_is_replaced_only_when_asked(run, tmp_path):
     code, _, err = run("--out", tmp_path)
     assert code == 2
     assert "--overwrite" in err
+
+
+@pytest.fixture
+def lines(tmp_path, monkeypatch):
+    monkeypatch.setattr(cells, "verify_along", functools.partial(cells.verify_along, workers=1))
+    return write_csv(tmp_path / "lines.csv", *there_and_back())
+
+
+def test_cells_run_along_a_path_and_their_page_needs_nothing(run, tmp_path, lines):
+    out = tmp_path / "cells"
+    code, said, _ = run("--out", out, "--trajectory", lines, "--seed", 3, *FEW, "--json")
+    shown = json.loads(said)
+    assert (code, shown["failed"], shown["trajectory"], shown["heading"]) == (0, [], "lines.csv", "direction of movement")
+    assert json.loads((out / "metrics.json").read_text()) == shown
+    page = (out / "verify.html").read_text()
+    assert page.count("data:image/svg+xml;base64,") == 4
+    assert "http" not in page.replace("http-equiv", "")
+    assert sorted(entry.name for entry in out.iterdir()) == ["cells.csv", "metrics.json", "verify.html"]
+    table = list(csv.DictReader((out / "cells.csv").open()))
+    assert {row["kind"] for row in table} == set(SCORES)
+    medians = {row["name"]: row["value"] for row in shown["metrics"]}
+    langston = sorted(float(row["langston"]) for row in table if row["kind"] == "grid")
+    assert medians["verify/grid_langston"] == pytest.approx(langston[len(langston) // 2], abs=1e-4)
+    assert all(row["vector_length"] == "" and float(row["spikes"]) > 0 for row in table if row["kind"] == "grid")
+
+
+def test_a_path_that_the_cells_cannot_follow_is_exit_code_1(run, tmp_path, lines):
+    code, out, _ = run("--out", tmp_path / "cells", "--trajectory", lines, *FEW, "--set", "neural.gain=1.02")
+    assert code == 1
+    assert "verify/path_phase" in out
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--nwb",), "--nwb: needs --trajectory"),
+        (("--concentration", 5), "--concentration: needs --trajectory"),
+        (("--shuffles", 5), "--shuffles: needs --trajectory"),
+        (("--trajectory", "none.csv"), "none.csv: no such trajectory"),
+        (("--trajectory", "nan.csv"), "nan.csv:3: found NaN"),
+        (("--trajectory", "lines.csv", "--concentration", 1e9), "needs 252989 cells"),
+    ],
+)  # fmt: skip
+def test_a_wrong_path_or_option_is_one_line_and_leaves_nothing(run, tmp_path, monkeypatch, lines, options, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "nan.csv").write_text("t,x,y\n0,1,2\n1,nan,2\n")
+    code, out, err = run("--out", tmp_path / "new", *options)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert said in err
+    assert not (tmp_path / "new").exists()
