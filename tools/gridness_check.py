@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +40,8 @@ def main() -> None:
 
 def opexebo_score() -> Any:
     """The function of opexebo from a rate map (H, W), Hz, to its grid score."""
-    from opexebo import analysis
-
-    module = sys.modules["opexebo.analysis.grid_score"]
+    analysis = import_module("opexebo.analysis")
+    module: Any = sys.modules["opexebo.analysis.grid_score"]
     radius = module._findCentreRadius
     module._findCentreRadius = lambda *args, **kwargs: float(
         np.squeeze(radius(*args, **kwargs))
