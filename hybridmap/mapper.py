@@ -133,7 +133,7 @@ class Mapper:
                 edges += self._close_loops(node)
             self._position.restart()
             self._correct()
-        return self._position.update(reason + self.calibration.follow(self.map, self.poses), node, edges)
+        return self._position.update(reason + self.calibration.follow(self.map, self.poses, self.vision), node, edges)
 
     def finish(self) -> list[Update]:
         """End of the drive: find more loops, solve, measure outlier loops again, and register the frames between nodes.
@@ -180,7 +180,8 @@ class Mapper:
 
     def belief(self, outliers: Sequence[int] = ()) -> Belief:
         """Poses of the nodes, solved without the edges whose numbers are in `outliers`, and their covariances."""
-        return self.book.belief(self.backends.poses, outliers)
+        poses_of = (lambda _: self.cells.poses_of_nodes) if self.config.edges.gate == "cells" else self.backends.poses
+        return self.book.belief(poses_of, outliers)
 
     def _correct(self, final: bool = False) -> None:
         """Give the graph to every back-end."""
@@ -230,14 +231,14 @@ class Mapper:
                 self.anchors = self.vision.dense_trajectory(replace(self.belief(), poses_map_node=self.poses()))
 
     def _retime(self) -> list[Update]:
-        """Measure the odometry of the whole drive again on the clock of the views, if that was off."""
-        if not (clock := self.calibration.clock).finish(self.map):
+        """Measure the odometry of the whole drive again if its clock was off against the views, or its gain by them."""
+        again = self.calibration.finish(self.map, self.vision, self._position.stamp_ns, self._position.pose_odom)
+        if again is None:
             return []
-        poses = clock.poses_at(np.array([*(node.stamp_ns for node in self.map.nodes), self._position.stamp_ns]))
-        edges = self.book.motion.retime(poses[:-1], self.vision)
-        self._position.retime(poses[-2], poses[-1])
+        edges = self.book.motion.retime(again.poses_odom[:-1], self.vision)
+        self._position.retime(again.poses_odom[-2], again.poses_odom[-1])
         self._correct()
-        return [self._position.update(str(clock.offset), None, edges)]
+        return [self._position.update(again.why, None, edges)]
 
     def _path_integrate(self, ready: Ready) -> None:
         with self.clock.stage("neural"):
@@ -286,6 +287,8 @@ class Mapper:
         assert matched.relative is not None
         pose_odom_matched = compose(self.map.node(matched.source).pose_odom, matched.relative.delta)
         self.cells.recalibrate(matched.target, between(pose_odom_matched, self.cells.pose_odom_robot))
+        if matched.source == len(self.map) - 1:
+            self.cells.remember(matched.source)
         if self.config.edges.hanging == "ratslam":
             self._position.attach(matched.target, pose_odom_matched)
 

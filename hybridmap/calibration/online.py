@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.calibration.clock import ClockOffset, Headings, Turns, offset_of
-from hybridmap.calibration.estimate import Estimate
+from hybridmap.calibration.estimate import SIGNIFICANT_SIGMAS, Estimate
 from hybridmap.calibration.legs import Motion
 from hybridmap.calibration.regression import Sighting, regress
 from hybridmap.config import Config
 from hybridmap.config.inputs import SensorsConfig
 from hybridmap.errors import EvaluationError
-from hybridmap.geometry import Array, interpolate
+from hybridmap.geometry import Array, between, compose, interpolate
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.pose_graph import PoseGraph
@@ -26,6 +26,7 @@ from hybridmap.neural.path_integrator import PathIntegrator
 from hybridmap.odometry_model import Gains
 from hybridmap.streams.synchronise import Ready, Synchroniser
 from hybridmap.trajectory import NS_PER_S
+from hybridmap.vision.base import FrontEnd, GaugingFrontEnd
 
 FIRST_M, EVERY_M = 50.0, 25.0
 """Travel before the first estimate of the gains and between two, m: legs between closures are then long enough to tell gains
@@ -212,6 +213,19 @@ class OnlineCalibration:
         return change
 
 
+@dataclass(frozen=True, slots=True)
+class Remeasured:
+    """The odometry of a whole drive, measured again.
+
+    Attributes:
+        poses_odom: (N + 1, 3) poses of the N nodes and of the robot at the end, in `odom`.
+        why: what was corrected, in words.
+    """
+
+    poses_odom: Array
+    why: str
+
+
 class OdometryWatch:
     """What is learnt about the odometry while driving, and put to use at once: its clock, and its gains if so configured.
 
@@ -223,12 +237,13 @@ class OdometryWatch:
         """Start before the drive; gains go to the integrator, the offset to the synchroniser."""
         self.clock = SensorClock(config.sensors)
         self._gains = OnlineCalibration(Gains.of(config.neural)) if config.calibration.online else None
+        self._seen: list[GainChange] = []
         self._integrator, self._synchroniser = integrator, synchroniser
 
     @property
     def changes(self) -> list[GainChange]:
         """The changes of the gains so far."""
-        return [] if self._gains is None else self._gains.changes
+        return self._seen or ([] if self._gains is None else self._gains.changes)
 
     def observe(self, ready: Ready, pose_odom: Array) -> None:
         """Take note of a step of raw odometry, and of the pose (3,) in `odom` after it."""
@@ -236,12 +251,13 @@ class OdometryWatch:
         if self._gains is not None:
             self._gains.observe(ready.stamp_ns, ready.delta_robot)
 
-    def follow(self, experiences: ExperienceMap, poses: Callable[[], Array]) -> str:
-        """Take note of a new node, and correct what the map shows to be wrong.
+    def follow(self, experiences: ExperienceMap, poses: Callable[[], Array], vision: FrontEnd | None = None) -> str:
+        """Take note of a new node, and correct what the map, or the views, show to be wrong.
 
         Args:
             experiences: the map with the new node.
             poses: called for the poses (N, 3) of all nodes, only if an estimate of the gains is due.
+            vision: asked for the gain of the wheels instead of the map, if it measures that.
 
         Returns:
             What was corrected, in words that begin with "; ", to be added to a reason; empty string if nothing was.
@@ -250,9 +266,64 @@ class OdometryWatch:
         if (late_s := self.clock.follow(experiences)) is not None:
             self._synchroniser.retime(late_s)
             said = f"; {self.clock.offset}"
+        if self._gains is None:
+            return said
         stamp_ns = experiences.node(len(experiences) - 1).stamp_ns
-        change = self._gains.follow(stamp_ns, experiences.pose_graph, poses) if self._gains is not None else None
+        if isinstance(vision, GaugingFrontEnd):
+            change = self._gauged(stamp_ns, vision)
+        else:
+            change = self._gains.follow(stamp_ns, experiences.pose_graph, poses)
         if change is None:
             return said
         self._integrator.gains = change.gains
         return f"{said}; {change}"
+
+    def finish(self, experiences: ExperienceMap, vision: FrontEnd | None, stamp_ns: int, pose_odom: Array) -> Remeasured | None:
+        """At the end of the drive, measure all of its odometry again where its clock was off, or its gain as the views have it.
+
+        Args:
+            experiences: the map.
+            vision: see `follow`.
+            stamp_ns, pose_odom: where the robot is now: stamp and pose (3,) in `odom`.
+
+        Returns:
+            None if nothing has to be corrected.
+        """
+        if self.clock.finish(experiences):
+            stamps_ns = np.array([*(node.stamp_ns for node in experiences.nodes), stamp_ns])
+            return Remeasured(self.clock.poses_at(stamps_ns), str(self.clock.offset))
+        if self._gains is None or not isinstance(vision, GaugingFrontEnd):
+            return None
+        before = [(change.stamp_ns, change.gains.gain) for change in self._seen]
+        first = self._integrator.config.gain
+        self._gauged(stamp_ns, vision)
+        if not self._seen:
+            return None
+        poses = np.array([*(node.pose_odom for node in experiences.nodes), pose_odom])
+        ends = np.array([node.stamp_ns for node in experiences.nodes])
+        used = np.array([first, *(gain for _, gain in before)])[np.searchsorted([at for at, _ in before], ends, side="right")]
+        steps = between(poses[:-1], poses[1:]) * np.column_stack([self._seen[-1].gains.gain / used] * 2 + [np.ones(len(used))])
+        return Remeasured(_chained(poses[0], steps), str(self._seen[-1]))
+
+    def _gauged(self, stamp_ns: int, vision: GaugingFrontEnd) -> GainChange | None:
+        """The gain by the views, if it differs from that in use: a change to apply."""
+        seen = vision.gain
+        if seen is None or abs(seen.gain - 1.0) <= SIGNIFICANT_SIGMAS * seen.sigma:
+            return None
+        in_use = self._integrator.gains if not self._seen else self._seen[-1].gains
+        gain = seen.gain * in_use.gain
+        covariance = np.diag([(seen.sigma * in_use.gain) ** 2, np.inf, np.inf, np.inf])
+        gains = replace(in_use, gain=gain).checked("gain by the views")
+        estimate = Estimate(gains, 0.0, covariance, 0.0, float(seen.steps), 0.0, 1.0, 0.0)
+        self._seen.append(GainChange(stamp_ns, gains, estimate))
+        vision.rescale(seen.gain)
+        _logger.info("%s", self._seen[-1])
+        return self._seen[-1]
+
+
+def _chained(first: Array, steps: Array) -> Array:
+    """Poses (N + 1, 3) of steps (N, 3) from the first pose (3,) on."""
+    poses = [first]
+    for step in steps:
+        poses.append(compose(poses[-1], step))
+    return np.array(poses)

@@ -206,6 +206,11 @@ class SimulationConfig(Section):
     """Factor on the noise of camera and laser: depth, colour, ranges, holes, lost beams and exposure changes; 0: none."""
     duration_s: float | None = Field(default=None, gt=0, le=1e6)
     """Stop the drive after this many seconds; None: drive to the end."""
+    weave_m: float = Field(default=0.0, ge=0, le=1)
+    """How far the robot weaves from side to side of its path, m, in each lap at other places; 0: laps retrace each other.
+
+    Watch: a path near walls and furniture leaves about 0.2 m; the robot drives through what stands in its way.
+    """
     carried_m: float | None = Field(default=None, gt=0)
     """Kidnap the robot in the middle of the drive: carry it about this far, m, to a place that it has visited. Meanwhile the
     odometry reports no motion and there are no frames. None: never.

@@ -149,11 +149,12 @@ class EdgesConfig(Section):
 
     Watch: with `ratslam` one false match breaks the chain of nodes for good.
     """
-    gate: Literal["map", "odometry"] = "map"
-    """Poses used to find older nodes close enough for a loop closure: those of the primary back-end (`map`) or of the path
-    integrator (`odometry`).
+    gate: Literal["map", "odometry", "cells"] = "map"
+    """Poses used to find older nodes close enough for a loop closure: those of the primary back-end (`map`), of the path
+    integrator (`odometry`), or those that its cells showed at each node (`cells`), which loops re-anchor.
 
-    Watch: with `odometry` the graph does not depend on a back-end, and after a long drive true loops are missed.
+    Watch: with `odometry` and `cells` the graph does not depend on a back-end; with `odometry`, and with `cells` where
+    `neural.reanchor_weight` is 0, true loops are missed after a long drive.
     """
     drop_contradicted: bool = True
     """Drop an odometry edge if a good registration of the same two nodes contradicts it.

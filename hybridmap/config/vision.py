@@ -74,6 +74,12 @@ class TrackingConfig(Section):
 class ClosingConfig(Section):
     """Search for loop closures by laser or camera."""
 
+    by: Literal["geometry", "scanline"] = "geometry"
+    """`geometry`: scans, features and depth are registered to each other, and measure motion and loops; `scanline`: the paper's
+    means alone, profiles that match along a stretch of the way (`vision.matching.sequence`).
+
+    Watch: with `scanline` the map between loops is that of the wheels.
+    """
     gate_sigmas: float = Field(default=2.5, gt=0, le=100)
     """Older nodes are considered for a loop within this many standard deviations of the pose uncertainty on the map (the gate).
 

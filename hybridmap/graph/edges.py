@@ -49,6 +49,7 @@ class Method(StrEnum):
     FEATURES = "features"
     FEATURES_AND_DEPTH = "features and depth"
     PROFILE = "profile"
+    SEQUENCE = "sequence"
     LOOPS = "loops"
 
     @property
@@ -101,6 +102,7 @@ _METHODS = {
     Method.FEATURES: "features agree",
     Method.FEATURES_AND_DEPTH: "features and depth agree",
     Method.PROFILE: "profile alone, not verified",
+    Method.SEQUENCE: "profiles agree along the way",
     Method.LOOPS: "where the loops put the robot",
 }
 _SEARCHES = {

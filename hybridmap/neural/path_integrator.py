@@ -321,6 +321,12 @@ class Reanchoring:
         self._integrator = integrator
         self._pose_odom_cells: Array | None = None
         self._activity_at_node: dict[int, Snapshot] = {}
+        self._poses_of_nodes: list[Array] = []
+
+    @property
+    def poses_of_nodes(self) -> Array:
+        """(N, 3) poses that the cells showed at each node, m and rad: in one frame, as recalibration puts them back there."""
+        return np.array(self._poses_of_nodes).reshape(-1, 3)
 
     @property
     def pose_odom_robot(self) -> Array:
@@ -329,10 +335,11 @@ class Reanchoring:
         return pose if self._pose_odom_cells is None else compose(self._pose_odom_cells, pose)
 
     def remember(self, node: int) -> None:
-        """Store the cells' activity, which is now that of a new node; with weight 0 that of the node before is forgotten."""
+        """Store the cells' activity as that of the newest node; with weight 0 that of the node before is forgotten."""
         if self.weight == 0.0:
             self._activity_at_node.clear()
         self._activity_at_node[node] = self._integrator.snapshot()
+        self._poses_of_nodes[node:] = [self._integrator.pose]
 
     def activity_at(self, node: int) -> Snapshot:
         """The stored activity of a node; with weight 0, the default, known for the newest node only.

@@ -14,6 +14,8 @@ from hybridmap.geometry import Array, between, compose, interpolate, quaternion_
 
 _STEP_OF_PATH_M = 0.02
 _LOOK_AHEAD_M = 0.45
+_WEAVE_M = 5.9
+"""Length of a weave, m: no multiple of a lap of any world, so that the laps differ."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +67,25 @@ def drive(legs: Sequence[Array], limits: DriveLimits, dt_s: float) -> Array:
         poses += _follow(state, leg, limits, dt_s)
     out = np.array(poses)
     out[:, 2] = wrap_angle(out[:, 2])
+    return out
+
+
+def weaving(legs: Sequence[Array], amplitude_m: float) -> list[Array]:
+    """Way points (M, 2) of pieces of a path that weave from side to side by `amplitude_m`, at another place in each lap.
+
+    Every piece keeps its two ends, and its length to a few per cent.
+    """
+    out, travelled_m = [], 0.0
+    for leg in legs:
+        path = _resample(leg)
+        along = np.gradient(path, axis=0)
+        left = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-9)[:, None]
+        here_m = _STEP_OF_PATH_M * np.arange(len(path))
+        from_ends_m = np.minimum(here_m, here_m[::-1])
+        sideways_m = amplitude_m * np.minimum(from_ends_m / _WEAVE_M, 1.0)
+        sideways_m *= np.sin(2.0 * np.pi * (travelled_m + here_m) / _WEAVE_M)
+        out.append(path + sideways_m[:, None] * left)
+        travelled_m += float(here_m[-1])
     return out
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hybridmap.config.inputs import SimulationConfig
 from hybridmap.errors import ConfigError
 from hybridmap.geometry import Array
-from hybridmap.simulation.motion import DriveLimits, KidnappedDrive, as_transmitted, carry, drive, wheel_odometry
+from hybridmap.simulation.motion import DriveLimits, KidnappedDrive, as_transmitted, carry, drive, weaving, wheel_odometry
 from hybridmap.simulation.surfaces import World
 from hybridmap.simulation.worlds import build_world
 from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion, StreamReport
@@ -62,7 +62,8 @@ class SimulatedStream:
             )
         self._report = StreamReport()
         step_s = 1.0 / ODOMETRY_RATE_HZ
-        truth = felt = drive(self._world.legs, DriveLimits(self._world.speed_m_s, TURN_RATE_RAD_S), step_s)
+        legs = weaving(self._world.legs, config.weave_m) if config.weave_m > 0.0 else self._world.legs
+        truth = felt = drive(legs, DriveLimits(self._world.speed_m_s, TURN_RATE_RAD_S), step_s)
         self._carry = None if config.carried_m is None else carry(truth, config.carried_m, step_s)
         if self._carry is not None:
             truth, felt = self._carry.truth, self._carry.felt

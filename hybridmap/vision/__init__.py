@@ -63,6 +63,8 @@ def create_front_end(config: VisionConfig, rig: Rig, seed: int, clock: StageCloc
         chosen: str | Factory = next((kind.front_end for kind, _ in sensors.carried(rig)), _none)
     else:
         chosen = _named(config.sensor, rig)
+    if config.closing.by == "scanline" and chosen is not _none:
+        chosen = "hybridmap.vision.scanline.front_end:create"
     factory: Factory = loaded(chosen) if isinstance(chosen, str) else chosen
     return factory(config, rig, seed, clock or StageClock())
 

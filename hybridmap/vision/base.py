@@ -194,6 +194,33 @@ class Overruling(Protocol):
         """
 
 
+@dataclass(frozen=True, slots=True)
+class SeenGain:
+    """k_m by the views: metres that the robot came ahead per metre of its self-motion.
+
+    Attributes:
+        gain: k_m, 1.
+        sigma: its standard deviation.
+        steps: number of steps between nodes that told it.
+    """
+
+    gain: float
+    sigma: float
+    steps: int
+
+
+@runtime_checkable
+class GaugingFrontEnd(FrontEnd, Protocol):
+    """A front-end that sees how far the robot came, and so measures the gain of its wheels."""
+
+    @property
+    def gain(self) -> SeenGain | None:
+        """k_m per metre of self-motion as it was told to the front-end; None while unknown."""
+
+    def rescale(self, factor: float) -> None:
+        """Take note that ways by self-motion are told longer by a factor from now on, and that earlier ones were too short."""
+
+
 @runtime_checkable
 class DenseFrontEnd(FrontEnd, Protocol):
     """A front-end that can register the frames between nodes to the final map."""

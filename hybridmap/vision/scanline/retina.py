@@ -1,0 +1,142 @@
+"""What the scanline front-end takes of a frame, by camera or laser: a profile, and how far things are column by column."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.config.vision import VisionConfig
+from hybridmap.errors import StreamError
+from hybridmap.geometry import Array
+from hybridmap.streams.base import Observation
+from hybridmap.streams.laser import LASER, Laser, LaserScan
+from hybridmap.streams.rgbd import RGBD, Camera, RgbdFrame
+from hybridmap.vision.profile import Profile, image_profile, laser_profile
+
+_HORIZON_ROWS = 0.045
+"""Rows above and below the middle of an image, as a share of its height, whose depth is looked at: higher or lower rows of a
+level camera see floor and ceiling, which come no nearer as the robot drives."""
+_CAMERA_REACH_M, _LASER_REACH_M = 4.5, 10.0
+"""Distance up to which depth of a camera (whose noise grows with the square) and ranges of a laser (which hit or miss by chance
+beyond) are looked at, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class Glance:
+    """What is kept of a frame.
+
+    Attributes:
+        profile: (bands, width) float32, z-normalised.
+        ahead_m: (columns,) float32 distance along the robot's heading of what is seen at the height of the sensor, m, by
+            column from left to right as in the profile; NaN where nothing is.
+    """
+
+    profile: Profile
+    ahead_m: NDArray[np.float32]
+
+
+class Retina(Protocol):
+    """One kind of sensor, as the scanline front-end uses it."""
+
+    @property
+    def reach_m(self) -> float:
+        """Distance up to which `Glance.ahead_m` is exact to some centimetres, m."""
+
+    @property
+    def bearings_rad(self) -> Array:
+        """(columns,) bearings of the columns of `Glance.ahead_m` to the left of the robot's heading, rad, descending."""
+
+    def glance(self, frame: Observation) -> Glance:
+        """Take a frame in.
+
+        Raises:
+            StreamError: the frame is of another sensor, or has another size.
+        """
+
+    def yaw_rad(self, shift: float) -> float:
+        """Heading of an older view seen from a newer one, rad, whose profile is shifted by so many columns against it."""
+
+    def compact(self, frame: Observation) -> dict[str, NDArray[Any]]:
+        """What the map file keeps of a frame."""
+
+
+class CameraRetina:
+    """The retina of an RGB-D camera, level and looking ahead."""
+
+    def __init__(self, config: VisionConfig, camera: Camera) -> None:
+        self._settings = config.profile
+        self._camera = camera
+        self.reach_m = _CAMERA_REACH_M
+        self.bearings_rad: Array = np.arctan2(camera.cx_px - np.arange(camera.width_px), camera.fx_px)
+
+    def glance(self, frame: Observation) -> Glance:
+        """Take in an RGB-D frame; see `Retina.glance`."""
+        import cv2
+
+        if not isinstance(frame, RgbdFrame):
+            raise StreamError(f"vision: scanline by camera needs colour with depth, found {type(frame).__name__}")
+        size = (self._camera.height_px, self._camera.width_px)
+        if frame.color.shape[:2] != size or frame.depth_m.shape != size:
+            found = f"colour {frame.color.shape[:2]} and depth {frame.depth_m.shape}"
+            raise StreamError(f"vision: frame at {frame.stamp_ns} ns has {found}, expected {size} rows and columns")
+        settings = self._settings
+        grey = np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        depth = np.nan_to_num(frame.depth_m, posinf=0.0)
+        profile = image_profile(grey, depth, settings.width, settings.bands, settings.normalise)
+        return Glance(profile, _horizon(depth, self._camera.cy_px))
+
+    def yaw_rad(self, shift: float) -> float:
+        """Things farther right in the newer view mean that it looks farther left; see `Retina.yaw_rad`."""
+        return -float(np.arctan2(shift * self._camera.width_px / self._settings.width, self._camera.fx_px))
+
+    def compact(self, frame: Observation) -> dict[str, NDArray[Any]]:
+        """The images, and how the camera is mounted."""
+        return {**RGBD.compact(frame), "T_base_camera": self._camera.T_base_camera}
+
+
+class LaserRetina:
+    """The retina of a planar laser; its profile is the ranges by bearing, the smallest bearing first."""
+
+    def __init__(self, config: VisionConfig, laser: Laser) -> None:
+        self._laser = laser
+        self._width = config.profile.width
+        self._span = float(np.ptp(laser.bearings_rad))
+        self.reach_m = _LASER_REACH_M
+        self.bearings_rad: Array = laser.bearings_rad[::-1] + laser.pose_base_laser[2]
+
+    def glance(self, frame: Observation) -> Glance:
+        """Take in a scan; see `Retina.glance`."""
+        if not isinstance(frame, LaserScan):
+            raise StreamError(f"vision: scanline by laser needs a LaserScan, found {type(frame).__name__}")
+        bearings = self._laser.bearings_rad
+        if frame.ranges_m.shape != bearings.shape:
+            raise StreamError(
+                f"laser: scan at {frame.stamp_ns} ns: expected {len(bearings)} ranges, found {frame.ranges_m.shape}"
+            )
+        profile = laser_profile(np.minimum(frame.ranges_m, np.float32(self.reach_m)), bearings, self._width)
+        return Glance(profile, frame.ranges_m[::-1] * np.cos(self.bearings_rad).astype(np.float32))
+
+    def yaw_rad(self, shift: float) -> float:
+        """Things at larger bearings in the newer view mean that it looks farther right; see `Retina.yaw_rad`."""
+        return shift * self._span / self._width
+
+    def compact(self, frame: Observation) -> dict[str, NDArray[Any]]:
+        """The ranges."""
+        return LASER.compact(frame)
+
+
+def _horizon(depth_m: NDArray[np.float32], middle_row: float) -> NDArray[np.float32]:
+    """(W,) median of the valid depth in the middle rows of an image (H, W), m; NaN where there is none."""
+    half = max(round(_HORIZON_ROWS * len(depth_m)), 1)
+    middle = int(np.clip(round(middle_row), half, len(depth_m) - half))
+    rows = np.sort(
+        np.where(depth_m[middle - half : middle + half] > 0.0, depth_m[middle - half : middle + half], np.inf), axis=0
+    )
+    seen = np.isfinite(rows).sum(axis=0)
+    low, high = np.maximum(seen - 1, 0) // 2, seen // 2
+    columns = np.arange(rows.shape[1])
+    median = 0.5 * (rows[low, columns] + rows[np.minimum(high, len(rows) - 1), columns])
+    return np.where(seen > 0, median, np.nan).astype(np.float32)
