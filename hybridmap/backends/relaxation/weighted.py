@@ -13,6 +13,7 @@ import numpy as np
 
 from hybridmap.backends.base import Outcome
 from hybridmap.backends.driver import Driver, Works
+from hybridmap.backends.objective import chi2
 from hybridmap.backends.relaxation.ratslam import outcome_of, relax_links, swept
 from hybridmap.config.backends import BackendsConfig, RelaxationConfig
 from hybridmap.errors import counted
@@ -30,17 +31,17 @@ sweep adds to the optimum shrinks with the rate."""
 def weighted(name: str, config: BackendsConfig) -> Driver:
     """A back-end with RatSLAM's rule and a rate for each link's position and heading by its variance (`shares`).
 
-    An update runs a few sweeps, as with the other rules. The end of a drive is a whole solution from the map of the drive.
+    An update runs a few sweeps, as with the other rules. The end of a drive is a whole solution from the map of the drive, or
+    from the graph's initial poses where these fit it better, as when the odometry was measured again.
     """
     rules = config.relaxation
-    return Driver(
-        name,
-        config,
-        (solve := swept(partial(_settled, rules), rules.solve_sweeps)),
-        follow=swept(partial(_followed, rules), rules.sweeps_per_node),
-        onward=solve,
-        works=Works.ON_GROWTH,
-    )
+    solve = swept(partial(_settled, rules), rules.solve_sweeps)
+
+    def onward(graph: PoseGraph, driven: Array) -> Outcome:
+        return solve(graph, driven if chi2(graph, driven) <= chi2(graph, graph.initial) else graph.initial)
+
+    follow = swept(partial(_followed, rules), rules.sweeps_per_node)
+    return Driver(name, config, solve, follow=follow, onward=onward, works=Works.ON_GROWTH)
 
 
 def shares(graph: PoseGraph) -> Array:
