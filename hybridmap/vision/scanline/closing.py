@@ -120,8 +120,9 @@ class ScanlineCloser:
         match = self._compared(node, best, belief)
         if match.status is Status.REJECTED:
             return [*changed, match]
-        agreeing = [edge for edge in self._matched if self._agree(edge, match, belief)]
-        self._matched = [edge for edge in self._matched if node - edge.source < WINDOW_NODES] + [match]
+        recent = [edge for edge in self._matched if node - edge.source < WINDOW_NODES]
+        agreeing = [edge for edge in recent if self._agree(edge, match, belief)]
+        self._matched = [*recent, match]
         if len(agreeing) + 1 < SUPPORT:
             self._waiting.append(match)
             return [*changed, match]
@@ -148,7 +149,11 @@ class ScanlineCloser:
         way_m = np.minimum(travel_m[node] - self._travel_at_closure, travel_m[node] - travel_m[:node])
         near = np.hypot(*(poses[:node, :2] - poses[node, :2]).T) <= GATE_M + GATE_PER_M * way_m
         turn = np.abs(wrap_angle(poses[:node, 2] - poses[node, 2])) <= np.deg2rad(HEADING_DEG + HEADING_DEG_PER_M * way_m)
-        usable = self._revisit(node, belief) & ~np.array(self._turning[:node], dtype=bool) & np.isfinite(self._sequences.scores[:node])
+        usable = (
+            self._revisit(node, belief)
+            & ~np.array(self._turning[:node], dtype=bool)
+            & np.isfinite(self._sequences.scores[:node])
+        )
         return np.flatnonzero(near & turn & usable)
 
     @staticmethod
