@@ -158,7 +158,7 @@ class EdgeBook:
         With the setting `edges.gate: odometry` both are those of the odometry edges alone.
 
         Args:
-            poses_of: solves a graph with the primary back-end; returns the poses (N, 3) of its nodes.
+            poses_of: returns the poses (N, 3) of a graph's nodes, as the primary back-end solves it or as the cells show them.
             outliers: numbers of edges that are left out of the graph.
         """
         own, nodes = self._config.gate == "odometry", self._map.nodes

@@ -179,7 +179,10 @@ class Mapper:
         return self.backends.poses(self.map.pose_graph(), backend)
 
     def belief(self, outliers: Sequence[int] = ()) -> Belief:
-        """Poses of the nodes, solved without the edges whose numbers are in `outliers`, and their covariances."""
+        """Poses of the nodes by `edges.gate`, and their covariances, without the edges whose numbers are in `outliers`.
+
+        What the cells showed at a node depends on all loops up to then, outliers too.
+        """
         poses_of = (lambda _: self.cells.poses_of_nodes) if self.config.edges.gate == "cells" else self.backends.poses
         return self.book.belief(poses_of, outliers)
 

@@ -156,13 +156,16 @@ class _Recorder:
             self.store.commit()
 
     def rewrite_odometry(self) -> None:
-        """At the end of the drive, write its odometry on the clock of the views, if that was corrected."""
-        clock, experiences = self._mapper.calibration.clock, self._mapper.map
-        self.store.put_info(CLOCK_OFFSET, clock.offset.used_s)
-        if not clock.offset.used_s:
+        """At the end of the drive, write its odometry anew if it was measured again, by its clock or its gains."""
+        calibration, experiences = self._mapper.calibration, self._mapper.map
+        self.store.put_info(CLOCK_OFFSET, calibration.clock.offset.used_s)
+        again = calibration.remeasured
+        if again is None:
             return
         track = self.store.track()
-        poses, nodes = clock.poses_at(track.stamps_ns), np.array([node.pose_odom for node in experiences.nodes])
+        if again.gains is not None:
+            self.store.put_info(GAIN_CHANGES, [[int(track.stamps_ns[0]), *again.gains.to_array().tolist()]])
+        poses, nodes = again.poses_at(track.stamps_ns, track.poses_odom), np.array([n.pose_odom for n in experiences.nodes])
         moved = replace(track, deltas=between(nodes[track.nodes], poses), poses_odom=poses)
         self.store.replace_odometry(moved, experiences)
 

@@ -219,10 +219,14 @@ class Remeasured:
 
     Attributes:
         poses_odom: (N + 1, 3) poses of the N nodes and of the robot at the end, in `odom`.
+        poses_at: (stamps (T,), ns, poses (T, 3) in `odom` at these as they were while driving) -> new poses (T, 3).
+        gains: the gains of the whole odometry; None: those of each time while driving, only its clock was corrected.
         why: what was corrected, in words.
     """
 
     poses_odom: Array
+    poses_at: Callable[[NDArray[np.int64], Array], Array]
+    gains: Gains | None
     why: str
 
 
@@ -231,10 +235,12 @@ class OdometryWatch:
 
     Attributes:
         clock: the offset between views and odometry.
+        remeasured: the odometry of the whole drive as `finish` measured it again; None if it did not.
     """
 
     def __init__(self, config: Config, integrator: PathIntegrator, synchroniser: Synchroniser) -> None:
         """Start before the drive; gains go to the integrator, the offset to the synchroniser."""
+        self.remeasured: Remeasured | None = None
         self.clock = SensorClock(config.sensors)
         self._gains = OnlineCalibration(Gains.of(config.neural)) if config.calibration.online else None
         self._seen: list[GainChange] = []
@@ -279,7 +285,7 @@ class OdometryWatch:
         return f"{said}; {change}"
 
     def finish(self, experiences: ExperienceMap, vision: FrontEnd | None, stamp_ns: int, pose_odom: Array) -> Remeasured | None:
-        """At the end of the drive, measure all of its odometry again where its clock was off, or its gain as the views have it.
+        """At the end of the drive, measure all of its odometry again if its clock was off, else with the gain by the views.
 
         Args:
             experiences: the map.
@@ -289,31 +295,46 @@ class OdometryWatch:
         Returns:
             None if nothing has to be corrected.
         """
+        stamps_ns = np.array([*(node.stamp_ns for node in experiences.nodes), stamp_ns], dtype=np.int64)
+        poses = np.array([*(node.pose_odom for node in experiences.nodes), pose_odom])
         if self.clock.finish(experiences):
-            stamps_ns = np.array([*(node.stamp_ns for node in experiences.nodes), stamp_ns])
-            return Remeasured(self.clock.poses_at(stamps_ns), str(self.clock.offset))
-        if self._gains is None or not isinstance(vision, GaugingFrontEnd):
-            return None
-        before = [(change.stamp_ns, change.gains.gain) for change in self._seen]
-        first = self._integrator.config.gain
-        self._gauged(stamp_ns, vision)
+            poses_at = self.clock.poses_at
+            self.remeasured = Remeasured(poses_at(stamps_ns), lambda stamps, _: poses_at(stamps), None, str(self.clock.offset))
+        elif self._gains is not None and isinstance(vision, GaugingFrontEnd):
+            self.remeasured = self._regauged(stamps_ns, poses, vision)
+        return self.remeasured
+
+    def _regauged(self, stamps_ns: NDArray[np.int64], poses: Array, vision: GaugingFrontEnd) -> Remeasured | None:
+        """The odometry of the whole drive with the gain by the views, which was in use for a part of it at most."""
+        driven_with = list(self._seen)
+        self._gauged(int(stamps_ns[-1]), vision)
         if not self._seen:
             return None
-        poses = np.array([*(node.pose_odom for node in experiences.nodes), pose_odom])
-        ends = np.array([node.stamp_ns for node in experiences.nodes])
-        used = np.array([first, *(gain for _, gain in before)])[np.searchsorted([at for at, _ in before], ends, side="right")]
-        steps = between(poses[:-1], poses[1:]) * np.column_stack([self._seen[-1].gains.gain / used] * 2 + [np.ones(len(used))])
-        return Remeasured(_chained(poses[0], steps), str(self._seen[-1]))
+        gains = np.array([self._integrator.config.gain, *(change.gains.gain for change in driven_with)])
+        since_ns = np.array([change.stamp_ns for change in driven_with], dtype=np.int64)
+        factor = self._seen[-1].gains.gain / gains[np.searchsorted(since_ns, stamps_ns[:-1], side="right")]
+        scale = np.column_stack([factor, factor, np.ones(len(factor))])
+        after = _chained(poses[0], between(poses[:-1], poses[1:]) * scale)
+
+        def poses_at(stamps: NDArray[np.int64], driven: Array) -> Array:
+            node = np.clip(np.searchsorted(stamps_ns[:-1], stamps, side="right") - 1, 0, None)
+            return compose(after[node], between(poses[node], driven) * scale[node])
+
+        return Remeasured(after, poses_at, self._seen[-1].gains, str(self._seen[-1]))
 
     def _gauged(self, stamp_ns: int, vision: GaugingFrontEnd) -> GainChange | None:
-        """The gain by the views, if it differs from that in use: a change to apply."""
+        """The gain by the views, if it differs from that in use: a change to apply. One that no robot has is left alone."""
         seen = vision.gain
         if seen is None or abs(seen.gain - 1.0) <= SIGNIFICANT_SIGMAS * seen.sigma:
             return None
         in_use = self._integrator.gains if not self._seen else self._seen[-1].gains
         gain = seen.gain * in_use.gain
         covariance = np.diag([(seen.sigma * in_use.gain) ** 2, np.inf, np.inf, np.inf])
-        gains = replace(in_use, gain=gain).checked("gain by the views")
+        try:
+            gains = replace(in_use, gain=gain).checked("gain by the views")
+        except EvaluationError as error:
+            _logger.info("%s", error)
+            return None
         estimate = Estimate(gains, 0.0, covariance, 0.0, float(seen.steps), 0.0, 1.0, 0.0)
         self._seen.append(GainChange(stamp_ns, gains, estimate))
         vision.rescale(seen.gain)

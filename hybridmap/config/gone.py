@@ -78,6 +78,8 @@ vision.rgbd.closing vision/rgbd/closing.py pending_nodes shift_sigma_m shift_sig
 vision.rgbd.closing vision/rgbd/closing.py repropose_m repropose_per_node repropose_online
 vision.rgbd.closing vision/rgbd/revisits.py repropose_sigma_m:MAP_SIGMA_M repropose_sigma_deg:MAP_SIGMA_DEG
 vision.rgbd.closing vision/rgbd/support.py support_nodes
+vision.rgbd.closing vision/gating.py min_age_s
+vision.rgbd vision/base.py held_images
 """
 
 RENAMED: dict[str, str] = {

@@ -44,8 +44,8 @@ class MatchingConfig(Section):
     g_bar: Literal["templates", "shifts"] = "templates"
     """Definition of g_bar: the mean of g_min over the stored templates, or the mean of g over the shifts of the pair."""
     c_t: float | None = Field(default=None, ge=-1e6, le=1e6)
-    """Threshold: two views match if their score G is below c_t. None: no threshold if matches are verified by features, else a
-    moderate one that depends on `vision.rgbd.matching`.
+    """Threshold: two views match if their score G is below c_t. None: with `vision.closing.by: scanline` it is found from the
+    drive; without, there is none if matches are verified by features, else a moderate one by `vision.rgbd.matching`.
 
     Watch: the scale of G differs between the readings of `vision.rgbd.matching`.
     """
@@ -78,7 +78,8 @@ class ClosingConfig(Section):
     """`geometry`: scans, features and depth are registered to each other, and measure motion and loops; `scanline`: the paper's
     means alone, profiles that match along a stretch of the way (`vision.matching.sequence`).
 
-    Watch: with `scanline` the map between loops is that of the wheels.
+    Watch: with `scanline` the map between loops is that of the wheels, a robot that was carried is not found, and of `vision`
+    only `sensor`, `profile` and `matching` are read.
     """
     gate_sigmas: float = Field(default=2.5, gt=0, le=100)
     """Older nodes are considered for a loop within this many standard deviations of the pose uncertainty on the map (the gate).
@@ -166,8 +167,6 @@ class PnpConfig(Section):
 class RgbdClosingConfig(Section):
     """Loop closure by camera: which older nodes are candidates."""
 
-    min_age_s: float = Field(default=10.0, ge=0, le=1e6)
-    """Least age of a node to be a candidate, s."""
     gate_m: float = Field(default=2.5, gt=0, le=10_000)
     """Radius around the robot within which older nodes are candidates, right after a loop closure, m. It grows by 10 % of the
     travel since then, by at most 10 m.
@@ -202,11 +201,6 @@ class RgbdConfig(Section):
     """Images are reduced by an integer factor until they are at most this wide, pixels.
 
     Watch: the time for features grows with the pixels.
-    """
-    held_images: int = Field(default=100, ge=1, le=1_000_000)
-    """Number of newest nodes whose images stay in memory; the map file holds all images.
-
-    Watch: an image of 640 x 480 takes 2 MB.
     """
     registration: RegistrationConfig = RegistrationConfig()
     """Registration of depth."""

@@ -19,7 +19,7 @@ from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.streams.sensors import carried
 from hybridmap.trajectory import NS_PER_S, Trajectory, format_motion, known_at, read_tum
-from hybridmap.vision.gating import Gate
+from hybridmap.vision.gating import MIN_AGE_S, Gate
 
 _AT_NODE_NS = 1_000
 _STAMPS_FROM_S = 1e6  # a time beyond it is a stamp, not seconds since the start
@@ -325,8 +325,7 @@ class Explainer:
             return "it is the first node"
         if gate is not None:
             if gate.older == 0:
-                least = _setting(self._settings, "vision.rgbd.closing.min_age_s")
-                return f"no node was old enough: {least} s (vision.rgbd.closing.min_age_s)"
+                return f"no node was old enough: {MIN_AGE_S:g} s"
             return "no older node lay inside the gate" if gate.inside == 0 else ""
         for kind, _ in carried(self._store.rig):
             every = _setting(self._settings, kind.seeks_every)
@@ -336,8 +335,7 @@ class Explainer:
 
     def _nearest(self, number: int) -> tuple[int, float, float] | None:
         """The nearest node by distance and turn together (1 rad counts as 1 m), among those old enough to be loops."""
-        age = _setting(self._settings, "vision.rgbd.closing.min_age_s")
-        young_ns = round((age if isinstance(age, int | float) else 10.0) * NS_PER_S)
+        young_ns = round(MIN_AGE_S * NS_PER_S)
         stamps = np.array([node.stamp_ns for node in self._map.nodes[:number]], dtype=np.int64)
         old = np.flatnonzero(stamps <= self._map.node(number).stamp_ns - young_ns)
         solution = self._store.solutions().get(self.primary)

@@ -18,6 +18,8 @@ from hybridmap.graph.edges import Check, Edge, Lack
 from hybridmap.streams.base import Observation
 from hybridmap.trajectory import Anchors
 
+HELD_IMAGES = 100
+"""Newest nodes whose images stay in memory; the map file holds all. An image of 640 x 480 with its depth takes 2 MB."""
 UNEXPECTED = (None, Lack.UNSUPPORTED, Lack.CONTRADICTED)
 """What a loop may lack that is refused only because the map did not expect it: nothing, or others that agree with it."""
 
@@ -27,8 +29,8 @@ class Belief:
     """The state of the map, for gating and re-proposal.
 
     Attributes:
-        poses_map_node: (N, 3) current estimate of every node by the primary back-end (or the integrator's own poses where
-            the configuration says `gate: odometry`), m and rad.
+        poses_map_node: (N, 3) current estimate of every node by the primary back-end (or by odometry or the cells where the
+            configuration says so, see `edges.gate`), m and rad.
         stamps_s: (N,) stamp of each node, s.
         travel_m: (N,) path length from node 0 to each node, m.
         covariance_from: node -> (N, 3, 3) covariance of every node's pose relative to that node, m^2 and rad^2, in each node's

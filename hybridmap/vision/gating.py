@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from hybridmap.geometry import Array, wrap_angle
 
 Indices = NDArray[np.int64]
+MIN_AGE_S = 10.0
+"""A node that is younger than this is no revisit, s: the robot has not left its place."""
 
 
 @dataclass(frozen=True, slots=True)

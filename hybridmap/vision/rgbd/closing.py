@@ -13,7 +13,7 @@ from hybridmap.geometry import Array, RelativePose, between, wrap_angle
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status
 from hybridmap.metrics import StageClock
 from hybridmap.vision.base import Belief
-from hybridmap.vision.gating import Gate, nodes_within
+from hybridmap.vision.gating import MIN_AGE_S, Gate, nodes_within
 from hybridmap.vision.profile import Profile
 from hybridmap.vision.relocalising import ChainState, GlobalMatch, Relocaliser, Whereabouts
 from hybridmap.vision.rgbd import checks
@@ -163,7 +163,7 @@ class LoopCloser:
         if not whereabouts.lost:
             return []
         self._gate_of_newest = replace(self._gate_of_newest, whole_map=True)
-        old = np.flatnonzero(belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s)
+        old = np.flatnonzero(belief.stamps_s[node] - belief.stamps_s[:node] >= MIN_AGE_S)
         seen = self._global_search.search(node, np.setdiff1d(old, gated).astype(np.int64))
         found = self._relocaliser.settle([GlobalMatch(edge) for edge in seen], belief)
         if found.accepted:
@@ -234,7 +234,7 @@ class LoopCloser:
         poses = belief.poses_map_node
         offset = poses[:node, :2] - poses[node, :2]
         turned = np.abs(wrap_angle(poses[:node, 2] - poses[node, 2]))
-        old = belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s
+        old = belief.stamps_s[node] - belief.stamps_s[:node] >= MIN_AGE_S
         inside = old & (np.hypot(offset[:, 0], offset[:, 1]) <= radii) & (turned <= heading)
         widths = float(radii.max(initial=radius)), float(np.rad2deg(min(heading, np.pi)))
         self._noted, self._ranking = node, np.zeros((0, 3))
@@ -304,7 +304,7 @@ class LoopCloser:
         poses = belief.poses_map_node
         gap = np.hypot(*(poses[:node, :2] - poses[node, :2]).T)
         turned = np.abs(wrap_angle(poses[:node, 2] - poses[node, 2]))
-        old = belief.stamps_s[node] - belief.stamps_s[:node] >= self._closing.min_age_s
+        old = belief.stamps_s[node] - belief.stamps_s[:node] >= MIN_AGE_S
         near = old & (gap <= REPROPOSE_M) & (turned <= np.deg2rad(HEADING_DEG))
         cost = gap + turned
         chosen: dict[int, Candidate] = {}

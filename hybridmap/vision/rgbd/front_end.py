@@ -16,7 +16,7 @@ from hybridmap.graph.edges import Check, Edge
 from hybridmap.metrics import StageClock
 from hybridmap.streams.base import Observation, Rig
 from hybridmap.streams.rgbd import RGBD, Camera, RgbdFrame
-from hybridmap.vision.base import UNEXPECTED, Belief, Division, View
+from hybridmap.vision.base import HELD_IMAGES, UNEXPECTED, Belief, Division, View
 from hybridmap.vision.profile import image_profile
 from hybridmap.vision.rgbd import checks
 from hybridmap.vision.rgbd.closing import LoopCloser
@@ -65,7 +65,7 @@ class RgbdFrontEnd:
         self._bands = config.profile.bands if rgbd.matching == "four-band" else 1
         self._templates = ViewTemplates(config.profile.width // 16, matching.mu_r, matching.mu_d)
         self.keyframes: list[Keyframe] = []
-        self._images: deque[tuple[int, RgbdFrame]] = deque(maxlen=rgbd.held_images)
+        self._images: deque[tuple[int, RgbdFrame]] = deque(maxlen=HELD_IMAGES)
         keys = itertools.count()
         level = NoiseLevel()
         self._tracker = Tracker(self.keyframes, config, self._camera, level, keys.__next__)
@@ -175,14 +175,13 @@ class RgbdFrontEnd:
         `T_base_camera` (4, 4), the camera on the robot at that time. The node closed last has those of `LoopCloser.note` too.
 
         Raises:
-            StreamError: the node's images are no longer held (see `held_images`); the map file has them.
+            StreamError: the node's images are no longer held (see `HELD_IMAGES`); the map file has them.
         """
         kept = self.keyframes[node]
         held = [frame for number, frame in self._images if number == node]
         if not held:
-            newest = self._config.rgbd.held_images
             raise StreamError(
-                f"vision: node {node}: only the newest {newest} images are held, take older ones from the map file"
+                f"vision: node {node}: only the newest {HELD_IMAGES} images are held, take older ones from the map file"
             )
         return {
             "profile": kept.profile,

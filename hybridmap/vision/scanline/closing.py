@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hybridmap.geometry import Array, RelativePose, between, compose, inverse, wrap_angle
 from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, Status, at_most
 from hybridmap.vision.base import Belief
+from hybridmap.vision.gating import MIN_AGE_S
 from hybridmap.vision.scanline.sequences import Sequences
 
 Indices = NDArray[np.int64]
@@ -23,8 +24,8 @@ GATE_M, GATE_PER_M = 1.0, 0.25
 """Radius of the gate, m, and its growth per metre of the way between the two nodes: wheels err by less than a quarter of it."""
 HEADING_DEG, HEADING_DEG_PER_M = 25.0, 1.5
 """Largest difference of headings, degrees, and its growth per metre: views must overlap by half, wheels veer by less."""
-AGE_S, AWAY_M = 10.0, 3.0
-"""A node this much younger, or with less travel between, is no revisit: s, m."""
+AWAY_M = 3.0
+"""A node with less travel between is no revisit, m."""
 RIVAL_M, UNLIKE = 1.5, 0.8
 """Distance from which a node is another place, m; a match scores at most so many times the best of these."""
 TURNING_DEG = 6.0
@@ -159,7 +160,7 @@ class ScanlineCloser:
     @staticmethod
     def _revisit(node: int, belief: Belief) -> NDArray[np.bool_]:
         """(node,) which earlier nodes would be seen again, not still."""
-        old = belief.stamps_s[node] - belief.stamps_s[:node] > AGE_S
+        old = belief.stamps_s[node] - belief.stamps_s[:node] > MIN_AGE_S
         return np.asarray(old & (belief.travel_m[node] - belief.travel_m[:node] > AWAY_M))
 
     def _compared(self, node: int, older: int, belief: Belief) -> Edge:

@@ -15,14 +15,13 @@ from hybridmap.metrics import StageClock
 from hybridmap.streams.base import Observation, Rig
 from hybridmap.streams.laser import LASER
 from hybridmap.streams.rgbd import RGBD
-from hybridmap.vision.base import Belief, SeenGain, View
+from hybridmap.vision.base import HELD_IMAGES, Belief, SeenGain, View
 from hybridmap.vision.scanline.closing import Measured, ScanlineCloser, seen_from_newer
 from hybridmap.vision.scanline.retina import CameraRetina, Glance, LaserRetina, Retina
 from hybridmap.vision.scanline.sequences import Sequences
 from hybridmap.vision.scanline.way_ahead import GainMeter, way_ahead
 from hybridmap.vision.templates import ViewTemplates
 
-_HELD_FRAMES = 100
 _FARTHEST_M = 1.0
 """Views that match were taken within this of each other, m: a larger way by depth is of something else."""
 
@@ -31,7 +30,8 @@ class ScanlineFrontEnd:
     """Loop closure by scanline profiles in sequence; implements `vision.base.GaugingFrontEnd`.
 
     A match gives the heading by the shift of the profile, and the way along by the depth ahead or by the scores of the nodes
-    around. Nothing is registered: between closures the map is that of self-motion.
+    around. Nothing is registered: between closures the map is that of self-motion. A node costs a comparison with every
+    profile so far. Places are recognised in the direction of the first visit only.
 
     Args:
         config: settings of the visual side.
@@ -46,7 +46,7 @@ class ScanlineFrontEnd:
         self._closer = ScanlineCloser(self._sequences, self._measured, matching.c_t)
         self._meter = GainMeter()
         self._glances: list[Glance] = []
-        self._frames: deque[tuple[int, Observation]] = deque(maxlen=_HELD_FRAMES)
+        self._frames: deque[tuple[int, Observation]] = deque(maxlen=HELD_IMAGES)
         self._seen: tuple[Observation, Glance] | None = None
 
     def observe(self, frame: Observation, delta_node_robot: Array) -> View:

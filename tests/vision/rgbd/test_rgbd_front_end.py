@@ -6,7 +6,6 @@ import pytest
 from hybridmap.config.vision import (
     ClosingConfig,
     RelocalisingConfig,
-    RgbdClosingConfig,
     RgbdConfig,
     TrackingConfig,
     VisionConfig,
@@ -170,7 +169,7 @@ def test_another_place_is_refused(poses, frames):
 def test_the_end_joins_by_depth_what_features_cannot(poses):
     """The second lap in other wallpaper: features see nothing, walls and the cupboard are the same."""
     papers = textures(1), textures(2)
-    config = VisionConfig(rgbd=RgbdConfig(closing=RgbdClosingConfig(min_age_s=8.0)), relocalising=NOT_CARRIED)
+    config = VisionConfig(relocalising=NOT_CARRIED)
     rng = np.random.default_rng(5)
     repapered = [render(VIEW, p, papers[i >= PER_LAP], i * 10**9, 0.002, rng) for i, p in enumerate(poses)]
     front_end, proposals, odometry = drive(config, poses, np.deg2rad(0.1), repapered)
