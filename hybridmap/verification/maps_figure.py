@@ -218,8 +218,8 @@ def spiking_grid_figure(result: PathVerification) -> str:
         panels = picture.subplots(3, len(shown), gridspec_kw={**_TIGHT, "hspace": 0.16}, squeeze=False)
         for column, (number, cell, found) in zip(panels.T, shown, strict=True):
             _spikes_on_path(column[0], result, number, f"{100.0 * cell.spacing_m:.0f} cm")
-            scores = f"S {found.scores['sargolini']:.2f}, L {found.scores['langston']:.2f}"
-            _rate_map(column[1], found.rates, f"{scores}\npeak {np.nanmax(found.rates):.2g} Hz")
+            scores = ", ".join(f"{name[0].upper()} {_said(found.scores[name])}" for name in ("sargolini", "langston"))
+            _rate_map(column[1], _squared(found.rates), f"{scores}\npeak {np.nanmax(found.rates):.2g} Hz")
             lags = _middle_of(autocorrelogram(found.rates), _SPACINGS_SHOWN * cell.spacing_m / result.arena.pitch_m)
             _picture(column[2], lags, "", _CORRELATION, (-1.0, 1.0))
         _scale_bar(panels[1, 0], 0.5 * float(result.spacings_m.max()) / result.arena.pitch_m, "")
@@ -241,7 +241,7 @@ def spiking_others_figure(result: PathVerification) -> str:
             entries = result.of_kind(kind)
             for axes, (_, _, found) in zip(row, entries[:: max(1, len(entries) // _EXAMPLES)], strict=False):
                 information = f"{found.scores['information']:.1f} bits"
-                _rate_map(axes, found.rates, f"{information}, {np.nanmax(found.rates):.2g} Hz")
+                _rate_map(axes, _squared(found.rates), f"{information}, {np.nanmax(found.rates):.2g} Hz")
         for axes in (*panels[:2].flat, *panels[2]):
             axes.set_axis_off() if not axes.get_images() else None
         _name_rows(panels[:2], ("band cells", "place cells"))
@@ -284,11 +284,22 @@ def _spikes_on_path(axes: Any, result: PathVerification, number: int, title: str
     axes.plot(
         *known[result.spikes[number]].T, color=_SPIKE_COLOUR, linestyle="none", marker=".", markersize=1.2, rasterized=True
     )
-    low = result.arena.corner_m
-    high = low + result.arena.pitch_m * np.array(result.arena.dwell_s.shape)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
+    sides = result.arena.pitch_m * np.array(result.arena.dwell_s.shape)
+    middle, half = result.arena.corner_m + 0.5 * sides, 0.5 * sides.max()
+    limits = [(centre - half, centre + half) for centre in middle]
+    axes.set(xlim=limits[0], ylim=limits[1], aspect="equal", xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
     axes.set_title(title, fontsize=_SMALL, fontweight="normal", loc="center", pad=2.5)
+
+
+def _squared(rates: Any) -> Any:
+    """A rate map with empty bins around it, so that it is as wide as high."""
+    lacking = max(rates.shape) - np.array(rates.shape)
+    return np.pad(rates, [(count // 2, count - count // 2) for count in lacking], constant_values=np.nan)
+
+
+def _said(score: float) -> str:
+    return f"{score:.2f}" if np.isfinite(score) else "–"
 
 
 def _tuning_curves(axes: Any, result: PathVerification) -> None:
