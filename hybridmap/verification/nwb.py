@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from datetime import UTC, datetime, timedelta
 from importlib.metadata import version
 from pathlib import Path
@@ -52,7 +53,10 @@ def read_nwb(path: Path) -> RecordedPath:
     """
     pynwb = pynwb_for(f"{path}: reading NWB", StreamError)
     try:
-        with pynwb.NWBHDF5IO(str(path), "r") as io:
+        with warnings.catch_warnings(), pynwb.NWBHDF5IO(str(path), "r") as io:
+            warnings.simplefilter(
+                "ignore"
+            )  # of versions of the schema and details of other objects; positions are checked here
             return _path_in(io.read(), path, pynwb)
     except StreamError:
         raise

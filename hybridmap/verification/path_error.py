@@ -16,7 +16,7 @@ from hybridmap.verification.drives import ExactDrive, corridor, wander
 
 _NODE_M = 0.5
 VON_MISES = 5.0
-"""Concentration of the sharper tuning that is shown: 62 degrees wide at half height, mean vector length 0.89, as many real
+"""Concentration of the sharper tuning that is shown: 61 degrees wide at half height, mean vector length 0.89, as many real
 cells of the postsubiculum."""
 
 
