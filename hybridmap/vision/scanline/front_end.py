@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.vision import VisionConfig
-from hybridmap.errors import ConfigError
+from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import IDENTITY, Array, RelativePose
 from hybridmap.graph.edges import Edge
 from hybridmap.metrics import StageClock
@@ -99,9 +99,17 @@ class ScanlineFrontEnd:
         """None: the front-end never takes the robot for lost."""
 
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
-        """`profile` (bands, width) float32 and the frame as the sensor stores it; for the newest nodes only."""
+        """`profile` (bands, width) float32 and the frame as the sensor stores it.
+
+        Raises:
+            StreamError: the node's frame is no longer held (see `HELD_IMAGES`); the map file has it.
+        """
         held = [frame for number, frame in self._frames if number == node]
-        return {"profile": self._glances[node].profile, **(self._retina.compact(held[0]) if held else {})}
+        if not held:
+            raise StreamError(
+                f"vision: node {node}: only the newest {HELD_IMAGES} images are held, take older ones from the map file"
+            )
+        return {"profile": self._glances[node].profile, **self._retina.compact(held[0])}
 
     def _measured(self, node: int, older: int) -> Measured:
         yaw = self._retina.yaw_rad(float(self._sequences.shifts[older]))
