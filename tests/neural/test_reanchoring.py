@@ -103,3 +103,23 @@ def test_what_a_node_stores_is_what_it_was_before_the_cells_jumped():
     there = integrator.decode().position_m
     cells.recalibrate(0, np.zeros(3))
     assert cells.activity_at(1)["near_m"] == pytest.approx(there, abs=1e-6)
+
+
+def test_the_poses_of_the_nodes_are_those_of_the_cells_where_a_loop_puts_them_back():
+    """A node stored again after the cells jumped lies where the matched node says, however far the integrator was off."""
+    integrator = PathIntegrator(SOFTPLUS)
+    cells = Reanchoring(integrator, 1.0)
+    assert cells.poses_of_nodes.shape == (0, 3)
+    cells.remember(0)
+    first = integrator.pose
+    away(integrator)
+    cells.remember(1)
+    off = integrator.pose
+    assert cells.poses_of_nodes == pytest.approx(np.array([first, off]))
+    delta = np.array([0.1, -0.05, 0.2])
+    cells.recalibrate(0, delta)
+    cells.remember(1)
+    assert cells.poses_of_nodes == pytest.approx(np.array([first, compose(first, delta)]), abs=1e-3)
+    away(integrator)
+    cells.remember(2)
+    assert len(cells.poses_of_nodes) == 3
