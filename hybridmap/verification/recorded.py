@@ -21,7 +21,7 @@ from hybridmap.verification.drives import ExactDrive
 RATE_HZ = 50.0
 """Steps per second of the cells: that of the video by which animals are tracked."""
 SHORTEST_S, LONGEST_S = 60.0, 6.0 * 3600.0
-"""Seconds that a path must cover, so that spikes can be shifted by 20 s and more, and may: 6 h take 0.8 GB."""
+"""Seconds that a path must cover, so that spikes can be shifted by 20 s and more, and may: two hours take 0.8 GB."""
 COVERAGE_MIN = 0.4
 """Least share of the squares of the path's bounding box that it visits. A disc fills 0.79 of its box."""
 BINS_PER_SPACING, SMOOTHINGS_PER_SPACING, SQUARES_PER_SPACING = 10.0, 6.0, 3.0
