@@ -10,6 +10,7 @@ import pytest
 from hybridmap.calibration.sessions import read_drive
 from hybridmap.config import Config
 from hybridmap.evaluate import absolute_error
+from hybridmap.evaluate.explain import Explainer
 from hybridmap.geometry import between
 from hybridmap.graph.edges import EdgeKind, Method, Status
 from hybridmap.graph.experience_map import ExperienceMap
@@ -109,6 +110,13 @@ def test_the_map_file_has_the_odometry_with_the_gain_by_the_views(how, request):
     assert at_nodes == pytest.approx(np.array([node.pose_odom for node in done.map.nodes]), abs=1e-4)
     true_m = np.hypot(*np.diff(done.truth.at(track.stamps_ns)[:, :2], axis=0).T).sum()
     assert np.hypot(*np.diff(track.poses_odom[:, :2], axis=0).T).sum() == pytest.approx(true_m, rel=0.015)
+
+
+def test_explain_says_why_there_are_no_loops(by_laser):
+    with Explainer(by_laser.session.folder.path) as explainer:
+        early, closed = explainer.node(3), explainer.node(by_laser.loops[-1].source)
+    assert "threshold" in early.no_loops
+    assert closed.no_loops == ""
 
 
 def test_a_calibration_takes_the_gain_off_again(bionic):

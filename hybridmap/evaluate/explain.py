@@ -327,6 +327,8 @@ class Explainer:
             if gate.older == 0:
                 return f"no node was old enough: {MIN_AGE_S:g} s"
             return "no older node lay inside the gate" if gate.inside == 0 else ""
+        if _setting(self._settings, "vision.closing.by") == "scanline":
+            return "no older node lay inside the gate, or the robot turned here, or the drive told no threshold yet"
         for kind, _ in carried(self._store.rig):
             every = _setting(self._settings, kind.seeks_every)
             if isinstance(every, int | float):
