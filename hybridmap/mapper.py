@@ -206,7 +206,7 @@ class Mapper:
         if self.second_opinion is None:
             return []
         with self.clock.stage("matching"):
-            return self.book.enter(self.second_opinion.ask(self.map.edges, self.belief()))
+            return self.book.enter(self.second_opinion.ask(self.map.edges, self.backends.rejected, self.belief()))
 
     def _propose_again(self) -> list[Update]:
         """Let vision decide what is pending and propose loops on the optimised map, until none is accepted."""

@@ -338,6 +338,12 @@ class Ensemble:
         solution = self.solutions.get(name)
         return extend(graph, solution.poses if solution is not None else graph.initial[:1])
 
+    @property
+    def rejected(self) -> tuple[int, ...]:
+        """Numbers of the edges that the primary gave no weight in its latest solution."""
+        solution = self.solutions.get(self.primary)
+        return () if solution is None else tuple(solution.report.rejected_edge_ids)
+
     def update(self, graph: PoseGraph) -> None:
         """Let every back-end follow the graph; `solutions` and `failures` say how that went."""
         for name, backend in self._backends.items():

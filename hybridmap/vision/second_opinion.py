@@ -21,6 +21,9 @@ from hybridmap.vision.relocalising import SUPPORT, GlobalMatch, Relocaliser, Whe
 
 ASKED = 12
 """Most nodes from which the whole map is searched: enough for `SUPPORT` of them where some see too little."""
+DISPUTED = 0.1
+"""Share of the loops without weight from which on they contradict each other: then the robot was not carried to a place that
+looks alike, whose loops agree, but to where its true loops and the chain dispute."""
 MOST = 4
 """Most searches of one drive; each of them may find a carry."""
 
@@ -75,11 +78,12 @@ class SecondOpinion:
         self._witness = witness
         self._left = MOST
 
-    def ask(self, edges: Sequence[Edge], belief: Belief) -> list[Edge]:
+    def ask(self, edges: Sequence[Edge], rejected: Sequence[int], belief: Belief) -> list[Edge]:
         """Search the whole map where loops fit worse than those before; if the robot was carried there, correct the map.
 
         Args:
             edges: of the map.
+            rejected: numbers of the loops to which the back-end gives no weight; if many, there is no second opinion.
             belief: the map.
 
         Returns:
@@ -88,6 +92,8 @@ class SecondOpinion:
         """
         accepted = [e for e in edges if e.status is Status.ACCEPTED and e.key >= 0 and e.kidnapped_m is None]
         loops = [edge for edge in accepted if edge.kind is EdgeKind.LOOP and np.isfinite(self._witness.misfit(edge))]
+        if len(rejected) > DISPUTED * len(loops):
+            return []
         steps = [edge for edge in accepted if edge.kind is EdgeKind.REGISTRATION]
         since = worse_since(loops, steps, self._witness) if self._left > 0 else None
         if since is None:
