@@ -19,7 +19,8 @@ class Sequences:
     """Scores every stretch of nodes that was driven against the stretch that ends at the newest node.
 
     The score of an older node j is the mean over the last L nodes i - k of the least G between node i - k and the nodes
-    j - k - 1 to j - k + 1. It is infinite where one of the two stretches is shorter than L.
+    j - k - 1 to j - k + 1. It is infinite where one of the two stretches is shorter than L. Views without any contrast, such as
+    scans without a return, are all alike and match none.
 
     Attributes:
         length: L, number of nodes of a stretch.
@@ -35,6 +36,7 @@ class Sequences:
         self._mu = (settings.mu_r, settings.mu_d)
         self._store = ProfileStore(max_shift)
         self._rows: deque[Array] = deque(maxlen=max(self.length - 1, 1))
+        self._blank: list[bool] = []
         self.scores = self.single = self.shifts = np.zeros(0)
 
     def add(self, profile: Profile) -> None:
@@ -43,7 +45,9 @@ class Sequences:
         weights = band_weights(len(profile), *self._mu)
         differences = self._store.differences(profile)
         self.single = differences.min(axis=2) @ weights
-        self.single[number] = np.inf
+        self._blank.append(not np.ptp(profile, axis=1).any())
+        self.single[number if not self._blank[number] else slice(None)] = np.inf
+        self.single[np.array(self._blank)] = np.inf
         self.shifts = _best_shifts(np.einsum("nbs,b->ns", differences, weights), self._store.shifts)
         total = self.single.copy()
         for back, row in enumerate(reversed(self._rows), 1):

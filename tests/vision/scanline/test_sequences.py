@@ -74,6 +74,17 @@ def test_nothing_matches_before_a_stretch_is_complete():
     assert np.isinf(scores[11])
 
 
+def test_views_without_contrast_match_none():
+    profiles = places(20)
+    profiles[4:9] = 0.0
+    profiles[14:] = 0.0
+    sequences = fed(profiles, 3)
+    assert np.isinf(sequences.scores).all()
+    sequences.add(profiles[2])
+    assert np.isinf(sequences.single[4:9]).all()
+    assert np.isfinite(sequences.single[:4]).all()
+
+
 def test_the_shift_has_a_fraction_and_is_positive_where_things_lie_at_higher_columns_in_the_newest():
     fine = np.interp(
         np.arange(0, 80, 0.25), np.arange(80), np.convolve(np.random.default_rng(3).normal(size=80), np.ones(5), "same")
