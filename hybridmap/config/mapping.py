@@ -118,10 +118,11 @@ class NeuralConfig(Section):
 class NodesConfig(Section):
     """When a new node is added to the map."""
 
-    rule: Literal["travel", "novelty"] = "travel"
-    """`travel`: after some distance or rotation; `novelty`: the paper's rule, by place code and view template.
+    rule: Literal["travel", "novelty", "passage"] = "travel"
+    """`travel`: after some distance or rotation; `novelty`: the paper's rule, by place code and view template, against every
+    node; `passage`: the same against the newest node alone, place code and head direction together.
 
-    Watch: under `novelty` a known place makes no node, and hence no loop closure.
+    Watch: under `novelty` a known place makes no node, and hence no loop closure; under `passage` it makes one at each visit.
     """
     distance_m: float = Field(default=0.25, gt=0, le=1000)
     """`travel`: distance between nodes, m.
@@ -134,7 +135,7 @@ class NodesConfig(Section):
     Watch: keep it well below a camera's field of view.
     """
     place_threshold: float = Field(default=0.4, gt=0, le=1)
-    """`novelty`: S_th. A node is made if its place code differs from that of every node by at least this (1 - cosine).
+    """`novelty`, `passage`: S_th. A node is made if its place code differs by at least this (1 - cosine).
 
     Watch: a smaller threshold makes more nodes.
     """

@@ -214,8 +214,9 @@ class Novelty:
         """Why a new node must be made now, in words; None if none is needed.
 
         Args:
-            delta_node_robot: (3,) pose of the robot in the frame of the node that it is at, m and rad; for the rule `travel`.
-            place_code: returns the present rates (P,) of the place cells; called only under the rule `novelty`.
+            delta_node_robot: (3,) pose of the robot in the frame of the node that it is at, m and rad; for the rule `travel`,
+                and the turn since that node for `passage`.
+            place_code: returns the present rates (P,) of the place cells; not called under the rule `travel`.
             new_template: whether the current frame made a new view template; without effect under the rule `travel`.
         """
         if self._count == 0:
@@ -224,6 +225,8 @@ class Novelty:
             return self._travelled(delta_node_robot)
         if new_template:
             return "new view template"
+        if self._config.rule == "passage":
+            return self._passed(delta_node_robot, place_code())
         distance = self.distance(place_code())
         return f"place code differs by {distance:.2f} from every node's" if distance > self._config.place_threshold else None
 
@@ -245,6 +248,12 @@ class Novelty:
         norm = float(np.linalg.norm(place_code))
         self._codes[self._count] = place_code / norm if norm > 0 else place_code
         self._count += 1
+
+    def _passed(self, delta: Array, place_code: NDArray[np.float32]) -> str | None:
+        """Cells of place and of head direction together: their populations' cosines multiply."""
+        newest, norm = self._codes[self._count - 1], float(np.linalg.norm(place_code))
+        distance = 1.0 - float(newest @ place_code) / max(norm, 1e-12) * float(np.cos(delta[2]))
+        return f"place code differs by {distance:.2f}" if distance >= self._config.place_threshold else None
 
     def _travelled(self, delta: Array) -> str | None:
         distance, angle = float(np.hypot(delta[0], delta[1])), float(np.rad2deg(abs(delta[2])))
