@@ -95,7 +95,7 @@ class PathIntegrator:
         self._read_out_every_m = _PART_OF_WRAP * self.attractor.extent_m
         self._theta_period_s = 1.0 / THETA_HZ - 1e-9
         self._warned = False
-        self.place.learn(self.grid.activity)
+        self.place.learn(self.grid.activity, self._last_decoded_m)
 
     def step(self, delta_robot: ArrayLike, dt_s: float) -> None:
         """Integrate one displacement. One of zero changes nothing; a turn on the spot moves the head-direction ring alone.
@@ -272,7 +272,7 @@ class PathIntegrator:
     def _learn(self) -> None:
         """Let the place cells learn, and the attractor receive their input where it is configured."""
         share = self.config.place.attractor_input
-        rates = self.place.learn(self.grid.activity)
+        rates = self.place.learn(self.grid.activity, self.attractor.unwrapped_m(self._last_decoded_m))
         if share > 0.0:
             self.attractor.receive(self._projection.onto(rates), share)
             self._projection.learn(rates, self.attractor.activity.ravel())

@@ -17,6 +17,8 @@ RECRUIT_THRESHOLD = 0.3
 """A cell is recruited where no other responds above this share of its peak: fields overlap a little, none is left out."""
 INHIBITION = 0.6
 """C_inh_p, as a share of a field's peak drive: fields are some 7 cm wide, and 97 % and more have one peak."""
+BLOCK_M = 0.5
+"""Cells are looked up by blocks of this side, m: those of the block of a position and of the eight around it can fire there."""
 MAX_CELLS = 32768
 """No more place cells than this are recruited: with their weights some 16 MB, and as many learning steps."""
 
@@ -40,6 +42,7 @@ class PlaceCells:
         self._less_mean = np.eye(inputs, dtype=np.float32) - np.float32(1.0 / inputs)
         self._weights = np.zeros((256, len(spacings_m) * GRID_INPUTS_SIDE**2), dtype=np.float32)
         self._recruited = 0
+        self._in_block: dict[tuple[int, int], list[int]] = {}
 
     @property
     def weights(self) -> NDArray[np.float32]:
@@ -50,20 +53,23 @@ class PlaceCells:
         """Return p = A f[W (s - C_inh_g) - C_inh_p] of every recruited cell, (cells,), for sheets (M, N, N); 1 at a peak."""
         return self.respond(self.inputs(sheets))
 
-    def learn(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
+    def learn(self, sheets: NDArray[np.floating], near_m: Array | None = None) -> NDArray[np.float32]:
         """One learning step: recruit where nothing responds, else move the responding cells' weights (eq. 8).
 
         Args:
             sheets: (M, N, N) rates of the grid cells.
+            near_m: (2,) about where the robot is, m: only cells recruited around there are asked, as the single field of any
+                other lies elsewhere, so that a step costs the same however many there are. None: all are asked.
 
         Returns:
             The rates (cells,) of all cells at this position; for a newly recruited cell, its rate after recruiting.
         """
         drive = self.inputs(sheets)
-        rates = self.respond(drive)
+        rates = self._local(drive, near_m)
         if rates.size == 0 or float(rates.max()) < RECRUIT_THRESHOLD:
-            self._recruit(drive)
-            return self.respond(drive)
+            if self._recruit(drive) and near_m is not None:
+                self._in_block.setdefault(_block(near_m), []).append(self._recruited - 1)
+            return self._local(drive, near_m)
         for cell in rates.nonzero()[0].tolist():
             weights = self._weights[cell]
             weights += np.float32(self.config.learning_rate * float(rates[cell])) * drive  # neither is negative
@@ -72,22 +78,29 @@ class PlaceCells:
 
     def respond(self, drive: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the rates (cells,) of the cells to one input vector (inputs,), or (cells, P) to P of them, (inputs, P)."""
-        inhibition = np.float32(INHIBITION)
-        above = self.weights.dot(drive)
-        above -= inhibition
-        np.maximum(above, np.float32(0.0), out=above)
-        above *= np.float32(1.0) / (np.float32(1.0) - inhibition)
-        return np.asarray(above)
+        return _above_inhibition(self.weights.dot(drive))
 
-    def _recruit(self, drive: NDArray[np.float32]) -> None:
+    def _local(self, drive: NDArray[np.float32], near_m: Array | None) -> NDArray[np.float32]:
+        """The rates (cells,) of all cells, those recruited far from a position (2,), m, taken as silent."""
+        if near_m is None:
+            return self.respond(drive)
+        x, y = _block(near_m)
+        around = [(x + across, y + along) for across in (-1, 0, 1) for along in (-1, 0, 1)]
+        cells = [cell for block in around for cell in self._in_block.get(block, ())]
+        rates = np.zeros(self._recruited, dtype=np.float32)
+        rates[cells] = _above_inhibition(self._weights[cells].dot(drive))
+        return rates
+
+    def _recruit(self, drive: NDArray[np.float32]) -> bool:
         if self._recruited == MAX_CELLS:
-            return
+            return False
         if self._recruited == len(self._weights):
             self._weights = np.concatenate([self._weights, np.zeros_like(self._weights)])
         self._weights[self._recruited] = drive
         self._recruited += 1
         if self._recruited == MAX_CELLS:
             log.warning("all %d place cells are recruited; new places get no cell of their own", self._recruited)
+        return True
 
     def inputs(self, sheets: NDArray[np.floating]) -> NDArray[np.float32]:
         """Input (inputs,) of the place cells from sheets (M, N, N): sampled rates above their module's mean, of unit length."""
@@ -99,6 +112,19 @@ class PlaceCells:
         return np.asarray(above.reshape(-1))
 
 
+def _block(position_m: Array) -> tuple[int, int]:
+    x, y = np.floor(position_m / BLOCK_M).astype(int).tolist()
+    return x, y
+
+
+def _above_inhibition(drive: NDArray[np.float32]) -> NDArray[np.float32]:
+    inhibition = np.float32(INHIBITION)
+    drive -= inhibition
+    np.maximum(drive, np.float32(0.0), out=drive)
+    drive *= np.float32(1.0) / (np.float32(1.0) - inhibition)
+    return np.asarray(drive)
+
+
 class PlaceProjection:
     """Hebbian weights from the place cells onto the place attractor: a cell learns where the bump is when it fires."""
 
@@ -108,9 +134,7 @@ class PlaceProjection:
 
     def learn(self, rates: NDArray[np.float32], bump: NDArray[np.floating]) -> None:
         """Move each cell's weights to the mean of the bumps (N * N,) it fired with, weighted by its rates (cells,)."""
-        while len(rates) > len(self._weights):
-            self._weights = np.concatenate([self._weights, np.zeros_like(self._weights)])
-            self._fired = np.concatenate([self._fired, np.zeros_like(self._fired)])
+        self._grow(len(rates))
         active = np.flatnonzero(rates)
         self._fired[active] += rates[active]
         step = (rates[active] / self._fired[active])[:, None]
@@ -118,7 +142,14 @@ class PlaceProjection:
 
     def onto(self, rates: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the input (N * N,) that place cells of rates (cells,) give the attractor; (N * N, P) for P sets (cells, P)."""
-        return np.asarray(self._weights[: len(rates)].T @ rates)
+        self._grow(len(rates))
+        active = np.flatnonzero(rates.reshape(len(rates), -1).any(axis=1))
+        return np.asarray(self._weights[active].T @ rates[active])
+
+    def _grow(self, cells: int) -> None:
+        while cells > len(self._weights):
+            self._weights = np.concatenate([self._weights, np.zeros_like(self._weights)])
+            self._fired = np.concatenate([self._fired, np.zeros_like(self._fired)])
 
 
 ATTRACTOR_WIDTH_CELLS = 1.4

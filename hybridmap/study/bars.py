@@ -25,8 +25,8 @@ class Verdict:
         bar: the configured limit that was checked.
         cell: first cell of the group; all cells of the group share its labels, except for the seed.
         values: the figure in each cell of the group, one per seed; None for a missing figure, which misses any bar.
-        limits: the limit of each value: the bar's number, or the figure of the back-end that it names in the cell of the same
-            seed (NaN if missing).
+        limits: the limit of each value: the bar's number, or its factor on the figure of the back-end that it names in the
+            cell of the same seed (NaN if missing).
         value: the bar's statistic of the values: median, mean, or with `worst` the one farthest on the wrong side of its limit;
             NaN if a value is missing.
         limit: what `value` is compared with: the same statistic of `limits`, or with `worst` the limit of that value.
@@ -107,7 +107,7 @@ def _verdict(
     slack = 0.0
     if isinstance(bar.at_most, str):
         others = (_own(results[cell.key], bar.figure) for cell in groups[cells[0].group, bar.at_most])
-        limits, slack = tuple(math.nan if other is None else other for other in others), _ROUND_OFF
+        limits, slack = tuple(math.nan if other is None else bar.times * other for other in others), _ROUND_OFF
     else:
         limit = bar.at_most if bar.at_least is None else bar.at_least
         assert limit is not None

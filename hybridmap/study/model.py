@@ -225,6 +225,8 @@ class BarConfig(Section):
     """A column of `cells.csv` or `timings.csv`."""
     at_most: float | str | None = None
     """The largest allowed value, or the title of a back-end whose figure on the same drive is the limit."""
+    times: float = Field(default=1.0, gt=0)
+    """Factor on the figure of the back-end that `at_most` names."""
     at_least: float | None = None
     """The smallest allowed value."""
     statistic: Literal["worst", "median", "mean"] = "worst"
