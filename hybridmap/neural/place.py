@@ -58,8 +58,9 @@ class PlaceCells:
 
         Args:
             sheets: (M, N, N) rates of the grid cells.
-            near_m: (2,) about where the robot is, m: only cells recruited around there are asked, as the single field of any
-                other lies elsewhere, so that a step costs the same however many there are. None: all are asked.
+            near_m: (2,) about where the robot is, m: only cells recruited around there are asked (`around`), as the field of
+                any other lies elsewhere, so that a step costs the same however many there are. None: all are asked. Side
+                peaks of the others, weaker than what recruits, are left out.
 
         Returns:
             The rates (cells,) of all cells at this position; for a newly recruited cell, its rate after recruiting.
@@ -80,13 +81,17 @@ class PlaceCells:
         """Return the rates (cells,) of the cells to one input vector (inputs,), or (cells, P) to P of them, (inputs, P)."""
         return _above_inhibition(self.weights.dot(drive))
 
+    def around(self, near_m: Array) -> list[int]:
+        """Numbers of the cells that were recruited around a position (2,), m: those that are asked there."""
+        x, y = _block(near_m)
+        blocks = [(x + across, y + along) for across in (-1, 0, 1) for along in (-1, 0, 1)]
+        return [cell for block in blocks for cell in self._in_block.get(block, ())]
+
     def _local(self, drive: NDArray[np.float32], near_m: Array | None) -> NDArray[np.float32]:
         """The rates (cells,) of all cells, those recruited far from a position (2,), m, taken as silent."""
         if near_m is None:
             return self.respond(drive)
-        x, y = _block(near_m)
-        around = [(x + across, y + along) for across in (-1, 0, 1) for along in (-1, 0, 1)]
-        cells = [cell for block in around for cell in self._in_block.get(block, ())]
+        cells = self.around(near_m)
         rates = np.zeros(self._recruited, dtype=np.float32)
         rates[cells] = _above_inhibition(self._weights[cells].dot(drive))
         return rates

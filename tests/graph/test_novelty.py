@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from hybridmap.config.mapping import EdgesConfig, NodesConfig
 from hybridmap.geometry import compose, exp
@@ -29,6 +30,28 @@ def test_novelty_rule_compares_with_every_node():
     assert novelty.reason(far, lambda: 5 * HERE, False) is None
     assert novelty.reason(far, lambda: -HERE, False) is not None
     assert novelty.reason(np.zeros(3), lambda: HERE, True) == "new view template"
+
+
+def test_passage_rule_asks_the_newest_node_alone():
+    novelty = Novelty(NodesConfig(rule="passage", place_threshold=0.3))
+    assert novelty.reason(np.zeros(3), lambda: HERE, False) == "first experience"
+    for code in (HERE, ELSEWHERE):
+        novelty.remember(code)
+    assert novelty.reason(np.zeros(3), lambda: HERE, False) is not None  # known, but from an earlier passage
+    assert novelty.reason(np.array([9.0, 9.0, 0.0]), lambda: 3 * ELSEWHERE, False) is None
+    assert novelty.reason(np.zeros(3), lambda: ELSEWHERE, True) == "new view template"
+    assert novelty.reason(np.zeros(3), lambda: 0.0 * ELSEWHERE, False) is not None
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_passage_rule_multiplies_the_likeness_of_place_and_of_heading(sign):
+    novelty = Novelty(NodesConfig(rule="passage", place_threshold=0.3))
+    novelty.remember(HERE)
+    near = np.array([0.9, np.sqrt(1.0 - 0.9**2)], np.float32)
+    for code, cosine in ((HERE, 1.0), (near, 0.9)):
+        limit = np.arccos(0.7 / cosine)
+        assert novelty.reason(np.array([0.0, 0.0, sign * (limit - 0.01)]), lambda code=code: code, False) is None
+        assert novelty.reason(np.array([0.0, 0.0, sign * (limit + 0.01)]), lambda code=code: code, False) is not None
 
 
 def test_odometry_covariance_agrees_with_a_random_walk():

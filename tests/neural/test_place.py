@@ -5,7 +5,8 @@ from hybridmap.config.mapping import NeuralConfig, PlaceConfig
 from hybridmap.neural import PathIntegrator
 from hybridmap.neural import place as place_cells
 from hybridmap.neural.grid import shift_sheets
-from hybridmap.neural.place import PlaceCells
+from hybridmap.neural.place import RECRUIT_THRESHOLD, PlaceCells, PlaceProjection
+from tests.neural.neural_drives import wander
 
 
 @pytest.fixture(scope="module")
@@ -71,3 +72,53 @@ def test_recruitment_stops_at_the_limit_and_says_so(integrator, caplog, monkeypa
         place.learn(sheets_at(integrator, float(x), 0.0))
     assert len(place.weights) == 3
     assert "all 3 place cells" in caplog.text
+
+
+def test_cells_asked_around_the_robot_fire_as_if_all_were_asked():
+    integrator = PathIntegrator(NeuralConfig())
+    near, every = cells(integrator), cells(integrator)
+    deltas, poses = wander(3, 30.0)
+    silent, learnt = 0, range(3, len(deltas), 4)
+    for k, delta in enumerate(deltas):
+        integrator.step(delta, 1 / 30)
+        if k not in learnt:
+            continue
+        here, sheets = poses[k, :2], integrator.grid.activity
+        asked, rates = near.around(here), near.learn(sheets, here)
+        of_all, elsewhere = near.rates(sheets), np.ones(len(rates), dtype=bool)
+        elsewhere[asked] = elsewhere[len(rates) - 1 :] = False
+        every.learn(sheets)
+        assert rates[~elsewhere] == pytest.approx(of_all[~elsewhere], abs=2e-3)  # one step of learning between them
+        assert not rates[elsewhere].any()
+        assert of_all[elsewhere].max(initial=0.0) < RECRUIT_THRESHOLD
+        silent += not of_all[elsewhere].any()
+    assert silent >= 0.75 * len(learnt)
+    assert len(near.weights) == len(every.weights)
+
+
+def test_a_step_asks_no_more_cells_however_many_there_are(integrator):
+    place, counts, asked = cells(integrator), [], []
+    straight = [(x, 0.0) for x in np.arange(0.0, 40.0, 0.05)]
+    lap = [(np.cos(angle), np.sin(angle)) for angle in np.arange(0.0, 2.0 * np.pi, 0.05)]
+    for x, y in straight + 4 * lap:
+        place.learn(sheets_at(integrator, x, y), np.array([x, y]))
+        counts.append(len(place.weights))
+        asked.append(len(place.around(np.array([x, y]))))
+    quarter, laps = len(straight) // 4, len(straight) + len(lap)
+    assert counts[len(straight) - 1] > 3.5 * counts[quarter]
+    assert max(asked[: len(straight)]) <= max(asked[:quarter])
+    assert max(asked[laps:]) <= 1.1 * max(asked[len(straight) : laps])
+
+
+def test_newly_recruited_cells_project_nothing_until_they_fire():
+    projection, bumps = PlaceProjection(4), np.eye(4, dtype=np.float32)
+    projection.learn(np.array([1.0, 0.0], np.float32), bumps[0])
+    assert projection.onto(np.array([1.0, 0.0, 1.0], np.float32)) == pytest.approx(bumps[0])
+    many = np.zeros(1000, np.float32)
+    many[[0, 999]] = 1.0, 0.5
+    assert projection.onto(many) == pytest.approx(bumps[0])
+    projection.learn(many, bumps[2])
+    assert projection.onto(many) == pytest.approx(0.5 * bumps[0] + 1.0 * bumps[2])
+    of_two = np.stack([many, 0.0 * many], axis=1)
+    assert projection.onto(of_two)[:, 0] == pytest.approx(projection.onto(many))
+    assert not projection.onto(of_two)[:, 1].any()

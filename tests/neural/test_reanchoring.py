@@ -105,21 +105,28 @@ def test_what_a_node_stores_is_what_it_was_before_the_cells_jumped():
     assert cells.activity_at(1)["near_m"] == pytest.approx(there, abs=1e-6)
 
 
-def test_the_poses_of_the_nodes_are_those_of_the_cells_where_a_loop_puts_them_back():
-    """A node stored again after the cells jumped lies where the matched node says, however far the integrator was off."""
+def test_poses_of_nodes_are_those_that_the_cells_showed_last_at_each():
     integrator = PathIntegrator(SOFTPLUS)
     cells = Reanchoring(integrator, 1.0)
     assert cells.poses_of_nodes.shape == (0, 3)
     cells.remember(0)
-    first = integrator.pose
+    start = integrator.pose
     away(integrator)
     cells.remember(1)
-    off = integrator.pose
-    assert cells.poses_of_nodes == pytest.approx(np.array([first, off]))
-    delta = np.array([0.1, -0.05, 0.2])
-    cells.recalibrate(0, delta)
+    drifted = integrator.pose
+    assert cells.poses_of_nodes == pytest.approx(np.array([start, drifted]))
+    closure = np.array([0.1, -0.05, 0.2])
+    cells.recalibrate(0, closure)
+    assert cells.poses_of_nodes[1] == pytest.approx(drifted)
     cells.remember(1)
-    assert cells.poses_of_nodes == pytest.approx(np.array([first, compose(first, delta)]), abs=1e-3)
-    away(integrator)
-    cells.remember(2)
-    assert len(cells.poses_of_nodes) == 3
+    assert cells.poses_of_nodes == pytest.approx(np.array([start, compose(start, closure)]), abs=1e-4)
+
+
+def test_without_a_weight_the_poses_of_all_nodes_are_kept():
+    integrator = PathIntegrator(SOFTPLUS)
+    cells, shown = Reanchoring(integrator, 0.0), []
+    for node in range(3):
+        cells.remember(node)
+        shown.append(integrator.pose)
+        away(integrator)
+    assert cells.poses_of_nodes == pytest.approx(np.array(shown))
