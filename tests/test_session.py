@@ -53,6 +53,9 @@ def test_the_file_gives_back_the_map(finished):
         assert set(store.solutions()) == set(OVERRIDES["backends.names"])
         assert "ranges_m" in store.keyframe(0)
         assert set(store.snapshot(0)) >= {"grid_phases", "heading"}
+        phases = store.grid_phases()
+        assert phases.shape == (len(store.map()), 8, 2)
+        np.testing.assert_array_equal(phases[-1], store.snapshot(len(phases) - 1)["grid_phases"])
 
 
 def test_the_words_of_a_figure_hold_for_every_back_end(finished):

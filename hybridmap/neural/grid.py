@@ -233,7 +233,8 @@ class GridModules:
 
 DECODE_BOX_M = 1.0
 """Half side of the box around the prior in which all modules together resolve the wrap, m: about twice the coarsest spacing."""
-_AGREEMENT_CYCLES = 0.06
+AGREEMENT_CYCLES = 0.06
+"""The modules agree on a position if the RMS misfit of their phases is below this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +252,7 @@ class Decoded:
     @property
     def agreed(self) -> bool:
         """Whether the modules agree (misfit below 0.06 cycles), so that the position can be trusted."""
-        return self.misfit_cycles < _AGREEMENT_CYCLES
+        return self.misfit_cycles < AGREEMENT_CYCLES
 
 
 class PhaseDecoder:

@@ -78,10 +78,9 @@ class PathIntegrator:
         """
         self.config = config
         self.gains = Gains.of(config)
-        self.spacings_m: NDArray[np.float64] = np.geomspace(config.spacing_min_m, config.spacing_max_m, config.modules)
-        turned = np.radians(ORIENTATION_DEG + ORIENTATION_STEP_DEG * np.arange(config.modules))
+        self.spacings_m = _spacings_m(config)
         self.head_direction = HeadDirectionRing(config.head_direction_cells, dtype, heading_concentration)
-        self.bands = BandRings(self.spacings_m, turned, dtype=dtype, metric=config.metric)
+        self.bands = band_rings(config, dtype)
         self.grid = _grid(config, dtype)
         place = config.place
         self.place = PlaceCells(place, config.sheet_side, self.spacings_m)
@@ -289,6 +288,16 @@ class PathIntegrator:
 def _unwrapped(difference: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
     """The phase difference, cycles, in the repetition that is nearest to the expected one."""
     return np.asarray(difference - np.round(difference - expected))
+
+
+def band_rings(config: NeuralConfig, dtype: DTypeLike = np.float64) -> BandRings:
+    """The rings of band cells of all modules, finest first, at phase zero."""
+    turned = np.radians(ORIENTATION_DEG + ORIENTATION_STEP_DEG * np.arange(config.modules))
+    return BandRings(_spacings_m(config), turned, dtype=dtype, metric=config.metric)
+
+
+def _spacings_m(config: NeuralConfig) -> NDArray[np.float64]:
+    return np.geomspace(config.spacing_min_m, config.spacing_max_m, config.modules)
 
 
 def _grid(config: NeuralConfig, dtype: DTypeLike) -> GridModules:

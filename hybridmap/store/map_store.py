@@ -268,13 +268,13 @@ class MapStore:
     def map(self) -> ExperienceMap:
         """A new experience map with the nodes and edges of the file, in the order in which they were made."""
         experiences, version = ExperienceMap(), int(self._one("PRAGMA user_version", ()))
-        codes = {row[0]: schema.Packed(*row[1:]) for row in self._arrays(_CODE)}
+        codes = self._of_nodes(_CODE, "place")
         for number, row in enumerate(self._rows("SELECT * FROM nodes ORDER BY number")):
-            node = Node(int(row[1]), _pose(row[2:5]), schema.unpack(codes[number]), int(row[8]), float(row[9]))
+            node = Node(int(row[1]), _pose(row[2:5]), codes[number], int(row[8]), float(row[9]))
             if experiences.add_node(node, _pose(row[5:8])) != row[0]:
                 raise ValueError(f"node {number} is missing")
         for number, row in enumerate(self._rows("SELECT * FROM edges ORDER BY number")):
-            relative = None if row[9] is None else RelativePose(_pose(row[6:9]), _covariance(row[9]))
+            relative = None if row[9] is None else RelativePose(_pose(row[6:9]), schema.covariance_from_bytes(row[9]))
             kind, status, record = EdgeKind[row[3].upper()], Status(row[4]), schema.record_from_json(row[10], row[5], version)
             edge = Edge(int(row[1]), int(row[2]), kind, status, relative, since_node=int(row[11]), **record)
             if experiences.add_edge(edge) != row[0]:
@@ -290,6 +290,14 @@ class MapStore:
     def snapshot(self, node: int) -> dict[str, NDArray[Any]]:
         """The arrays of the state of the path integrator at a node, by name; empty for an unknown node."""
         return self._named(node, _SNAPSHOT)
+
+    @_reading
+    def grid_phases(self) -> NDArray[np.float64]:
+        """(N, M, 2) phases of the M grid sheets at each node, cycles: a displacement for `neural.vector.GridVectors`."""
+        phases = self._of_nodes(_SNAPSHOT, "grid_phases")
+        if list(phases) != list(range(self._one("SELECT COUNT(*) FROM nodes", ()))):
+            raise ValueError("not every node has grid phases")
+        return np.array(list(phases.values()), dtype=np.float64).reshape(len(phases), -1 if phases else 0, 2)
 
     @_reading
     def track(self) -> Track:
@@ -354,8 +362,9 @@ class MapStore:
         rows = self._rows(statement, values)
         return rows[0][0] if rows else None
 
-    def _arrays(self, part: str) -> list[tuple[Any, ...]]:
-        return self._rows("SELECT node, dtype, shape, codec, data FROM arrays WHERE part = ?", (part,))
+    def _of_nodes(self, part: str, name: str) -> dict[int, NDArray[Any]]:
+        statement = "SELECT node, dtype, shape, codec, data FROM arrays WHERE part = ? AND name = ? ORDER BY node"
+        return {row[0]: schema.unpack(schema.Packed(*row[1:])) for row in self._rows(statement, (part, name))}
 
     def _named(self, node: int, part: str) -> dict[str, NDArray[Any]]:
         statement = "SELECT name, dtype, shape, codec, data FROM arrays WHERE node = ? AND part = ? ORDER BY name"
@@ -385,13 +394,6 @@ def _near(values: Array) -> Array:
     if not (np.abs(values) <= FARTHEST_M).all():
         raise ValueError(f"a pose with NaN, Inf or a number beyond {FARTHEST_M:g}")
     return values
-
-
-def _covariance(data: bytes) -> Array:
-    covariance = schema.unpack_floats(data, 3)
-    if covariance.shape != (3, 3) or not np.isfinite(covariance).all() or not (np.diagonal(covariance) > 0.0).all():
-        raise ValueError("a covariance that is none")
-    return covariance
 
 
 def _marks(count: int) -> str:

@@ -214,6 +214,18 @@ def unpack_floats(data: bytes, columns: int) -> NDArray[np.float64]:
     return np.frombuffer(data, "<f8").astype(np.float64).reshape(-1, columns)
 
 
+def covariance_from_bytes(data: bytes) -> NDArray[np.float64]:
+    """The covariance (3, 3) that `pack_floats` packed.
+
+    Raises:
+        ValueError: it is none.
+    """
+    covariance = unpack_floats(data, 3)
+    if covariance.shape != (3, 3) or not np.isfinite(covariance).all() or not (np.diagonal(covariance) > 0.0).all():
+        raise ValueError("a covariance that is none")
+    return covariance
+
+
 def rig_to_json(rig: Rig) -> dict[str, Any]:
     """The sensors of a source as nested plain values that JSON can hold."""
     return {name: _plain(asdict(sensor)) for name, sensor in rig.sensors.items()}

@@ -58,6 +58,22 @@ def test_keyframes_snapshots_rig_and_solutions_come_back_exactly(tmp_path):
         assert solution.report.status is SolveStatus.CONVERGED
 
 
+def test_grid_phases_of_all_nodes_come_back_in_order(tmp_path):
+    phases = np.random.default_rng(0).uniform(size=(12, 3, 2))
+    code = np.zeros(1, np.float32)
+    with MapStore.create(tmp_path / "whole", "{}", Rig(), "x") as store:
+        for k in range(12):
+            store.add_node(k, Node(k, np.zeros(3), code, -1, 0.0), np.zeros(3), {}, {"grid_phases": phases[k]})
+    with MapStore.open(tmp_path / "whole") as store:
+        np.testing.assert_array_equal(store.grid_phases(), phases)
+    with MapStore.create(tmp_path / "empty", "{}", Rig(), "x") as store:
+        assert store.grid_phases().shape == (0, 0, 2)
+    with MapStore.create(tmp_path / "other", "{}", Rig(), "x") as store:
+        store.add_node(0, Node(0, np.zeros(3), code, -1, 0.0), np.zeros(3), {}, {"phases": phases[0]})
+        with pytest.raises(StoreError, match="grid phases"):
+            store.grid_phases()
+
+
 def test_report_keeps_weights_and_rejected_edges(tmp_path):
     report = SolveReport("b", SolveStatus.STALLED, "m", 3, 2.0, 1.0, 0.5, (4, 9), {4: 0.25, 9: 0.0})
     with MapStore.create(tmp_path, "{}", Rig(), "x") as store:
