@@ -274,8 +274,8 @@ class PhaseDecoder:
         """Decode phases (M, 3), cycles.
 
         Starts are tried in order until the modules agree: `last_m`; the first of `starts_m`; the position of best
-        agreement in the box around that; all of `starts_m`. If the modules never agree, the best of the box is returned,
-        with `agreed` False.
+        agreement in the box around that, and around `last_m`; all of `starts_m`. If the modules never agree, the best of
+        the first box is returned, with `agreed` False.
 
         Args:
             phases_cycles: (M, 3) phases of the sheets' first modes, as `GridModules.band_phases` gives them.
@@ -293,6 +293,9 @@ class PhaseDecoder:
         near = self._refine(phases, self._scan(phases, starts[0]))
         if near.agreed:
             return near
+        found = self._refine(phases, self._scan(phases, last_m))
+        if found.agreed:
+            return found
         far = min((self._refine(phases, start) for start in starts), key=lambda decoded: decoded.misfit_cycles)
         return far if far.agreed else near
 

@@ -8,6 +8,10 @@ import numpy as np
 
 from hybridmap import geometry
 from hybridmap.geometry import Array
+from hybridmap.simulation.motion import DriveLimits
+from hybridmap.simulation.motion import drive as simulated_drive
+from hybridmap.simulation.stream import ODOMETRY_RATE_HZ, TURN_RATE_RAD_S
+from hybridmap.simulation.worlds import build_world
 
 _ROOM_M = (10.0, 3.0)
 _MARGIN_M = 0.9
@@ -104,3 +108,22 @@ def _along(motions: Array, hz: float) -> ExactDrive:
     deltas = np.column_stack([distance * np.cos(0.5 * turn), distance * np.sin(0.5 * turn), turn])
     poses = np.column_stack([position, geometry.wrap_angle(yaw)])
     return ExactDrive(deltas, poses, np.cumsum(distance), hz)
+
+
+def office_laps(distance_m: float) -> tuple[ExactDrive, float]:
+    """Laps of the simulated office as its robot drives them, at 30 Hz; and the length of a lap along the way points, m.
+
+    Args:
+        distance_m: the drive ends with the step that reaches it.
+    """
+    world = build_world("office")
+    points = world.legs[0]
+    again = int(np.flatnonzero((points[1:] == points[0]).all(axis=1))[0]) + 1
+    lap_m = float(np.hypot(*np.diff(points[: again + 1], axis=0).T).sum())
+    laps = np.vstack([np.tile(points[:again], (int(distance_m / lap_m) + 2, 1)), points[:1]])
+    poses = simulated_drive([laps], DriveLimits(world.speed_m_s, TURN_RATE_RAD_S), 1.0 / ODOMETRY_RATE_HZ)
+    deltas = geometry.between(poses[:-1], poses[1:])
+    driven_m = np.cumsum(np.hypot(deltas[:, 0], deltas[:, 1]))
+    steps = int(np.searchsorted(driven_m, distance_m)) + 1
+    from_start = geometry.between(poses[0], poses[1 : steps + 1])
+    return ExactDrive(deltas[:steps], from_start, driven_m[:steps], ODOMETRY_RATE_HZ), lap_m

@@ -10,6 +10,7 @@ import numpy as np
 
 from hybridmap.geometry import Array
 from hybridmap.metrics import Metric
+from hybridmap.verification.laps import CLOSURE_M, LAPS_NOISE
 from hybridmap.verification.path_error import VON_MISES, PathErrors
 from hybridmap.verification.physiology import gridness, ideal_map, tuning_width, vector_length
 from hybridmap.verification.rate_maps import PlaceResult
@@ -19,6 +20,7 @@ from hybridmap.verification.verification import CellVerification
 
 PHASE_BAR_PERCENT = {"relu": 0.6, "softplus": 0.02}
 ROOM_BAR_MM, CORRIDOR_BAR_MM = 0.5, 0.1
+RECALIBRATED_BAR_M = 0.15
 _SHADOW_BAR = 1e-6
 _ONE_BUMP_BAR_PERCENT = 99.0
 _LEARNT = {"recruited": "recruited place cells", "printed": "place cells by the printed rule"}
@@ -46,6 +48,7 @@ def rows_of(result: CellVerification) -> list[Metric]:
         recurrence_rows,
         standstill_rows,
         noise_rows,
+        recalibration_rows,
         kernel_rows,
     )
     return [row for part in parts for row in part(result)]
@@ -230,6 +233,21 @@ def noise_rows(result: CellVerification) -> list[Metric]:
             f"every rate, every step; half of them between {low:.3g} and {high:.3g} m"
         )
         rows.append(_row(f"noise_{100.0 * share:g}_percent", float(curve.rms[-1]), "m", what))
+    return rows
+
+
+def recalibration_rows(result: CellVerification) -> list[Metric]:
+    """Rows on recalibration: where in the map noisy cells show the robot on laps of the office, with closures and without."""
+    percent, rows = 100.0 * LAPS_NOISE, []
+    for name, laps, how, bar in (
+        ("recalibrated", result.recalibrated, f"a closure every {CLOSURE_M:g} m", RECALIBRATED_BAR_M),
+        ("not_recalibrated", result.alone, "no closures", None),
+    ):
+        what = (
+            f"largest error of the place in the map that the cells show, from the second lap on, over "
+            f"{laps.distance_m[-1]:.0f} m of laps of {laps.lap_m:.0f} m with {percent:g} % noise and {how}"
+        )
+        rows.append(_row(f"{name}_{percent:g}_percent", float(laps.error_m.max()), "m", what, bar))
     return rows
 
 

@@ -16,7 +16,8 @@ from hybridmap.config.mapping import NeuralConfig
 from hybridmap.errors import ConfigError
 from hybridmap.neural import PathIntegrator
 from hybridmap.study.pools import one_thread_for_children
-from hybridmap.verification import path_error, rate_maps, shadow
+from hybridmap.verification import laps, path_error, rate_maps, shadow
+from hybridmap.verification.laps import LapErrors
 from hybridmap.verification.path_error import HeadDirectionResult, PathErrors, StandstillResult
 from hybridmap.verification.rate_maps import LatticeMaps, PlaceResult
 from hybridmap.verification.shadow import Overwriting
@@ -39,6 +40,7 @@ class Scale:
         place_pitch_m, place_cells, place_epochs: pixel of the place cells' maps; cells and passes of the paper's rule.
         noise: standard deviations of the neuron noise, as a share of the rate; `noise_repeats` drives of `noise_distance_m`
             for each.
+        laps_m, laps_alone_m: length of the drive in laps of the office with noisy neurons, with closures and without.
         workers: number of processes; None: one per core.
     """
 
@@ -57,6 +59,8 @@ class Scale:
     noise: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1)
     noise_repeats: int = 12
     noise_distance_m: float = 40.0
+    laps_m: float = 1000.0
+    laps_alone_m: float = 400.0
     workers: int | None = None
 
 
@@ -73,6 +77,7 @@ class CellVerification:
         corridor: rectifier -> errors of the drive down the corridor.
         overwritten: rectifier -> response of the pose to a shift of the cells' activity.
         noise: standard deviation of the neuron noise -> errors of every drive with it.
+        recalibrated, alone: laps of the office with noisy neurons, with closures and without.
         printed_kernel: error message for the paper's printed kernel; empty if it is stable.
     """
 
@@ -81,6 +86,8 @@ class CellVerification:
     lattice: LatticeMaps
     square: LatticeMaps
     place: PlaceResult
+    recalibrated: LapErrors
+    alone: LapErrors
     room: dict[tuple[str, float], list[PathErrors]] = field(default_factory=dict)
     corridor: dict[str, PathErrors] = field(default_factory=dict)
     overwritten: dict[str, Overwriting] = field(default_factory=dict)
@@ -122,8 +129,10 @@ def _tasks(seed: np.random.SeedSequence, scale: Scale, settings: dict[str, objec
     """Every experiment by name, the longest first; each has a seed of its own."""
     paths, others, noises = seed.spawn(3)
     path_seeds = paths.spawn(scale.paths)
-    still, turns, lattice, square, place, corridor, overwritten = others.spawn(7)
+    still, turns, lattice, square, place, corridor, overwritten, lapped = others.spawn(8)
     tasks: dict[tuple[Any, ...], Task] = {}
+    tasks["recalibrated",] = laps.office_errors, (lapped, settings, scale.laps_m, True)
+    tasks["alone",] = laps.office_errors, (lapped, settings, scale.laps_alone_m, False)
     for hz in reversed(RATES_HZ):
         for f in reversed(RECTIFIERS):
             for k, path_seed in enumerate(path_seeds):

@@ -244,3 +244,14 @@ def test_the_same_input_gives_the_same_bytes():
         return integrator.pose.tobytes() + integrator.place_code.tobytes() + integrator.place.weights.tobytes()
 
     assert run() == run()
+
+
+def test_a_bump_that_went_astray_does_not_lose_the_position():
+    integrator = PathIntegrator(NeuralConfig())
+    exact = np.zeros(3)
+    for _ in range(100):
+        integrator.attractor.step(np.array([0.05, -0.03]))
+        integrator.step((0.05, 0.0, 0.01), 0.1)
+        exact = geometry.compose(exact, np.array([0.05, 0.0, 0.01]))
+    assert integrator.decode().agreed
+    assert integrator.pose == pytest.approx(exact, abs=1e-3)

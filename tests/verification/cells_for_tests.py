@@ -18,5 +18,7 @@ TINY = Scale(
     noise=(0.01, 0.1),
     noise_repeats=1,
     noise_distance_m=6.0,
+    laps_m=72.0,
+    laps_alone_m=72.0,
     workers=1,
 )

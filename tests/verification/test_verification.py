@@ -27,7 +27,7 @@ def test_every_row_of_the_table_is_there(rows):
         "phase_error_softplus_100hz",
         "position_room_relu", "position_room_softplus", "position_corridor_relu", "position_corridor_softplus",
         "no_shadow_integrator", "no_shadow_driving_on", "place_single_recruited", "attractor_one_bump_recruited_settled",
-        "attractor_one_bump_printed_settled", "standing_still", "printed_kernel_refused",
+        "attractor_one_bump_printed_settled", "standing_still", "printed_kernel_refused", "recalibrated_5_percent",
     }  # fmt: skip
     assert {"gridness_ideal", "gridness_square", "place_single_printed", "noise_1_percent", "turn_rate_modulation"} <= set(rows)
 
@@ -42,6 +42,11 @@ def test_a_square_metric_scores_below_the_hexagonal_one(rows):
 
 def test_more_noise_is_more_error(rows):
     assert 0.0 < rows["noise_1_percent"].value < rows["noise_10_percent"].value
+
+
+def test_closures_bound_what_noise_costs(rows):
+    assert rows["recalibrated_5_percent"].value < 0.1
+    assert rows["not_recalibrated_5_percent"].value > 10.0 * rows["recalibrated_5_percent"].value
 
 
 def test_recurrence_is_stated_whichever_way_it_comes_out(result):

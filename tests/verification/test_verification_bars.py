@@ -68,6 +68,7 @@ BREAKS = {
     "attractor_one_bump_recruited_settled": lambda r: with_bumps(r, "recruited"),
     "attractor_one_bump_printed_settled": lambda r: with_bumps(r, "printed"),
     "standing_still": lambda r: with_part(r, "standstill", pose_change=1e-15),
+    "recalibrated_5_percent": lambda r: with_part(r, "recalibrated", error_m=worst(r.recalibrated.error_m, 0.151)),
     "printed_kernel_refused": lambda r: dataclasses.replace(r, printed_kernel=""),
 }
 
