@@ -278,20 +278,29 @@ class Mapper:
 
     def _close_loops(self, node: int) -> list[int]:
         assert self.vision is not None
+        lost_since = self.lost_since
         with self.clock.stage("matching"):
             proposals = self.vision.close(node, self.belief())
         edges = self.book.enter(proposals)
         if closed := [proposal for proposal in proposals if proposal.status is Status.ACCEPTED]:
-            self._recalibrate(max(closed, key=lambda proposal: proposal.source))
+            found = lost_since is not None and self.lost_since is None
+            self._recalibrate(max(closed, key=lambda proposal: proposal.source), lost_since if found else None)
         return edges
 
-    def _recalibrate(self, matched: Edge) -> None:
-        """Re-anchor the cells at the matched node (paper eq. 16), and attach the robot to it if so configured (OpenRatSLAM)."""
+    def _recalibrate(self, matched: Edge, lost_since: int | None) -> None:
+        """Re-anchor the cells at the matched node (paper eq. 16), and attach the robot to it if so configured (OpenRatSLAM).
+
+        If the robot was lost since a node and is found now, the nodes since then are re-anchored with it.
+        """
         assert matched.relative is not None
         pose_odom_matched = compose(self.map.node(matched.source).pose_odom, matched.relative.delta)
-        self.cells.recalibrate(matched.target, between(pose_odom_matched, self.cells.pose_odom_robot))
+        robot = self.cells.pose_odom_robot
+        self.cells.recalibrate(matched.target, between(pose_odom_matched, robot))
         if matched.source == len(self.map) - 1:
             self.cells.remember(matched.source)
+        if lost_since is not None:
+            nodes = range(lost_since, len(self.map))
+            self.cells.put_back({node: between(robot, self.map.node(node).pose_odom) for node in nodes})
         if self.config.edges.hanging == "ratslam":
             self._position.attach(matched.target, pose_odom_matched)
 

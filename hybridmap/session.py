@@ -133,6 +133,7 @@ class _Recorder:
         self._mapper = mapper
         self._before_first_node: list[Update] = []
         self._gain_changes = 0
+        self._put_back = 0
         self._last_stamp_ns = -1
         self._poses = np.zeros((0, 3))
 
@@ -140,6 +141,7 @@ class _Recorder:
         """Take in one update."""
         if update.new_node is not None:
             self._write_node(update.new_node)
+            self._write_put_back()
             self._write_gain_changes()
         for number in update.edges:
             self.store.put_edge(number, self._mapper.map.edge(number))
@@ -174,6 +176,13 @@ class _Recorder:
         keyframe = mapper.vision.keyframe(number) if mapper.vision is not None else {}
         initial = mapper.map.initial[number]
         self.store.add_node(number, mapper.map.node(number), initial, keyframe, mapper.cells.activity_at(number))
+
+    def _write_put_back(self) -> None:
+        """Write the cells' state again at nodes that were made while the robot was lost, once it is found."""
+        cells = self._mapper.cells
+        for number in cells.put_back_nodes[self._put_back :]:
+            self.store.put_snapshot(number, cells.activity_at(number))
+        self._put_back = len(cells.put_back_nodes)
 
     def _write_gain_changes(self) -> None:
         changes = self._mapper.calibration.changes

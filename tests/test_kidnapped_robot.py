@@ -10,10 +10,65 @@ from hybridmap.evaluate import evaluate_session
 from hybridmap.geometry import align, between, compose
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.gaps import kidnappings
+from hybridmap.mapper import Mapper
+from hybridmap.neural.vector import GridVectors
 from hybridmap.session import run
 from hybridmap.simulation import SimulatedStream
 from hybridmap.store import MapStore
 from tests.narrowing import known
+
+CARRIED = {
+    "simulation.world": "lab", "simulation.carried_m": 4.0, "backends.names": ["gtsam-isam2"], "neural.reanchor_weight": 1.0,
+}  # fmt: skip
+
+
+def test_the_map_file_has_the_codes_that_were_put_back(tmp_path):
+    """The vectors of the grid code lead from nodes before the kidnapping to those made while the robot was lost."""
+    config = Config.load("laser", CARRIED)
+    stream = SimulatedStream(config.simulation, 1)
+    done = run(stream, config, tmp_path / "s")
+    with MapStore.open(done.folder.path) as store:
+        phases, nodes = store.grid_phases(), store.map().nodes
+    stamps = np.array([node.stamp_ns for node in nodes])
+    truth = stream.groundtruth.at(stamps)
+    down = int(np.searchsorted(stamps, stream.groundtruth.stamps_ns[known(stream.carry).last]))
+    vectors = GridVectors(config.neural)
+    for node in range(down, down + 5):
+        vector = vectors.between(phases[0], phases[node])
+        true_m = between(truth[0], truth[node])[:2]  # the cells start at the first node, along the robot
+        assert vector.agreed
+        assert np.hypot(*(vector.displacement_m - true_m)) < 0.5
+
+
+def test_its_cells_take_up_the_code_of_the_place_that_is_recognised():
+    """The network goes on from there, and so do the codes of the nodes that were made while the robot was lost."""
+    config = Config.load("laser", CARRIED)
+    stream = SimulatedStream(config.simulation, 1)
+    mapper, carry = Mapper(config, stream.rig), known(stream.carry)
+    down_ns, lost, found_ns = int(stream.groundtruth.stamps_ns[carry.last]), -1, np.inf
+    for sample in stream:
+        for update in mapper.add(sample):
+            was_lost = lost >= 0 and mapper.lost_since is None
+            found_ns = min(found_ns, update.stamp_ns) if was_lost else found_ns
+            lost = known(mapper.lost_since) if lost < 0 and mapper.lost_since is not None else lost
+            if was_lost and update.stamp_ns == found_ns:
+                shown, odom = mapper.integrator.pose, update.pose_odom_robot
+        if sample.stamp_ns > found_ns + 3 * 10**9:
+            break
+    stamps = np.array([node.stamp_ns for node in mapper.map.nodes])
+    truth, cells = stream.groundtruth.at(stamps), mapper.cells.poses_of_nodes
+    assert stamps[lost - 1] < down_ns <= stamps[lost + 1]
+    found = int(np.searchsorted(stamps, found_ns))
+    assert found > lost + 4
+    off = between(between(truth[0], truth), between(cells[0], cells))
+    off_m = np.hypot(off[:, 0], off[:, 1])
+    assert off_m[lost:].max() < off_m[:lost].max() + 0.1 < 0.5  # no farther than it ever was: the drift of the wheels
+    near = int(np.argmin(np.hypot(*(truth[:lost] - truth[found])[:, :2].T)))
+    seen = between(between(truth[near], truth[found]), between(cells[near], cells[found]))
+    assert np.hypot(seen[0], seen[1]) < 0.1
+    assert mapper.cells.put_back_nodes == list(range(lost, found + 1))
+    goes_on = between(between(odom, mapper.cells.pose_odom_robot), between(shown, mapper.integrator.pose))
+    assert goes_on == pytest.approx(np.zeros(3), abs=1e-3)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -323,10 +324,12 @@ class Reanchoring:
 
     Attributes:
         weight: how far the cells are moved, 0..1; 0 leaves them alone.
+        put_back_nodes: numbers of the nodes whose activity was stored anew by `put_back`, in that order.
     """
 
     def __init__(self, integrator: PathIntegrator, weight: float) -> None:
         self.weight = weight
+        self.put_back_nodes: list[int] = []
         self._integrator = integrator
         self._pose_odom_cells: Array | None = None
         self._activity_at_node: dict[int, Snapshot] = {}
@@ -344,11 +347,11 @@ class Reanchoring:
         return pose if self._pose_odom_cells is None else compose(self._pose_odom_cells, pose)
 
     def remember(self, node: int) -> None:
-        """Store the cells' activity as that of the newest node; with weight 0 that of the node before is forgotten."""
+        """Store the cells' activity as that of a node, the newest or an earlier one; with weight 0 all others are forgotten."""
         if self.weight == 0.0:
             self._activity_at_node.clear()
         self._activity_at_node[node] = self._integrator.snapshot()
-        self._poses_of_nodes[node:] = [self._integrator.pose]
+        self._poses_of_nodes[node : node + 1] = [self._integrator.pose]
 
     def activity_at(self, node: int) -> Snapshot:
         """The stored activity of a node; with weight 0, the default, known for the newest node only.
@@ -373,3 +376,20 @@ class Reanchoring:
         before = self.pose_odom_robot
         self._integrator.restore(self._activity_at_node[node], self.weight, delta_node_robot)
         self._pose_odom_cells = compose(before, inverse(self._integrator.pose))
+
+    def put_back(self, deltas_robot_node: Mapping[int, Array]) -> None:
+        """Store anew the activity of nodes that were made while the robot was lost, now that a closure said where it is.
+
+        The cells show each of them from where the robot is, and then the robot again. With weight 0 nothing changes.
+
+        Args:
+            deltas_robot_node: number of a node -> its pose (3,) in the frame of the robot, m and rad.
+        """
+        if self.weight == 0.0 or not deltas_robot_node:
+            return
+        here = self._integrator.snapshot()
+        for node, delta in deltas_robot_node.items():
+            self._integrator.restore(here, 1.0, delta)
+            self.remember(node)
+        self._integrator.restore(here)
+        self.put_back_nodes += deltas_robot_node

@@ -22,7 +22,7 @@ from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.store import schema
 from hybridmap.store.track import Track
 from hybridmap.streams.base import Rig
-from hybridmap.trajectory import FARTHEST_M, NO_ANCHORS, Anchors, Trajectory
+from hybridmap.trajectory import NO_ANCHORS, Anchors, Trajectory
 
 _KEYFRAME, _SNAPSHOT, _CODE = "keyframe", "snapshot", "code"
 _DAMAGE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError, GeometryError, GraphError)
@@ -137,10 +137,11 @@ class MapStore:
         )
         self._write(f"INSERT INTO nodes VALUES ({_marks(len(row))})", row)
         for part, arrays in ((_CODE, {"place": node.place_code}), (_KEYFRAME, keyframe), (_SNAPSHOT, snapshot)):
-            for name, array in arrays.items():
-                packed = schema.pack(np.asarray(array))
-                fields = (number, part, name, packed.dtype, packed.shape, packed.codec, packed.data)
-                self._write("INSERT INTO arrays VALUES (?, ?, ?, ?, ?, ?, ?)", fields)
+            self._put_arrays(number, part, arrays)
+
+    def put_snapshot(self, number: int, snapshot: Mapping[str, NDArray[Any]]) -> None:
+        """Write the state of the path integrator at a node again, over that which `add_node` wrote."""
+        self._put_arrays(number, _SNAPSHOT, snapshot)
 
     def put_edge(self, number: int, edge: Edge) -> None:
         """Write an edge, whatever its status; replaces what was written under the same number (from 0, without gaps)."""
@@ -303,7 +304,7 @@ class MapStore:
     def track(self) -> Track:
         """Where the robot was at each stamp, seen from nodes, and the frames registered to the final map; it may be empty."""
         rows = self._rows("SELECT * FROM track ORDER BY stamp_ns")
-        values = _near(np.array([row[2:] for row in rows], dtype=np.float64).reshape(-1, 6))
+        values = schema.near(np.array([row[2:] for row in rows], dtype=np.float64).reshape(-1, 6))
         ends = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2)
         return Track(ends[:, 0].copy(), ends[:, 1].copy(), values[:, :3].copy(), values[:, 3:].copy(), self._anchors())
 
@@ -311,7 +312,7 @@ class MapStore:
         if not self._rows("SELECT name FROM sqlite_master WHERE name = 'anchors'"):
             return NO_ANCHORS
         rows = self._rows("SELECT * FROM anchors ORDER BY stamp_ns")
-        values = _near(np.array([row[3:] for row in rows], dtype=np.float64).reshape(-1, 6))
+        values = schema.near(np.array([row[3:] for row in rows], dtype=np.float64).reshape(-1, 6))
         ends = np.array([row[:3] for row in rows], dtype=np.int64).reshape(-1, 3)
         stamps, nodes, after = ends.T.copy()
         return Anchors(stamps, nodes, after, values[:, :3].copy(), values[:, 3:].copy())
@@ -321,7 +322,7 @@ class MapStore:
         """The poses that a back-end gave while driving; an empty trajectory if it gave none."""
         rows = self._rows("SELECT stamp_ns, x_m, y_m, yaw_rad FROM online WHERE backend = ? ORDER BY stamp_ns", (backend,))
         stamps = np.array([row[0] for row in rows], dtype=np.int64)
-        return Trajectory(stamps, _near(np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 3)))
+        return Trajectory(stamps, schema.near(np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 3)))
 
     @_reading
     def online_backends(self) -> list[str]:
@@ -337,7 +338,7 @@ class MapStore:
             str(name): Solution(schema.unpack_floats(poses, 3), schema.report_from_json(report)) for name, poses, report in rows
         }
         for name, solution in found.items():
-            if len(_near(solution.poses)) != nodes:
+            if len(schema.near(solution.poses)) != nodes:
                 raise ValueError(f"{name} has {len(solution.poses)} poses, expected one for each of {nodes} nodes")
         return found
 
@@ -346,6 +347,12 @@ class MapStore:
     def _write(self, statement: str, row: tuple[Any, ...]) -> None:
         with self._named_errors("write"):
             self._connection.execute(statement, row)
+
+    def _put_arrays(self, number: int, part: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+        for name, array in arrays.items():
+            packed = schema.pack(np.asarray(array))
+            fields = (number, part, name, packed.dtype, packed.shape, packed.codec, packed.data)
+            self._write(f"INSERT OR REPLACE INTO arrays VALUES ({_marks(len(fields))})", fields)
 
     def _rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         with self._named_errors("read"):
@@ -382,18 +389,7 @@ def _floats(values: Array) -> tuple[float, ...]:
 
 def _pose(values: tuple[Any, ...]) -> Array:
     """A pose (3,) from its columns."""
-    return _near(np.array(values, dtype=np.float64))
-
-
-def _near(values: Array) -> Array:
-    """The numbers, if they are poses.
-
-    Raises:
-        ValueError: one is not finite, or too large for a pose in metres.
-    """
-    if not (np.abs(values) <= FARTHEST_M).all():
-        raise ValueError(f"a pose with NaN, Inf or a number beyond {FARTHEST_M:g}")
-    return values
+    return schema.near(np.array(values, dtype=np.float64))
 
 
 def _marks(count: int) -> str:

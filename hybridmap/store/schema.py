@@ -22,6 +22,7 @@ from hybridmap.graph.edges import Check, Edge, Lack, Method, Need, Search
 from hybridmap.streams.base import Rig
 from hybridmap.streams.cameras import decode_picture
 from hybridmap.streams.sensors import kinds
+from hybridmap.trajectory import FARTHEST_M
 
 VERSION = 3
 """Raised whenever the tables change."""
@@ -212,6 +213,17 @@ def unpack_floats(data: bytes, columns: int) -> NDArray[np.float64]:
         ValueError: the bytes are no whole rows.
     """
     return np.frombuffer(data, "<f8").astype(np.float64).reshape(-1, columns)
+
+
+def near(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The numbers of any shape, if they are poses.
+
+    Raises:
+        ValueError: one is not finite, or too large for a pose in metres.
+    """
+    if not (np.abs(values) <= FARTHEST_M).all():
+        raise ValueError(f"a pose with NaN, Inf or a number beyond {FARTHEST_M:g}")
+    return values
 
 
 def covariance_from_bytes(data: bytes) -> NDArray[np.float64]:

@@ -130,3 +130,34 @@ def test_without_a_weight_the_poses_of_all_nodes_are_kept():
         shown.append(integrator.pose)
         away(integrator)
     assert cells.poses_of_nodes == pytest.approx(np.array(shown))
+
+
+@pytest.mark.parametrize("weight", [1.0, 0.5])
+def test_nodes_made_while_lost_are_put_back_with_the_robot(weight):
+    integrator = PathIntegrator(SOFTPLUS)
+    cells = Reanchoring(integrator, weight)
+    odom = []
+    for node in range(4):
+        cells.remember(node)
+        odom.append(cells.pose_odom_robot)
+        away(integrator)
+    robot, stays = cells.pose_odom_robot, cells.poses_of_nodes[:2]
+    cells.recalibrate(0, np.array([0.1, 0.0, 0.2]))
+    shown = integrator.pose
+    cells.put_back({node: between(robot, odom[node]) for node in (2, 3)})
+    assert integrator.pose == pytest.approx(shown, abs=1e-6)
+    assert cells.pose_odom_robot == pytest.approx(robot, abs=1e-6)
+    assert cells.poses_of_nodes[:2] == pytest.approx(stays)
+    for node in (2, 3):
+        seen, was = between(shown, cells.poses_of_nodes[node]), between(robot, odom[node])
+        assert between(was, seen) == pytest.approx(np.zeros(3), abs=1e-4)
+        assert cells.activity_at(node)["near_m"] == pytest.approx(cells.poses_of_nodes[node, :2], abs=1e-6)
+
+
+def test_without_a_weight_nothing_is_put_back():
+    integrator = PathIntegrator(SOFTPLUS)
+    cells = Reanchoring(integrator, 0.0)
+    cells.remember(0)
+    before = cells.poses_of_nodes
+    cells.put_back({0: np.array([1.0, 0.0, 0.0])})
+    assert np.array_equal(cells.poses_of_nodes, before)

@@ -64,6 +64,9 @@ def test_grid_phases_of_all_nodes_come_back_in_order(tmp_path):
     with MapStore.create(tmp_path / "whole", "{}", Rig(), "x") as store:
         for k in range(12):
             store.add_node(k, Node(k, np.zeros(3), code, -1, 0.0), np.zeros(3), {}, {"grid_phases": phases[k]})
+        phases[4:6] += 0.25
+        for k in (4, 5):
+            store.put_snapshot(k, {"grid_phases": phases[k]})
     with MapStore.open(tmp_path / "whole") as store:
         np.testing.assert_array_equal(store.grid_phases(), phases)
     with MapStore.create(tmp_path / "empty", "{}", Rig(), "x") as store:
