@@ -296,8 +296,9 @@ class Mapper:
         pose_odom_matched = compose(self.map.node(matched.source).pose_odom, matched.relative.delta)
         robot = self.cells.pose_odom_robot
         self.cells.recalibrate(matched.target, between(pose_odom_matched, robot))
-        if matched.source == len(self.map) - 1:
-            self.cells.remember(matched.source)
+        self.cells.remember(len(self.map) - 1)
+        if self.cells.weight > 0.0:
+            self._novelty.recalibrate(self.integrator.place_code)
         if lost_since is not None:
             nodes = range(lost_since, len(self.map))
             self.cells.put_back({node: between(robot, self.map.node(node).pose_odom) for node in nodes})

@@ -131,6 +131,18 @@ def test_reanchoring_brings_old_place_codes_back_and_leaves_odometry_alone():
     assert poses[1.0] == pytest.approx(poses[0.0], abs=5e-3)
 
 
+def test_a_closure_that_recalibrates_makes_no_node_by_its_jump():
+    """The drive moves by 0.12 m a scan, too little for a node of its own."""
+    stream = RoomDrive(laps=4)
+    settings = {"neural.reanchor_weight": 1.0, "nodes.rule": "passage", "nodes.place_threshold": 0.267}
+    mapper = Mapper(Config.load("laser", settings), stream.rig)
+    drive(mapper, stream)
+    poses = np.array([node.pose_odom for node in mapper.map.nodes])
+    steps = between(poses[:-1], poses[1:])
+    straight = np.abs(steps[:, 2]) < np.radians(15.0)
+    assert np.hypot(*steps[straight, :2].T).min() > 0.2
+
+
 def test_nan_odometry_is_refused_with_its_stamp():
     stream = RoomDrive(laps=1, nan_at=7)
     mapper = Mapper(Config.load("laser"), stream.rig)

@@ -203,11 +203,12 @@ def _invert(covariance: Array) -> Array:
 
 
 class Novelty:
-    """Decides when a new node is made. It changes only by `remember`, to be called for every node."""
+    """Decides when a new node is made. It changes only by `remember`, to be called for every node, and by `recalibrate`."""
 
     def __init__(self, config: NodesConfig) -> None:
         self._config = config
         self._codes: NDArray[Any] = np.zeros((0, 0), dtype=np.float32)
+        self._newest: NDArray[np.float32] = np.zeros(0, dtype=np.float32)
         self._count = 0
 
     def reason(self, delta_node_robot: Array, place_code: Callable[[], NDArray[np.float32]], new_template: bool) -> str | None:
@@ -246,13 +247,21 @@ class Novelty:
                 grown[: self._count] = self._codes
             self._codes = grown
         norm = float(np.linalg.norm(place_code))
-        self._codes[self._count] = place_code / norm if norm > 0 else place_code
+        self._codes[self._count] = self._newest = place_code / norm if norm > 0 else place_code
         self._count += 1
+
+    def recalibrate(self, place_code: NDArray[np.float32]) -> None:
+        """Take the place code (P,) that the cells show at the newest node since they were re-anchored there.
+
+        The rule `passage` compares with it, so that the jump of the cells is not taken for motion.
+        """
+        norm = float(np.linalg.norm(place_code))
+        self._newest = place_code / norm if norm > 0 else place_code
 
     def _passed(self, delta: Array, place_code: NDArray[np.float32]) -> str | None:
         """Cells of place and of head direction together: their populations' cosines multiply."""
-        newest, norm = self._codes[self._count - 1], float(np.linalg.norm(place_code))
-        distance = 1.0 - float(newest @ place_code) / max(norm, 1e-12) * float(np.cos(delta[2]))
+        norm = float(np.linalg.norm(place_code))
+        distance = 1.0 - float(self._newest @ place_code) / max(norm, 1e-12) * float(np.cos(delta[2]))
         return f"place code differs by {distance:.2f}" if distance >= self._config.place_threshold else None
 
     def _travelled(self, delta: Array) -> str | None:

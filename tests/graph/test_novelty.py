@@ -57,6 +57,18 @@ def test_passage_rule_multiplies_the_likeness_of_place_and_of_heading(sign):
         assert novelty.reason(np.array([0.0, 0.0, sign * (limit + 0.01)]), same, False) is not None
 
 
+def test_a_jump_of_the_cells_at_a_closure_is_no_passage():
+    novelty = Novelty(NodesConfig(rule="passage", place_threshold=0.3))
+    novelty.remember(HERE)
+    assert novelty.reason(np.zeros(3), lambda: ELSEWHERE, False) is not None
+    novelty.recalibrate(ELSEWHERE)
+    assert novelty.reason(np.zeros(3), lambda: ELSEWHERE, False) is None
+    assert novelty.reason(np.zeros(3), lambda: HERE, False) is not None
+    assert novelty.distance(HERE) == 0.0
+    novelty.remember(HERE)
+    assert novelty.reason(np.zeros(3), lambda: HERE, False) is None
+
+
 def test_odometry_covariance_agrees_with_a_random_walk():
     config = EdgesConfig(
         translation_floor_m=1e-4, rotation_floor_deg=1e-3, translation_per_sqrt_m=0.02, rotation_deg_per_sqrt_m=2.0,
