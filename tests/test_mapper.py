@@ -143,6 +143,17 @@ def test_a_closure_that_recalibrates_makes_no_node_by_its_jump():
     assert np.hypot(*steps[straight, :2].T).min() > 0.2
 
 
+def test_the_place_cells_matter_where_nodes_are_made_by_place():
+    hashes = set()
+    for share in (0.0, 0.2):
+        stream = RoomDrive(laps=2.2)
+        settings = {"nodes.rule": "passage", "nodes.place_threshold": 0.267, "neural.place.attractor_input": share}
+        mapper = Mapper(Config.load("laser", settings), stream.rig)
+        drive(mapper, stream)
+        hashes.add(graph_hash(mapper.map))
+    assert len(hashes) == 2
+
+
 def test_nan_odometry_is_refused_with_its_stamp():
     stream = RoomDrive(laps=1, nan_at=7)
     mapper = Mapper(Config.load("laser"), stream.rig)

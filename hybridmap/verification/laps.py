@@ -13,10 +13,10 @@ from hybridmap.neural import PathIntegrator
 from hybridmap.neural.path_integrator import Reanchoring
 from hybridmap.verification.drives import ExactDrive, office_laps
 
-NODE_M = 0.5
-"""A node every so many metres of the first lap."""
-CLOSURE_M = 1.0
-"""From the second lap on, a closure every so many metres: half as many as there are nodes."""
+NODE_M = 0.25
+"""A node every so many metres of the first lap, as the configuration `bionic` makes them."""
+CLOSURE_M = 0.75
+"""From the second lap on, a closure every so many metres: as often as `bionic` closes loops on its second lap of the office."""
 LAPS_NOISE = 0.05
 """Neuron noise of the laps, as a share of every rate."""
 BESIDE = 3
@@ -27,7 +27,7 @@ _METRES_A_RADIAN = 1.0
 
 @dataclass(frozen=True, slots=True)
 class LapErrors:
-    """Where the cells showed the robot in the map, from the second lap on, every half metre.
+    """Where the cells showed the robot in the map, from the second lap on, every 0.25 m.
 
     Attributes:
         distance_m: (S,) distance driven.
