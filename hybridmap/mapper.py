@@ -234,7 +234,12 @@ class Mapper:
                 self.anchors = self.vision.dense_trajectory(replace(self.belief(), poses_map_node=self.poses()))
 
     def _retime(self) -> list[Update]:
-        """Measure the odometry of the whole drive again if its clock was off against the views, or its gain by them."""
+        """Measure the odometry of the whole drive again if its clock was off against the views, or its gain by them.
+
+        Not where nodes hang on matched ones: their edges are no motion from node to node.
+        """
+        if self.config.edges.hanging != "chain":
+            return []
         again = self.calibration.finish(self.map, self.vision, self._position.stamp_ns, self._position.pose_odom)
         if again is None:
             return []

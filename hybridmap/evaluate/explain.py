@@ -284,14 +284,14 @@ class Explainer:
         if number == 0:
             return "first experience"
         moved = _moved(between(self._map.node(number - 1).pose_odom, self._map.node(number).pose_odom))
-        if _setting(self._settings, "nodes.rule") == "novelty":
+        if _setting(self._settings, "nodes.rule") in ("novelty", "passage"):
             return f"a new place or view, {format_motion(*moved)} since node {number - 1}"
         return f"{format_motion(*moved)} since node {number - 1}; {self._node_rule()}"
 
     def _why_no_node(self, moved: tuple[float, float]) -> str:
-        if _setting(self._settings, "nodes.rule") == "novelty":
-            least = _setting(self._settings, "nodes.place_threshold")
-            return f"neither a new view template nor a place code {least} from every node's (nodes.place_threshold)"
+        if (rule := _setting(self._settings, "nodes.rule")) in ("novelty", "passage"):
+            least, whose = _setting(self._settings, "nodes.place_threshold"), "every" if rule == "novelty" else "the newest"
+            return f"neither a new view template nor a place code {least} from {whose} node's (nodes.place_threshold)"
         limits = [_setting(self._settings, f"nodes.{name}") for name in ("distance_m", "angle_deg")]
         due = any(value >= limit for value, limit in zip(moved, limits, strict=True) if isinstance(limit, int | float))
         why = f"no view at this instant, though {format_motion(*moved)}" if due else f"only {format_motion(*moved)}"

@@ -20,7 +20,7 @@ INHIBITION = 0.6
 BLOCK_M = 0.5
 """Cells are looked up by blocks of this side, m: those of the block of a position and of the eight around it can fire there."""
 MAX_CELLS = 32768
-"""No more place cells than this are recruited: with their weights some 16 MB, and as many learning steps."""
+"""No more place cells than this are recruited: with their weights some 16 MB, with those onto the attractor 134 MB more."""
 
 log = logging.getLogger(__name__)
 
@@ -59,8 +59,8 @@ class PlaceCells:
         Args:
             sheets: (M, N, N) rates of the grid cells.
             near_m: (2,) about where the robot is, m: only cells recruited around there are asked (`around`), as the field of
-                any other lies elsewhere, so that a step costs the same however many there are. None: all are asked. Side
-                peaks of the others, weaker than what recruits, are left out.
+                any other lies elsewhere: of the cost of a step only that of a list of rates grows with all cells. None: all
+                are asked. Side peaks of the others, weaker than what recruits, are left out.
 
         Returns:
             The rates (cells,) of all cells at this position; for a newly recruited cell, its rate after recruiting.

@@ -90,8 +90,13 @@ class Summary:
 
     @property
     def verdict(self) -> str:
-        """`lower` or `higher` than the baseline if the test says so at the confidence of the intervals; else empty."""
-        if self.difference is None or not self.p < 1.0 - self.difference.confidence or not self.difference.value:
+        """`lower` or `higher` than the baseline if the test says so at the confidence of the intervals; else empty.
+
+        Also empty for a back-end that gave no map at all: its figures are odometry's.
+        """
+        if self.lost == self.cells or self.difference is None or not self.p < 1.0 - self.difference.confidence:
+            return ""
+        if not self.difference.value:
             return ""
         return "lower" if self.difference.value < 0.0 else "higher"
 
@@ -147,7 +152,7 @@ def signed_rank(differences: Array) -> float:
         return 1.0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # few values with ties: the normal approximation is said to be rough
-        return float(wilcoxon(differences, zero_method="wilcox").pvalue)
+        return float(wilcoxon(differences[differences != 0.0]).pvalue)
 
 
 def holm(ps: Sequence[float]) -> list[float]:

@@ -153,8 +153,10 @@ def measured_theta_max(rule: LinearRule, positions: Array, scale: Array, sweeps:
         rule: the correction.
         positions: (N, 2) where to begin, m.
         scale: (N,) rate of each node per theta.
-        sweeps: of each trial.
+        sweeps: of each trial; NaN is returned where nothing is to be corrected.
     """
+    if not np.isfinite(measured_factor(rule, positions, scale, sweeps)):
+        return np.nan
     low, high = 0.0, 4.0 / float(np.max(scale * rule.degree))  # lambda_max is not below this entry of the diagonal
     while high - low > 1e-3 * high:
         middle = 0.5 * (low + high)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.geometry import Array, RelativePose, between, compose, inverse, wrap_angle
-from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, Status, at_most
+from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, Status, at_most, passed
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import MIN_AGE_S
 from hybridmap.vision.scanline.sequences import Sequences
@@ -169,7 +169,7 @@ class ScanlineCloser:
         rival = float(np.min(scores[:node][elsewhere], initial=np.inf))
         score = float(scores[older])
         checks: tuple[Check, ...] = (
-            at_most("G over the last views", score, self._threshold, "vision.matching.c_t"),
+            at_most("G over the last views", score, self._threshold, None if self._c_t is None else "vision.matching.c_t"),
             at_most("its share of the best G elsewhere", score / max(rival, 1e-9), UNLIKE),
         )
         measured = self._measure(node, older)
@@ -181,7 +181,7 @@ class ScanlineCloser:
             EdgeKind.LOOP,
             RelativePose(measured.delta, covariance),
             checks,
-            Lack.WAITING,
+            Lack.WAITING if passed(checks) else None,
             method=Method.SEQUENCE,
             search=Search.GATE,
             shift=round(float(self._sequences.shifts[older])),

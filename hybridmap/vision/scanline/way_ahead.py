@@ -11,6 +11,8 @@ from hybridmap.vision.base import SeenGain
 _AHEAD_RAD = float(np.deg2rad(3.9))
 """Columns within this of straight ahead are compared: what lies beside the way comes no nearer."""
 _NEAREST_M = 0.6
+_LEAST_COS = 0.2
+"""Of a bearing: the way along the heading of what lies farther to the side is not told by its distance ahead."""
 _SPREAD_M = 0.06
 """Most median deviation of the columns, m: more, and they show surfaces at several depths or something that moved."""
 _STRAIGHT_RAD, _STEP_M = float(np.deg2rad(2.0)), 0.15
@@ -34,7 +36,9 @@ def way_ahead(
     if len(ahead) == 0:
         return None
     columns = np.interp(-(bearings_rad[ahead] + yaw_rad), -bearings_rad, np.arange(len(bearings_rad)))
-    before, after = older[ahead], newer[np.rint(columns).astype(np.int64)]
+    same = np.rint(columns).astype(np.int64)
+    along_older = np.cos(bearings_rad[ahead]) / np.maximum(np.cos(bearings_rad[same]), _LEAST_COS)
+    before, after = older[ahead], newer[same] * along_older
     usable = (before > _NEAREST_M) & (before < reach_m) & (after > _NEAREST_M) & (after < reach_m)
     if 2 * np.count_nonzero(usable) < len(ahead):
         return None

@@ -29,9 +29,17 @@ def test_columns_are_compared_by_direction_where_the_robot_turned():
     """A slanted wall: only the same directions tell."""
     slanted = 2.5 + 0.8 * BEARINGS
     turned = np.deg2rad(10.0)
-    newer = np.interp(-(BEARINGS - turned), -BEARINGS, slanted) - 0.3
+    ahead_of_older = np.interp(-(BEARINGS - turned), -BEARINGS, slanted) - 0.3
+    newer = ahead_of_older * np.cos(BEARINGS) / np.cos(BEARINGS - turned)
     assert way(slanted, newer, turned) == pytest.approx(0.3, abs=0.01)
     assert way(slanted, newer, 0.0) != pytest.approx(0.3, abs=0.1)
+
+
+@pytest.mark.parametrize("turned_deg", [-15.0, 5.0, 10.0, 20.0])
+def test_a_robot_that_only_turned_came_no_way(turned_deg):
+    turned = np.deg2rad(turned_deg)
+    newer = 3.0 * np.cos(BEARINGS) / np.cos(BEARINGS - turned)
+    assert way(wall(3.0), newer, turned) == pytest.approx(0.0, abs=0.005)
 
 
 def test_what_does_not_tell_gives_nothing():
