@@ -21,9 +21,9 @@ from hybridmap.vision.relocalising import SUPPORT, GlobalMatch, Relocaliser, Whe
 
 ASKED = 12
 """Most nodes from which the whole map is searched: enough for `SUPPORT` of them where some see too little."""
-DISPUTED = 0.1
-"""Share of the loops without weight from which on they contradict each other: then the robot was not carried to a place that
-looks alike, whose loops agree, but to where its true loops and the chain dispute."""
+DISPUTED, FAR_M = 0.1, 5.0
+"""Share of the loops without weight from which on loops and chain dispute, and a distance, m: a carry over less explains the
+dispute by itself, and where it was the second look finds."""
 MOST = 4
 """Most searches of one drive; each of them may find a carry."""
 
@@ -83,7 +83,7 @@ class SecondOpinion:
 
         Args:
             edges: of the map.
-            rejected: numbers of the loops to which the back-end gives no weight; if many, there is no second opinion.
+            rejected: numbers of the loops to which the back-end gives no weight; if they are many, a near place is not taken.
             belief: the map.
 
         Returns:
@@ -92,8 +92,6 @@ class SecondOpinion:
         """
         accepted = [e for e in edges if e.status is Status.ACCEPTED and e.key >= 0 and e.kidnapped_m is None]
         loops = [edge for edge in accepted if edge.kind is EdgeKind.LOOP and np.isfinite(self._witness.misfit(edge))]
-        if len(rejected) > DISPUTED * len(loops):
-            return []
         steps = [edge for edge in accepted if edge.kind is EdgeKind.REGISTRATION]
         since = worse_since(loops, steps, self._witness) if self._left > 0 else None
         if since is None:
@@ -107,7 +105,11 @@ class SecondOpinion:
         sigmas = contradictions(edges).sigmas
         carried_to = max(places, key=lambda node: sigmas.get(node, 0.0))
         wrong = _contradicted(accepted, carried_to, belief.travel_m, self._witness.reach_m)
-        corrected = [*wrong, *matches, *relocaliser.reattach(carried_to, matches, belief)]
+        across = relocaliser.reattach(carried_to, matches, belief)
+        near = any(edge.kidnapped_m is not None and edge.kidnapped_m < FAR_M for edge in across)
+        if near and len(rejected) > DISPUTED * len(loops):
+            return []
+        corrected = [*wrong, *matches, *across]
         self._witness.corrected(corrected)
         return corrected
 
