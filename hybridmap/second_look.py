@@ -46,6 +46,8 @@ Indices = NDArray[np.int64]
 
 TRIED = 3
 """Places that are tried for each sign of a break: those where it is strongest."""
+ALONG = 5
+"""Places that are tried along the stretch of the chain that the map bends most: views lead to the node from nearby alone."""
 EQUAL = 0.5
 """A place is as good as the best one if it gains this share: which one it was, the signs say."""
 DIVISIONS = 3
@@ -81,7 +83,7 @@ class _Disputed:
         graph: the edges of the map, and the loops that were refused only because the map did not expect them.
         poses: (N, 3) the map, m and rad.
         outliers: (L,) indices of the loops that do not fit it.
-        claimed: nodes to whose steps groups of them point, and one amid the stretch of the chain that the map bends most.
+        claimed: nodes to whose steps groups of them point, and some of the stretch of the chain that the map bends most.
         asked: node -> checks of whether the robot drove there from the node before, for the steps that many of them span.
     """
 
@@ -152,8 +154,9 @@ class SecondLook:
         paying = [trial for trial in trials if trial is not None and (trial.found.pays or trial.found.straightens)]
         most = max((trial.found.gain for trial in paying), default=0.0)
         good = [trial for trial in paying if trial.found.gain >= EQUAL * most]
-        best = max(good, key=lambda trial: (len(trial.signs), trial.found.gain), default=None)
-        return None if best is None or self._drove(disputed, best) else self._divided(disputed, best)
+        good.sort(key=lambda trial: (-len(trial.signs), -trial.found.gain))
+        divided = (self._divided(disputed, trial) for trial in good if not self._drove(disputed, trial))
+        return next((trial for trial in divided if trial is not None), None)
 
     def _drove(self, disputed: _Disputed, trial: _Trial) -> bool:
         """Whether dead reckoning has the robot where the loops that a trial frees have it: then it was not carried."""
@@ -187,7 +190,7 @@ class SecondLook:
         found = rivals(graph, poses, groups, graph.is_loop & ~refused & ~outliers)
         claimed = {one.node for one in found if one.spanning >= LEAST_LOOPS}
         if bend is not None:
-            claimed.add((bend.first + bend.last) // 2)
+            claimed.update(np.linspace(bend.first + 1, bend.last, ALONG).astype(np.int64).tolist())
         return _Disputed(graph, poses, np.flatnonzero(outliers), claimed, asked)
 
     def _unexpected(self) -> list[int]:
