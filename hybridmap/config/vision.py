@@ -74,9 +74,10 @@ class TrackingConfig(Section):
 class ClosingConfig(Section):
     """Search for loop closures by laser or camera."""
 
-    by: Literal["geometry", "scanline"] = "geometry"
+    by: Literal["geometry", "scanline", "nothing"] = "geometry"
     """`geometry`: scans, features and depth are registered to each other, and measure motion and loops; `scanline`: the paper's
-    means alone, profiles that match along a stretch of the way (`vision.matching.sequence`).
+    means alone, profiles that match along a stretch of the way (`vision.matching.sequence`); `nothing`: registrations measure
+    motion as with `geometry`, and no loop is closed.
 
     Watch: with `scanline` the map between loops is that of the wheels, a robot that was carried is not found, and of `vision`
     only `sensor`, `profile` and `matching` are read.

@@ -14,6 +14,7 @@ from hybridmap.plugins import Table, loaded
 from hybridmap.streams import sensors
 from hybridmap.streams.base import Rig
 from hybridmap.vision.base import FrontEnd
+from hybridmap.vision.without_loops import WithoutLoops
 
 __all__ = ["Factory", "create_front_end", "register"]
 
@@ -66,7 +67,8 @@ def create_front_end(config: VisionConfig, rig: Rig, seed: int, clock: StageCloc
     if config.closing.by == "scanline" and chosen is not _none:
         chosen = "hybridmap.vision.scanline.front_end:create"
     factory: Factory = loaded(chosen) if isinstance(chosen, str) else chosen
-    return factory(config, rig, seed, clock or StageClock())
+    made = factory(config, rig, seed, clock or StageClock())
+    return WithoutLoops(made) if made is not None and config.closing.by == "nothing" else made
 
 
 def _named(name: str, rig: Rig) -> str | Factory:
