@@ -17,6 +17,7 @@ from hybridmap.geometry import IDENTITY, Array, between, compose, inverse
 from hybridmap.graph.edges import Edge, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node, Novelty
 from hybridmap.metrics import StageClock
+from hybridmap.neural.composition import Composition, Integrator
 from hybridmap.neural.path_integrator import PathIntegrator, Reanchoring
 from hybridmap.second_look import SecondLook, may_part
 from hybridmap.streams.base import Rig, Sample, SelfMotion, Velocity
@@ -63,7 +64,8 @@ class Mapper:
         self.clock = StageClock()
         self.map = ExperienceMap()
         self.book = EdgeBook(self.map, config.edges)
-        self.integrator = PathIntegrator(config.neural)
+        cells = config.neural.modules > 0
+        self.integrator: Integrator = PathIntegrator(config.neural) if cells else Composition(config.neural)
         self.cells = Reanchoring(self.integrator, config.neural.reanchor_weight)
         self.vision = create_front_end(config.vision, rig or rig_of(config.sensors), config.seed, self.clock)
         self.backends = Ensemble(config.backends, self.clock, backends)

@@ -12,6 +12,7 @@ from hybridmap.geometry import between, compose
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.io import graph_hash
 from hybridmap.mapper import Mapper
+from hybridmap.neural.path_integrator import PathIntegrator
 from hybridmap.streams.base import Sample, SelfMotion
 from hybridmap.streams.laser import LaserScan
 from hybridmap.trajectory import Trajectory
@@ -80,6 +81,7 @@ def test_the_pose_follows_the_activity():
     for i in range(20):
         mapper.add_odometry(0.1 * i, [0.05 * i, 0.0, 0.0])
     before = mapper.integrator.pose
+    assert isinstance(mapper.integrator, PathIntegrator)
     overwrite(mapper.integrator, "both", np.array([0.1, 0.05]))
     moved = known(mapper.add_odometry(2.0, [0.95, 0.0, 0.0]))
     assert np.allclose(moved.pose_odom_robot[:2] - before[:2], [0.1, 0.05], atol=1e-4)

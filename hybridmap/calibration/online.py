@@ -22,7 +22,7 @@ from hybridmap.geometry import Array, between, compose, interpolate
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.pose_graph import PoseGraph
-from hybridmap.neural.path_integrator import PathIntegrator
+from hybridmap.neural.composition import Integrator
 from hybridmap.odometry_model import Gains
 from hybridmap.streams.synchronise import Ready, Synchroniser
 from hybridmap.trajectory import NS_PER_S
@@ -238,7 +238,7 @@ class OdometryWatch:
         remeasured: the odometry of the whole drive as `finish` measured it again; None if it did not.
     """
 
-    def __init__(self, config: Config, integrator: PathIntegrator, synchroniser: Synchroniser) -> None:
+    def __init__(self, config: Config, integrator: Integrator, synchroniser: Synchroniser) -> None:
         """Start before the drive; gains go to the integrator, the offset to the synchroniser."""
         self.remeasured: Remeasured | None = None
         self.clock = SensorClock(config.sensors)

@@ -12,6 +12,8 @@ import typer
 from hybridmap.cli.options import AsJson
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from hybridmap.study.pools import Pool
     from hybridmap.study.statistics import Summary
     from hybridmap.study.study import Study
@@ -57,12 +59,13 @@ def study(
     """Run a study: map or solve every combination of source, setting, back-end, false loops and seed; compare the back-ends.
 
     A cell is one such combination. Metrics: error against ground truth, verified relations or the optimum without false loops;
-    chi2; accepted false loops; lost true loops. Differences between back-ends are paired by seed.
+    chi2; accepted false loops; lost true loops. Differences between back-ends, and between settings,
+    are paired by seed.
 
-    Writes study.yaml, tables (cells.csv, timings.csv, summary.csv, bars.csv), metrics.json, the page report.html, and every
-    result as soon as it is known: an interrupted study continues when it is run again. A cell without a result (`failed`,
-    `unmapped`, `crashed`) keeps its row, with the reason. A back-end that diverged is a result. A cell without the figure of a
-    limit (bar) misses it.
+    Writes study.yaml, tables (cells.csv, timings.csv, summary.csv, effects.csv, bars.csv), metrics.json, the page report.html,
+    and every result as soon as it is known: an interrupted study continues when it is run again. A cell without a result
+    (`failed`, `unmapped`, `crashed`) keeps its row, with the reason. A back-end that diverged is a result. A cell without the
+    figure of a limit (bar) misses it.
     """
     _one_thread()
     from hybridmap.cli.choose import parse_settings
@@ -105,8 +108,8 @@ def _show(done: Study) -> None:
     from rich.table import Table
 
     from hybridmap.errors import counted
-    from hybridmap.report.study_figures import ERRORS
     from hybridmap.report.study_page import baseline_of, error_of, remarks
+    from hybridmap.study.measures import ERRORS
 
     console = Console()
     if not console.is_terminal:
@@ -127,6 +130,7 @@ def _show(done: Study) -> None:
     for line in _lines(done, measure, others):
         table.add_row(*line)
     console.print(table)
+    _show_effects(done, console)
     for verdict in done.missed:
         unit = "" if verdict.unit == "1" else f" {verdict.unit}"
         missed = f"missed: {verdict.label}: {verdict.bar.figure} {verdict.value:.4g}{unit}, {verdict.said}"
@@ -136,6 +140,30 @@ def _show(done: Study) -> None:
     for remark in remarks(done):
         where = f"{counted(remark.count, 'cell')} {remark.status}: {remark.where}, {remark.backend}"
         console.print(f"note: {where}: {remark.message}", soft_wrap=True, markup=False, highlight=False)
+
+
+def _show_effects(done: Study, console: Console) -> None:
+    """Print what each setting changes against the first one, over all of its sources; where it has one, for that."""
+    from rich.table import Table
+
+    from hybridmap.errors import counted
+    from hybridmap.report.study_page import effect_lines
+
+    several = {one.cell.setting for one in done.effects if one.pooled}
+    lines = [line for line in effect_lines(done) if line.pooled or line.setting not in several]
+    if not lines:
+        return
+    first = done.grid.study.settings[0].name
+    left_out = len(done.effects) - len(lines)
+    more = f"; {counted(left_out, 'row')} of single sources in effects.csv and on the page" if left_out else ""
+    table = Table(title=f"settings against {first}{more}", title_justify="left")
+    for name in ("setting", "drives", "back-end"):
+        table.add_column(name)
+    for name in ("pairs", "minus (m)", "ratio", "p", "CPU"):
+        table.add_column(name, justify="right")
+    for line in lines:
+        table.add_row(line.setting, line.where, line.backend, line.pairs, line.difference, line.ratio, line.p, line.cpu)
+    console.print(table)
 
 
 def _known(done: Study, measure: str) -> bool:

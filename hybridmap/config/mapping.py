@@ -41,8 +41,9 @@ class NeuralConfig(Section):
 
     Watch: the heading is exact with any number; more cells only average out more noise.
     """
-    modules: int = Field(default=8, ge=3, le=32)
-    """M, number of grid modules; their spacings form a geometric series between the two limits.
+    modules: int = Field(default=8, ge=0, le=32)
+    """M, number of grid modules, 3 or more; their spacings form a geometric series between the two limits. 0: no cells at all,
+    the odometry is composed as numbers (for comparison).
 
     Watch: with fewer, the position code repeats sooner; the time of a step grows with the number.
     """
@@ -109,6 +110,8 @@ class NeuralConfig(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        if 0 < self.modules < 3:
+            raise ValueError(f"expected 3 modules or more, or 0 for no cells, found {self.modules}")
         if self.spacing_min_m > self.spacing_max_m:
             found = f"{self.spacing_min_m:g} and {self.spacing_max_m:g}"
             raise ValueError(f"expected spacing_min_m not above spacing_max_m, found {found}")

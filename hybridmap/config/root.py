@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.config.gone import without_gone
@@ -42,6 +42,12 @@ class Config(Section):
     """Which back-ends run, and their settings."""
     calibration: CalibrationConfig = CalibrationConfig()
     """Online calibration of odometry."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.neural.modules == 0 and self.nodes.rule != "travel":
+            raise ValueError(f"nodes.rule: expected travel where neural.modules is 0 (no place code), found {self.nodes.rule}")
+        return self
 
     @classmethod
     def load(

@@ -103,7 +103,7 @@ def said(error: ValidationError, model: type[BaseModel], section: str = "") -> s
     if kind == "missing":
         return f"{where}: is missing"
     if kind == "value_error":
-        return f"{where}: {first['ctx']['error']}"
+        return f"{where}: {first['ctx']['error']}" if where else str(first["ctx"]["error"])
     if kind == "too_short":
         message = f"expected at least {first['ctx']['min_length']} of them"
     elif kind in _WORDS:

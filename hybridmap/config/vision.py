@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from hybridmap.config.section import Section
 
@@ -184,8 +184,9 @@ class RgbdClosingConfig(Section):
 class RgbdConfig(Section):
     """Mapping with an RGB-D camera: scanline profiles, visual features, depth registration."""
 
-    matching: Literal["literal", "ratio", "signed", "plain", "four-band"] = "four-band"
-    """How candidates are ranked: by the paper's single-band profile with one of four readings of G, or by four row bands.
+    matching: Literal["literal", "ratio", "signed", "plain", "four-band", "nearest"] = "four-band"
+    """How candidates are ranked: by the paper's single-band profile with one of four readings of G, by four row bands, or
+    without a profile, the nearest on the map first (for comparison; a robot that is lost is still searched for by four bands).
 
     Watch: `literal` is inverted, see [the paper](paper.md).
     """
@@ -209,6 +210,12 @@ class RgbdConfig(Section):
     """Verification."""
     closing: RgbdClosingConfig = RgbdClosingConfig()
     """Gate and candidates."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.matching == "nearest" and self.verify == "none":
+            raise ValueError("expected verify: pnp where matching is nearest, as no profile gives an edge, found none")
+        return self
 
 
 class VisionConfig(Section):

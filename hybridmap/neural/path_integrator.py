@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from hybridmap.config.mapping import NeuralConfig
 from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import Array, compose, inverse
+from hybridmap.neural.composition import LARGEST_STEP_M, Integrator, Snapshot, checked_step
 from hybridmap.neural.grid import (
     FOURIER_MODES,
     Decoded,
@@ -30,9 +30,6 @@ from hybridmap.odometry_model import Gains, step_of
 
 log = logging.getLogger(__name__)
 
-Snapshot = dict[str, NDArray[Any]]
-"""State of the cells by name, as `PathIntegrator.snapshot` gives it."""
-
 ORIENTATION_DEG, ORIENTATION_STEP_DEG = 7.0, 7.5
 """Orientation of the finest module's first band, and the rotation of each module against the one before it, degrees: eight
 modules share the 60 degrees after which a hexagonal lattice repeats, and none lies along a wall."""
@@ -40,7 +37,6 @@ THETA_HZ = 7.5
 """Learning steps a second of motion: the theta rhythm of a moving rat (6-10 Hz)."""
 NEURON_NOISE_SEED = 0
 """Seed of `neural.neuron_noise` where no generator is handed in."""
-_LARGEST_STEP_M = 1000.0
 _PART_OF_WRAP = 0.1
 _WRAPS = np.array(sorted(((x, y) for x in range(-8, 9) for y in range(-8, 9)), key=lambda w: (w[0] ** 2 + w[1] ** 2, w)), float)
 
@@ -75,8 +71,11 @@ class PathIntegrator:
             heading_concentration: of the head-direction cells' von Mises tuning; 0: the paper's cosine. The pose is the same.
 
         Raises:
-            ConfigError: the grid sheets do not settle with this kernel, or the head-direction cells are too few.
+            ConfigError: there are no modules, the grid sheets do not settle with this kernel, or the head-direction cells are
+                too few.
         """
+        if config.modules == 0:
+            raise ConfigError("neural.modules: expected 3 or more, found 0: there are no cells to look at")
         self.config = config
         self.gains = Gains.of(config)
         self.spacings_m = _spacings_m(config)
@@ -109,14 +108,7 @@ class PathIntegrator:
         Raises:
             StreamError: the displacement or the time is not finite, or it is more than a kilometre.
         """
-        dx, dy, dyaw = np.asarray(delta_robot, dtype=np.float64).tolist()
-        if not math.isfinite(dx + dy + dyaw + dt_s):
-            found = f"({dx}, {dy}, {dyaw}) in {dt_s} s"
-            raise StreamError(f"self-motion: expected a finite displacement (dx, dy, dyaw) and time, found {found}")
-        if math.hypot(dx, dy) > _LARGEST_STEP_M:
-            raise StreamError(
-                f"self-motion: expected at most {_LARGEST_STEP_M:g} m in one step, found {math.hypot(dx, dy):g} m"
-            )
+        dx, dy, dyaw = checked_step(delta_robot, dt_s)
         if dx == 0.0 and dy == 0.0 and dyaw == 0.0:
             return
         forward, left, turn = step_of(dx, dy, dyaw, self.gains)
@@ -195,8 +187,8 @@ class PathIntegrator:
         if not 0.0 <= weight <= 1.0:
             raise ConfigError(f"re-anchoring: expected a weight from 0 to 1, found {weight}")
         delta = np.asarray(delta_snapshot_robot, dtype=np.float64)
-        if delta.shape != (3,) or not math.hypot(*delta[:2]) <= _LARGEST_STEP_M or not math.isfinite(delta[2]):
-            raise StreamError(f"re-anchoring: expected a pose (x, y, yaw) within {_LARGEST_STEP_M:g} m, found {delta.tolist()}")
+        if delta.shape != (3,) or not math.hypot(*delta[:2]) <= LARGEST_STEP_M or not math.isfinite(delta[2]):
+            raise StreamError(f"re-anchoring: expected a pose (x, y, yaw) within {LARGEST_STEP_M:g} m, found {delta.tolist()}")
         here = self._moved(snapshot, delta) if delta.any() else snapshot
         moved_m = np.asarray(here["near_m"] - snapshot["near_m"], dtype=np.float64)
         if weight < 1.0:
@@ -327,7 +319,7 @@ class Reanchoring:
         put_back_nodes: numbers of the nodes whose activity was stored anew by `put_back`, in that order.
     """
 
-    def __init__(self, integrator: PathIntegrator, weight: float) -> None:
+    def __init__(self, integrator: Integrator, weight: float) -> None:
         self.weight = weight
         self.put_back_nodes: list[int] = []
         self._integrator = integrator

@@ -12,11 +12,9 @@ import numpy as np
 from hybridmap.report import style
 from hybridmap.study.cell import CellResult
 from hybridmap.study.cells import Cell
+from hybridmap.study.measures import ERRORS
 from hybridmap.study.statistics import Summary
 from hybridmap.study.study import Study
-
-ERRORS = {"ate_m": "ATE", "relation_m": "relation error"}
-"""The errors that a page may compare, the preferred one first, and their names for people."""
 
 MOST_PANELS = 12
 """More are not drawn; the tables have everything."""
@@ -95,7 +93,14 @@ def _gathered(entries: Sequence[tuple[str, str, Cell, CellResult]], ticks: Seque
     by_title: dict[str, list[tuple[int, str, CellResult]]] = {}
     for title, tick, cell, result in entries:
         by_title.setdefault(title, []).append((ticks.index(tick), cell.backend, result))
-    return tuple(Panel(title, tuple(ticks), tuple(cells)) for title, cells in by_title.items())
+    return tuple(_panel(title, ticks, cells) for title, cells in by_title.items())
+
+
+def _panel(title: str, ticks: Sequence[str], cells: Sequence[tuple[int, str, CellResult]]) -> Panel:
+    """A panel with the ticks that it has cells for: not every setting is for every source."""
+    used = sorted({at for at, _, _ in cells})
+    moved = tuple((used.index(at), backend, result) for at, backend, result in cells)
+    return Panel(title, tuple(ticks[at] for at in used), moved)
 
 
 def having(plan: Layout, figure: Figure) -> Layout:

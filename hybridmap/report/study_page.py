@@ -14,12 +14,12 @@ from hybridmap.output import write_text
 from hybridmap.report import page_tables as tables
 from hybridmap.report import study_figures
 from hybridmap.report.page_tables import rendered
-from hybridmap.report.study_figures import ERRORS, FLOOR_M, MOST_PANELS
+from hybridmap.report.study_figures import FLOOR_M, MOST_PANELS
 from hybridmap.study.bars import Verdict
 from hybridmap.study.cell import CellResult
 from hybridmap.study.cells import Cell
 from hybridmap.study.folder import PAGE
-from hybridmap.study.measures import TIMINGS, measures_of
+from hybridmap.study.measures import ERRORS, TIMINGS, measures_of
 from hybridmap.study.model import quoted
 from hybridmap.study.statistics import LEAST, Interval, Summary
 from hybridmap.study.study import Study
@@ -97,6 +97,35 @@ class Bar:
 
 
 @dataclass(frozen=True, slots=True)
+class EffectLine:
+    """One row of the table of what the settings change; everything is text.
+
+    Attributes:
+        setting, where, backend: the setting, its drives, and the title of the back-end.
+        error: which error is compared.
+        pairs: number of pairs of drives.
+        difference: median of the paired differences to the first setting, m, with its interval.
+        ratio: median of the ratios to the first setting's error, with its interval.
+        verdict: `lower` or `higher` if the signed-rank test says so; else empty.
+        p: of that test, corrected for all settings on the same drives; empty if unknown.
+        cpu: ratio of the CPU times of mapping; empty if unknown.
+        pooled: whether the row is of several sources.
+    """
+
+    setting: str
+    where: str
+    backend: str
+    error: str
+    pairs: str
+    difference: str
+    ratio: str
+    verdict: str
+    p: str
+    cpu: str
+    pooled: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Remark:
     """Cells of a study that did not end well, with the same status and message.
 
@@ -164,6 +193,9 @@ def _render(study: Study) -> str:
         confidence=f"{100.0 * config.statistics.confidence:g}",
         least=LEAST,
         groups=shown,
+        effects=effect_lines(study),
+        clocked=any(line.cpu for line in effect_lines(study)),
+        reference=quoted(config.settings[0].name),
         groups_without=len(groups) - len(shown),
         measures=[(name, unit, text) for name, (unit, text) in (measures_of(config) | TIMINGS).items()],
         remarks=remarks(study),
@@ -267,6 +299,32 @@ def _group(label: str, by_backend: dict[str, dict[str, Summary]], measure: str, 
     solved = {backend: any(one.solved for one in by_measure.values()) for backend, by_measure in by_backend.items()}
     lines = tuple(_line(by_measure, measure, others) for backend, by_measure in by_backend.items() if solved[backend])
     return Group(label, lines, tuple(quoted(backend) for backend in by_backend if not solved[backend]))
+
+
+def effect_lines(study: Study) -> list[EffectLine]:
+    """The table of what each setting changes against the first one; those without any pair are left out."""
+    return [
+        EffectLine(
+            setting=one.cell.setting,
+            where=one.where,
+            backend=one.cell.backend,
+            error=", ".join(dict.fromkeys(ERRORS[name] for name in one.measures)),
+            pairs=str(one.difference.count) + (f", {one.lost} lost" if one.lost else ""),
+            difference=_with_limits(one.difference),
+            ratio=_with_limits(one.ratio),
+            verdict=one.verdict,
+            p="" if math.isnan(one.p) else f"{one.p:.2g}",
+            cpu="" if math.isnan(one.cpu_ratio) else f"{one.cpu_ratio:.2f}",
+            pooled=one.pooled,
+        )
+        for one in study.effects
+        if one.difference.count
+    ]
+
+
+def _with_limits(found: Interval) -> str:
+    """A median, with its interval if it has one."""
+    return tables.interval(found) if found.known else tables.number(found.value)
 
 
 def _line(by_measure: dict[str, Summary], measure: str, others: Sequence[str]) -> Line:

@@ -88,8 +88,8 @@ class Grid:
 def lay_out(study: StudyConfig) -> Grid:
     """Make the cells of a study: the product of sources, settings, false loops, seeds and back-ends; back-ends vary fastest.
 
-    Sources and settings vary slowest. What is not random gets one cell for all seeds. Files, sessions and recordings are read,
-    since their content is part of the keys. Nothing is mapped.
+    Sources and settings vary slowest, and a setting is for the sources that it names. What is not random gets one cell for all
+    seeds. Files, sessions and recordings are read, since their content is part of the keys. Nothing is mapped.
 
     Raises:
         GraphError, StoreError, StreamError: a file or session is missing or damaged.
@@ -99,6 +99,8 @@ def lay_out(study: StudyConfig) -> Grid:
     cells: list[Cell] = []
     tasks: dict[str, SourceTask] = {}
     for source, setting in product(study.sources, study.settings):
+        if setting.sources and source.title not in setting.sources:
+            continue
         key_at = cache(partial(_enter, tasks, opened[source.title], setting))
         drawn = opened[source.title].by_chance(setting)
         for kind, rate in _false_loops(study):

@@ -12,10 +12,10 @@ from hybridmap.study.cell import CellResult
 from hybridmap.study.frozen import Frozen
 
 STUDY, CELLS_CSV, TIMINGS_CSV, SUMMARY_CSV = "study.yaml", "cells.csv", "timings.csv", "summary.csv"
-BARS_CSV, METRICS, PAGE = "bars.csv", "metrics.json", "report.html"
+BARS_CSV, EFFECTS_CSV, METRICS, PAGE = "bars.csv", "effects.csv", "metrics.json", "report.html"
 _CELLS, _SOURCES = "cells", "sources"
 _OLD_LOCK = ".lock"  # of earlier versions
-_FILES = (STUDY, CELLS_CSV, TIMINGS_CSV, SUMMARY_CSV, BARS_CSV, METRICS, PAGE, _CELLS, _SOURCES, _OLD_LOCK)
+_FILES = (STUDY, CELLS_CSV, TIMINGS_CSV, SUMMARY_CSV, BARS_CSV, EFFECTS_CSV, METRICS, PAGE, _CELLS, _SOURCES, _OLD_LOCK)
 STUDY_FOLDER = Kind("study", _FILES, lambda folder: holds_only(folder, _FILES), continued=True)
 
 

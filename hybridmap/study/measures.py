@@ -14,6 +14,9 @@ NEAR_M = 0.05
 OF_ODOMETRY = ("ate_m", "yaw_deg", "within_5_cm", "chi2", "chi2_own")
 """Figures that are those of odometry where a back-end failed or diverged."""
 
+ERRORS = {"ate_m": "ATE", "relation_m": "relation error"}
+"""The errors of position by which maps are compared, the preferred one first, and their names for people."""
+
 VERDICT = ("1", "verdict on the map: 0 trusted, 1 doubtful, 2 failed")
 
 MEASURES = {

@@ -158,6 +158,9 @@ class SettingConfig(Section):
     """For drives: disturbance (of `study.disturb.TABLE`) -> its strength; 0 changes nothing."""
     drift: DriftConfig = DriftConfig()
     """For every source: errors added to the frozen graph's odometry edges."""
+    sources: Names = ()
+    """Titles of the sources that the setting is for; default: all. The first setting is for all, as the others are compared
+    with it."""
 
     @property
     def title(self) -> str:

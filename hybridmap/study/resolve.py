@@ -134,6 +134,10 @@ def _check(study: StudyConfig, origin: str) -> None:
         _check_source(source, study, f"{origin}: sources")
     for setting in study.settings:
         _check_setting(setting, study, f"{origin}: settings: {setting.name}")
+    if study.settings[0].sources:
+        raise ConfigError(
+            f"{origin}: settings: {study.settings[0].name}: is the first and must be for all sources, found `sources`"
+        )
     if study.maps and any(study.false_loops.rates):
         raise ConfigError(
             f"{origin}: false_loops: they cannot be added to a drive; give back-ends that solve the graph, or none"
@@ -164,7 +168,8 @@ def _check_source(source: SourceConfig, study: StudyConfig, origin: str) -> None
             raise ConfigError(f"{origin}: {source.title}: found a {source.kind}; {what}")
     if source.kind not in DRIVES and study.maps:
         raise ConfigError(f"{origin}: {source.title}: is a graph; give the back-ends that solve it")
-    acting = next((setting.name for setting in study.settings if setting.overrides or setting.disturb), None)
+    of_it = (setting for setting in study.settings if not setting.sources or source.title in setting.sources)
+    acting = next((setting.name for setting in of_it if setting.overrides or setting.disturb), None)
     if source.kind not in DRIVES and acting is not None:
         raise ConfigError(
             f"{origin}: {source.title}: is a graph already, and the setting {quoted(acting)} has overrides or disturbances "
@@ -173,6 +178,9 @@ def _check_source(source: SourceConfig, study: StudyConfig, origin: str) -> None
 
 
 def _check_setting(setting: SettingConfig, study: StudyConfig, origin: str) -> None:
+    titles = [source.title for source in study.sources]
+    if missing := next((title for title in setting.sources if title not in titles), None):
+        raise ConfigError(f"{origin}: sources has no {missing!r}; there are {', '.join(titles)}")
     for name, strength in setting.disturb.items():
         disturb.check(name, strength, origin)
     if study.maps and not setting.drift.idle:

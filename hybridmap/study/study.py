@@ -15,7 +15,18 @@ from hybridmap.study import bars, provenance, tables
 from hybridmap.study.bars import Verdict
 from hybridmap.study.cell import CellResult
 from hybridmap.study.cells import Cell, Grid, lay_out
-from hybridmap.study.folder import BARS_CSV, CELLS_CSV, METRICS, STUDY, STUDY_FOLDER, SUMMARY_CSV, TIMINGS_CSV, StudyFolder
+from hybridmap.study.effects import Effect, effects_of
+from hybridmap.study.folder import (
+    BARS_CSV,
+    CELLS_CSV,
+    EFFECTS_CSV,
+    METRICS,
+    STUDY,
+    STUDY_FOLDER,
+    SUMMARY_CSV,
+    TIMINGS_CSV,
+    StudyFolder,
+)
 from hybridmap.study.measures import measures_of
 from hybridmap.study.model import StudyConfig, quoted
 from hybridmap.study.pools import Pool
@@ -32,6 +43,7 @@ class Study:
         grid: the cells of the study.
         results: cache key of a result -> the result, for every cell of the grid.
         summaries: summaries over the seeds, one per group, back-end and measure.
+        effects: each setting against the first, one per source and back-end and one over all sources.
         verdicts: one verdict per bar, group and back-end.
         computed: number of results that this run computed, see `runner.Outcomes`.
         head: keys of `metrics.json` besides its list of metrics, with their values.
@@ -42,6 +54,7 @@ class Study:
     grid: Grid
     results: dict[str, CellResult]
     summaries: list[Summary]
+    effects: list[Effect]
     verdicts: list[Verdict]
     computed: int
     head: dict[str, Any]
@@ -66,8 +79,9 @@ class Study:
 def run_study(study: StudyConfig, out: Path, pool: Pool, progress: Progress | None = None) -> Study:
     """Run or continue a study; results stored by an earlier run in the same folder are not computed again.
 
-    The folder gets `study.yaml`, `cells.csv`, `timings.csv`, `summary.csv`, `bars.csv` and `metrics.json`, which replace those
-    of an earlier run, but no page (`report.study_page`). A cell that fails keeps its row; a missed bar is not an error.
+    The folder gets `study.yaml`, `cells.csv`, `timings.csv`, `summary.csv`, `effects.csv`, `bars.csv` and `metrics.json`, which
+    replace those of an earlier run, but no page (`report.study_page`). A cell that fails keeps its row; a bar may be missed
+    without an error.
 
     Args:
         study: the study.
@@ -85,20 +99,22 @@ def run_study(study: StudyConfig, out: Path, pool: Pool, progress: Progress | No
         grid = lay_out(study)
         outcomes = run(grid, folder, pool, progress)
         summaries = summarise(grid, outcomes.results)
+        effects = effects_of(grid, outcomes.results)
         head = _head(grid, outcomes.results)
         verdicts = bars.judge(grid, outcomes.results)
-        metrics = _metrics(summaries, verdicts)
+        metrics = _metrics(summaries, effects, verdicts)
         texts = {
             STUDY: study.to_yaml(),
             CELLS_CSV: tables.cells_csv(grid.cells, outcomes.results, measures_of(study)),
             TIMINGS_CSV: tables.timings_csv(grid.cells, outcomes.results),
             SUMMARY_CSV: tables.summary_csv(summaries),
+            EFFECTS_CSV: tables.effects_csv(effects),
             BARS_CSV: tables.bars_csv(verdicts),
             METRICS: to_json(head, metrics) + "\n",
         }
         for name, text in texts.items():
             write_text(out / name, text)
-    return Study(folder, grid, outcomes.results, summaries, verdicts, outcomes.computed, head, metrics)
+    return Study(folder, grid, outcomes.results, summaries, effects, verdicts, outcomes.computed, head, metrics)
 
 
 def _head(grid: Grid, results: dict[str, CellResult]) -> dict[str, Any]:
@@ -113,8 +129,11 @@ def _head(grid: Grid, results: dict[str, CellResult]) -> dict[str, Any]:
     }
 
 
-def _metrics(summaries: Sequence[Summary], verdicts: Sequence[Verdict]) -> list[Metric]:
-    """Median and mean of each measure, the median difference to the baseline, and every bar: `<figure>/<group>/<back-end>`."""
+def _metrics(summaries: Sequence[Summary], effects: Sequence[Effect], verdicts: Sequence[Verdict]) -> list[Metric]:
+    """Median and mean of each measure, the median difference to the baseline, and every bar: `<figure>/<group>/<back-end>`.
+
+    `effect/<setting>/<source>/<back-end>` is what a setting changes against the first one, m.
+    """
     metrics = []
     for one in summaries:
         stage = f"{one.cell.label}/{one.cell.backend}"
@@ -126,6 +145,11 @@ def _metrics(summaries: Sequence[Summary], verdicts: Sequence[Verdict]) -> list[
             what = f"median of the paired differences to {quoted(one.baseline)}, {one.difference}"
             what += "" if math.isnan(one.p) else f"; Wilcoxon's p, by Holm, {one.p:.3g}"
             metrics.append(Metric(f"{stem}_difference/{stage}", one.difference.value, one.unit, what))
+    for effect in effects:
+        what = f"median of the paired differences to the first setting, {effect.difference}; ratio {effect.ratio.value:.4g}"
+        what += "" if math.isnan(effect.p) else f"; Wilcoxon's p, by Holm, {effect.p:.3g}"
+        name = f"effect/{effect.cell.setting}/{effect.where}/{effect.cell.backend}"
+        metrics.append(Metric(name, effect.difference.value, "m", what))
     for verdict in verdicts:
         name = f"{_stem(verdict.bar.figure, verdict.unit)}_{verdict.bar.statistic}/{verdict.label}"
         metrics = [metric for metric in metrics if metric.name != name]

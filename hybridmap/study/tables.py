@@ -11,6 +11,7 @@ from typing import Any
 from hybridmap.study.bars import Verdict
 from hybridmap.study.cell import CellResult
 from hybridmap.study.cells import Cell
+from hybridmap.study.effects import Effect
 from hybridmap.study.measures import TIMINGS
 from hybridmap.study.statistics import Summary
 
@@ -25,6 +26,20 @@ SUMMARY_COLUMNS = (
 """Of `summary.csv`."""
 TIMING_COLUMNS = (*_LABELS, *TIMINGS, "key")
 """Of `timings.csv`."""
+EFFECT_COLUMNS = (
+    *("setting", "source", "false_loop_kind", "false_loop_rate", "backend", "error", "pairs", "lost"),
+    *(
+        "difference_median",
+        "difference_low",
+        "difference_high",
+        "ratio_median",
+        "ratio_low",
+        "ratio_high",
+        "p_holm",
+        "cpu_ratio",
+    ),
+)
+"""Of `effects.csv`."""
 BAR_COLUMNS = (
     *_GROUP_LABELS,
     *("figure", "unit", "statistic", "value", "side", "bar", "passed", "median", "worst", "values"),
@@ -54,6 +69,11 @@ def timings_csv(cells: Sequence[Cell], results: Mapping[str, CellResult]) -> str
 def bars_csv(verdicts: Sequence[Verdict]) -> str:
     """The text of `bars.csv`: one line per bar, group and back-end. The last column has the value of each seed, or a dash."""
     return _text(BAR_COLUMNS, (_bar_row(one) for one in verdicts))
+
+
+def effects_csv(effects: Sequence[Effect]) -> str:
+    """The text of `effects.csv`: a line for each setting but the first, source and back-end, and one over all its sources."""
+    return _text(EFFECT_COLUMNS, (_effect_row(one) for one in effects))
 
 
 def shown(value: float | None) -> str:
@@ -99,6 +119,14 @@ def _summary_row(one: Summary) -> tuple[str, ...]:
     apart = one.difference
     paired = tuple(_known(value) for value in (apart.value, apart.low, apart.high, one.better, one.p))
     return (*labels, *sums, str(apart.count), *paired)
+
+
+def _effect_row(one: Effect) -> tuple[str, ...]:
+    cell = one.cell
+    where = (cell.setting, one.where if one.pooled else cell.source, cell.kind, shown(cell.rate), cell.backend)
+    middles = (_known(value) for each in (one.difference, one.ratio) for value in (each.value, each.low, each.high))
+    errors = " ".join(dict.fromkeys(one.measures))
+    return (*where, errors, str(one.difference.count), str(one.lost), *middles, _known(one.p), _known(one.cpu_ratio))
 
 
 def _known(value: float) -> str:

@@ -44,6 +44,7 @@ def test_a_study_is_run_and_gone_on_with(run, tmp_path, monkeypatch):
         "timings.csv",
         "summary.csv",
         "bars.csv",
+        "effects.csv",
         "metrics.json",
         "report.html",
         "cells",

@@ -8,7 +8,7 @@ import pytest
 
 from hybridmap.output import held
 from hybridmap.report import study_figures, style
-from hybridmap.report.study_page import groups_of, write_study_page
+from hybridmap.report.study_page import effect_lines, groups_of, write_study_page
 from hybridmap.study.cell import CellResult
 from hybridmap.study.cells import Cell, lay_out
 from hybridmap.study.folder import STUDY_FOLDER, StudyFolder
@@ -160,3 +160,17 @@ def test_the_axis_of_the_differences_names_the_error_that_is_compared(made, monk
         {label: [replace(one, measure=measure) for one in ones] for label, ones in pairs.items()}, "gtsam-lm"
     )
     assert {axes.get_xlabel() for axes in drawn[0].axes} - {""} == {f"{error} minus that of gtsam-lm (m)"}
+
+
+def test_what_a_setting_changes_is_a_table_of_its_own(made):
+    settings = [{"name": "as it is"}, {"name": "twice", "drift": {"scale_bias": 0.1}}]
+
+    def outcome(cell: Cell) -> float:
+        return better_by_the_seed(cell) * (2.0 if cell.setting == "twice" else 1.0)
+
+    study = made(outcome, settings=settings, seeds=6, false_loops={})
+    assert "twice laps gtsam-lm ATE 6" in text_of(study)
+    lines = effect_lines(study)
+    assert [line.backend for line in lines] == ["gtsam-lm", "relaxed"]
+    assert [line.verdict for line in lines] == ["higher", "higher"]
+    assert "What the settings change" not in text_of(made(better_by_the_seed))

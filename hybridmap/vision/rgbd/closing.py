@@ -22,7 +22,7 @@ from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp import Candidate, Verification, Verifier
 from hybridmap.vision.rgbd.revisits import MAP_SIGMA_DEG, MAP_SIGMA_M, Reverification, Revisits
 from hybridmap.vision.rgbd.support import MeasuredLoop, Support
-from hybridmap.vision.templates import MODERATE_THRESHOLD, Matcher
+from hybridmap.vision.templates import MODERATE_THRESHOLD, Matcher, Mode
 
 Indices = NDArray[np.int64]
 GATE_PER_M, GATE_GROWTH_M = 0.1, 10.0
@@ -81,13 +81,13 @@ class LoopCloser:
         self._yaw_of_shift = yaw_of_shift
         self._new_key = new_key
         self._clock = clock
-        self._matcher = Matcher(
-            rgbd.matching, matching.mu_r, matching.mu_d, config.profile.max_shift, matching.g_bar, matching.sequence
-        )
+        self._by_profile = rgbd.matching != "nearest"
+        mode: Mode = "four-band" if rgbd.matching == "nearest" else rgbd.matching
+        self._matcher = Matcher(mode, matching.mu_r, matching.mu_d, config.profile.max_shift, matching.g_bar, matching.sequence)
         whereabouts = Whereabouts(UNRECOGNISED_NODES if self._may_be_lost else 0, UNCERTAIN_NODES)
         self._relocaliser = Relocaliser(whereabouts, new_key, SPAN_M)
         self._global_search = GlobalSearch(keyframes, self._matcher, verifier, new_key)
-        self._c_t = matching.c_t if matching.c_t is not None or not self._unverified else MODERATE_THRESHOLD[rgbd.matching]
+        self._c_t = matching.c_t if matching.c_t is not None or not self._unverified else MODERATE_THRESHOLD[mode]
         self.support = Support()
         self._revisits = Revisits()
         self._tried: set[tuple[int, int]] = set()
@@ -105,7 +105,7 @@ class LoopCloser:
         """Look for loops of the newest node, and decide pending ones; returns new (also rejected) and changed edges."""
         since_m = self._travel_at_closure
         gated = self._gate(node, belief)
-        changed = self._try_candidates(node, self._ranked(node, gated), belief) if len(gated) else []
+        changed = self._try_candidates(node, self._ranked(node, gated, belief), belief) if len(gated) else []
         if not self._unverified:
             broken = self._relocaliser.whereabouts.first_break is not None
             if not broken and not any(p.status is Status.ACCEPTED for p in changed):
@@ -241,8 +241,12 @@ class LoopCloser:
         self._gate_of_newest = Gate(*widths, int(old.sum()), int(inside.sum()))
         return np.flatnonzero(inside).astype(np.int64)
 
-    def _ranked(self, node: int, gated: Indices) -> dict[int, Candidate]:
-        """The best candidates by profile, some nodes apart."""
+    def _ranked(self, node: int, gated: Indices, belief: Belief) -> dict[int, Candidate]:
+        """The best candidates by profile, or those nearest on the map where profiles do not rank; some nodes apart."""
+        if not self._by_profile:
+            gap = np.hypot(*(belief.poses_map_node[gated, :2] - belief.poses_map_node[node, :2]).T)
+            nearest = np.argsort(gap, kind="stable")
+            return _first_apart(gated[nearest], gap[nearest], self._closing.candidates, Search.GATE)
         ranked = RANKED * self._closing.candidates
         with self._clock.stage("search"):
             match = self._matcher.best(self._keyframes[node].profile, ranked, gated, ending_at=node)
@@ -307,16 +311,9 @@ class LoopCloser:
         old = belief.stamps_s[node] - belief.stamps_s[:node] >= MIN_AGE_S
         near = old & (gap <= REPROPOSE_M) & (turned <= np.deg2rad(HEADING_DEG))
         cost = gap + turned
-        chosen: dict[int, Candidate] = {}
-        for i in np.argsort(np.where(near, cost, np.inf), kind="stable")[: int(near.sum())]:
-            target = int(i)
-            if self.support.has(node, target):
-                continue
-            if all(abs(target - other) >= SEPARATION for other in chosen):
-                chosen[target] = Candidate(Search.NEAR, figures={"map_distance_m": float(gap[i])})
-            if len(chosen) == most:
-                break
-        return chosen
+        order = np.argsort(np.where(near, cost, np.inf), kind="stable")[: int(near.sum())]
+        left = np.array([target for target in order.tolist() if not self.support.has(node, target)], dtype=np.int64)
+        return _first_apart(left, gap[left], most, Search.NEAR)
 
     def _accept_unverified(self, node: int, ranked: dict[int, Candidate], belief: Belief) -> list[Edge]:
         """As in the paper: the best match is a closure; its shift gives the yaw, the translation is 0."""
@@ -340,3 +337,14 @@ class LoopCloser:
             )
             return [edge]
         return []
+
+
+def _first_apart(targets: Indices, gap_m: Array, most: int, search: Search) -> dict[int, Candidate]:
+    """The first of older nodes (n,), at distances (n,), m, on the map, that lie some nodes apart."""
+    chosen: dict[int, Candidate] = {}
+    for target, gap in zip(targets.tolist(), gap_m.tolist(), strict=True):
+        if all(abs(target - other) >= SEPARATION for other in chosen):
+            chosen[target] = Candidate(search, figures={"map_distance_m": gap})
+        if len(chosen) == most:
+            break
+    return chosen

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from hybridmap.config.vision import (
     ClosingConfig,
@@ -123,6 +124,25 @@ def test_features_that_no_depth_confirms_must_be_many(poses, frames, monkeypatch
     alone = [p for p in proposals.values() if p.method is Method.FEATURES and p.status is Status.ACCEPTED]
     assert alone
     assert all([check.figure for check in p.checks][-2:] == ["feature_inliers_both", "supporting"] for p in alone)
+
+
+def test_without_profiles_the_nearest_on_the_map_are_tried_first(poses, frames):
+    front_end, proposals, odometry = drive(VisionConfig(rgbd=RgbdConfig(matching="nearest")), poses, np.deg2rad(0.5), frames)
+    tried = [p for p in proposals.values() if p.kind is EdgeKind.LOOP and p.search is Search.GATE]
+    accepted = [p for p in tried if p.status is Status.ACCEPTED]
+    assert len({p.source for p in accepted}) > 0.6 * PER_LAP
+    assert all("profile_G" not in p.figures for p in tried)
+    newest = len(poses) - 1
+    first = next(p for p in tried if p.source == newest)
+    gap = np.hypot(*(odometry[: newest - 9, :2] - odometry[newest, :2]).T)  # ten seconds old
+    assert gap[first.target] == pytest.approx(known(first.figures["map_distance_m"]))
+    assert gap[first.target] == gap.min()
+    assert len(front_end.note(newest)["ranked"]) == 0
+
+
+def test_profiles_must_rank_where_the_match_alone_is_the_closure():
+    with pytest.raises(ValidationError, match="expected verify: pnp where matching is nearest"):
+        RgbdConfig(matching="nearest", verify="none")
 
 
 def test_every_refusal_has_a_reason(driven):
