@@ -137,7 +137,7 @@ def test_without_profiles_the_nearest_on_the_map_are_tried_first(poses, frames):
     gap = np.hypot(*(odometry[: newest - 9, :2] - odometry[newest, :2]).T)  # ten seconds old
     assert gap[first.target] == pytest.approx(known(first.figures["map_distance_m"]))
     assert gap[first.target] == gap.min()
-    assert len(front_end.note(newest)["ranked"]) == 0
+    assert len(front_end.closer.note(newest)["ranked"]) == 0
 
 
 def test_profiles_must_rank_where_the_match_alone_is_the_closure():
