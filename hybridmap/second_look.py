@@ -44,7 +44,7 @@ from hybridmap.vision.relocalising import REATTACHED_M, REATTACHED_RAD
 
 Indices = NDArray[np.int64]
 
-TRIED = 3
+TRIED = 8
 """Places that are tried for each sign of a break: those where it is strongest."""
 ALONG = 5
 """Places that are tried along the stretch of the chain that the map bends most: views lead to the node from nearby alone."""
@@ -229,17 +229,33 @@ class SecondLook:
         return out
 
     def _trial(self, disputed: _Disputed, place: int) -> _Trial | None:
-        """Solve the graph with its chain loosened before a node; None if the back-end cannot."""
+        """Solve the graph with its chain loosened before a node; None if the back-end cannot.
+
+        Loops that fitted may be lost to those that are against both maps. Then all that fit one of the two are tried together.
+        """
         graph, poses = disputed.graph, disputed.poses
         clear = self._clear(graph, place)
         voting = disputed.outliers[leads_across(graph, place)[disputed.outliers]]
         motion = wanted_motion(graph, poses, voting, place) if len(voting) else IDENTITY
-        solved = self._backends.trial(loosened(graph.with_edges(clear), poses, place, motion))
+        tried = self._loosened(graph.with_edges(clear), disputed, place, motion, clear)
+        if tried is not None and tried[1].lost and tried[1].gain > 0.0:
+            fits = np.minimum(squared_norms(graph, poses), squared_norms(graph, tried[0])) <= self._gate
+            together = self._loosened(graph.with_edges(clear & (fits | ~graph.is_loop)), disputed, place, motion, clear)
+            tried = max(tried, together or tried, key=lambda one: one[1].gain)
+        if tried is None:
+            return None
+        solved, found = tried
+        signs = tuple(check for check in disputed.asked.get(place, ()) if not check.passed)
+        return _Trial(place, signs, solved, found, tuple(graph.edge_ids[~clear].tolist()))
+
+    def _loosened(
+        self, graph: PoseGraph, disputed: _Disputed, place: int, motion: Array, clear: NDArray[np.bool_]
+    ) -> tuple[Array, Freed] | None:
+        """Poses (N, 3) of a graph with its chain loosened before a node, and what that changes; None if it cannot be solved."""
+        solved = self._backends.trial(loosened(graph, disputed.poses, place, motion))
         if solved is None:
             return None
-        found = freed(graph, poses, solved.poses, place, self._gate, clear)
-        signs = tuple(check for check in disputed.asked.get(place, ()) if not check.passed)
-        return _Trial(place, signs, solved.poses, found, tuple(graph.edge_ids[~clear].tolist()))
+        return solved.poses, freed(disputed.graph, disputed.poses, solved.poses, place, self._gate, clear)
 
     def _clear(self, graph: PoseGraph, place: int) -> NDArray[np.bool_]:
         """(E,) edges but the loops across a node that are measured by views from both sides of it."""
