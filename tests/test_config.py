@@ -48,6 +48,10 @@ def test_extending_in_a_circle_is_refused(tmp_path):
         ("nodes: {distance_m: .nan}\n", r"nodes.distance_m: .*finite"),
         ("nodes: [1]\n", r"nodes: expected keys with values, found \[1\]"),
         ("seed: -1\n", r"seed: expected a number greater than or equal to 0, found -1"),
+        (
+            "vision: {closing: {by: ratslam}}\n",
+            r"yaml: vision.closing.by is ratslam: expected edges.hanging ratslam, found chain",
+        ),
         ("backends: {names: []}\n", r"backends.names: expected at least 1 of them, found \[\]"),
         ("backends: {names: x}\n", r"backends.names: expected a list, found 'x'"),
         ("backends: {names: [a, b, a]}\n", r"backends.names: expected each back-end once, found 'a' again"),

@@ -45,8 +45,10 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if self.neural.modules == 0 and self.nodes.rule != "travel":
+        if self.neural.modules == 0 and self.nodes.rule not in ("travel", "views"):
             raise ValueError(f"nodes.rule: expected travel where neural.modules is 0 (no place code), found {self.nodes.rule}")
+        if self.vision.closing.by == "ratslam" and self.edges.hanging != "ratslam":  # it reckons with being seen from the match
+            raise ValueError(f"vision.closing.by is ratslam: expected edges.hanging ratslam, found {self.edges.hanging}")
         return self
 
     @classmethod

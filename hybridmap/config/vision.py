@@ -45,7 +45,8 @@ class MatchingConfig(Section):
     """Definition of g_bar: the mean of g_min over the stored templates, or the mean of g over the shifts of the pair."""
     c_t: float | None = Field(default=None, ge=-1e6, le=1e6)
     """Threshold: two views match if their score G is below c_t. None: with `vision.closing.by: scanline` it is found from the
-    drive; without, there is none if matches are verified by features, else a moderate one by `vision.rgbd.matching`.
+    drive; with `ratslam` it is that of view templates, 0.5; without, there is none if matches are verified by features, else a
+    moderate one by `vision.rgbd.matching`.
 
     Watch: the scale of G differs between the readings of `vision.rgbd.matching`.
     """
@@ -74,19 +75,20 @@ class TrackingConfig(Section):
 class ClosingConfig(Section):
     """Search for loop closures by laser or camera."""
 
-    by: Literal["geometry", "scanline", "nothing"] = "geometry"
+    by: Literal["geometry", "scanline", "ratslam", "nothing"] = "geometry"
     """`geometry`: scans, features and depth are registered to each other, and measure motion and loops; `scanline`: the paper's
-    means alone, profiles that match along a stretch of the way (`vision.matching.sequence`); `nothing`: registrations measure
-    motion as with `geometry`, and no loop is closed.
+    means alone, profiles that match along a stretch of the way (`vision.matching.sequence`); `ratslam`: RatSLAM's view cells
+    and pose cells; `nothing`: registrations measure motion as with `geometry`, and no loop is closed.
 
-    Watch: with `scanline` the map between loops is that of the wheels, a robot that was carried is not found, and of `vision`
-    only `sensor`, `profile` and `matching` are read.
+    Watch: with `scanline` and `ratslam` the map between loops is that of the wheels, a robot that was carried is not found, and
+    of `vision` only `sensor`, `profile`, `matching` and, by `ratslam`, `closing.gate_sigmas` are read.
     """
     gate_sigmas: float = Field(default=2.5, gt=0, le=100)
     """Older nodes are considered for a loop within this many standard deviations of the pose uncertainty on the map (the gate).
 
     Watch: a wide gate takes time and admits places that only look alike; a narrow one loses loops after long drift. A laser
-    multiplies the deviations by four; a camera uses them only after its gate has grown by 10 m.
+    multiplies the deviations by four; a camera uses them only after its gate has grown by 10 m. With `ratslam` it is the
+    distance of two places on the pose cells, in cells, within which they are one: a packet deviates by about a cell.
     """
     revisit_rounds: int = Field(default=2, ge=0, le=100)
     """How many times, at the end, nodes that lie close together on the optimised map are registered to each other; 0: never.

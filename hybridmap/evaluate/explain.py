@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hybridmap.backends.base import ODOMETRY
 from hybridmap.errors import EvaluationError
+from hybridmap.evaluate.why_not import NO_LOOPS, NO_NODE
 from hybridmap.geometry import Array, between
 from hybridmap.graph.edges import Check, Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
@@ -284,14 +285,13 @@ class Explainer:
         if number == 0:
             return "first experience"
         moved = _moved(between(self._map.node(number - 1).pose_odom, self._map.node(number).pose_odom))
-        if _setting(self._settings, "nodes.rule") in ("novelty", "passage"):
+        if _setting(self._settings, "nodes.rule") in NO_NODE:
             return f"a new place or view, {format_motion(*moved)} since node {number - 1}"
         return f"{format_motion(*moved)} since node {number - 1}; {self._node_rule()}"
 
     def _why_no_node(self, moved: tuple[float, float]) -> str:
-        if (rule := _setting(self._settings, "nodes.rule")) in ("novelty", "passage"):
-            least, whose = _setting(self._settings, "nodes.place_threshold"), "every" if rule == "novelty" else "the newest"
-            return f"neither a new view template nor a place code {least} from {whose} node's (nodes.place_threshold)"
+        if (rule := _setting(self._settings, "nodes.rule")) in NO_NODE:
+            return NO_NODE[rule].format(_setting(self._settings, "nodes.place_threshold"))
         limits = [_setting(self._settings, f"nodes.{name}") for name in ("distance_m", "angle_deg")]
         due = any(value >= limit for value, limit in zip(moved, limits, strict=True) if isinstance(limit, int | float))
         why = f"no view at this instant, though {format_motion(*moved)}" if due else f"only {format_motion(*moved)}"
@@ -327,8 +327,8 @@ class Explainer:
             if gate.older == 0:
                 return f"no node was old enough: {MIN_AGE_S:g} s"
             return "no older node lay inside the gate" if gate.inside == 0 else ""
-        if _setting(self._settings, "vision.closing.by") == "scanline":
-            return "no older node lay inside the gate, or the robot turned here, or the drive told no threshold yet"
+        if (by := _setting(self._settings, "vision.closing.by")) in NO_LOOPS:
+            return NO_LOOPS[by]
         for kind, _ in carried(self._store.rig):
             every = _setting(self._settings, kind.seeks_every)
             if isinstance(every, int | float):

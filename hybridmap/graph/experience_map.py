@@ -217,8 +217,8 @@ class Novelty:
         Args:
             delta_node_robot: (3,) pose of the robot in the frame of the node that it is at, m and rad; for the rule `travel`,
                 and the turn since that node for `passage`.
-            place_code: returns the present rates (P,) of the place cells; not called under the rule `travel`.
-            new_template: whether the current frame made a new view template; without effect under the rule `travel`.
+            place_code: returns the present rates (P,) of the place cells; not called under the rules `travel` and `views`.
+            new_template: `View.new_template` of the current frame; without effect under the rule `travel`.
         """
         if self._count == 0:
             return "first experience"
@@ -226,6 +226,8 @@ class Novelty:
             return self._travelled(delta_node_robot)
         if new_template:
             return "new view template"
+        if self._config.rule == "views":
+            return None
         if self._config.rule == "passage":
             return self._passed(delta_node_robot, place_code())
         distance = self.distance(place_code())

@@ -31,6 +31,9 @@ FRONT_ENDS: Table[str | Factory] = Table(
 )
 """Front-ends by name; `register` adds to it."""
 
+_BY = {"scanline": "hybridmap.vision.scanline.front_end:create", "ratslam": "hybridmap.ratslam.front_end:create"}
+"""Front-ends for every kind of sensor, by `vision.closing.by`. RatSLAM's has cells of its own and so is no part of vision."""
+
 
 def register(name: str, factory: Factory) -> None:
     """Add a front-end under a name, so that the setting `vision.sensor` can choose it.
@@ -64,8 +67,8 @@ def create_front_end(config: VisionConfig, rig: Rig, seed: int, clock: StageCloc
         chosen: str | Factory = next((kind.front_end for kind, _ in sensors.carried(rig)), _none)
     else:
         chosen = _named(config.sensor, rig)
-    if config.closing.by == "scanline" and chosen is not _none:
-        chosen = "hybridmap.vision.scanline.front_end:create"
+    if chosen is not _none:
+        chosen = _BY.get(config.closing.by, chosen)
     factory: Factory = loaded(chosen) if isinstance(chosen, str) else chosen
     made = factory(config, rig, seed, clock or StageClock())
     return WithoutLoops(made) if made is not None and config.closing.by == "nothing" else made

@@ -5,13 +5,14 @@ A front-end keeps its own templates, keyframes and submaps, by node number. It g
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, RelativePose, between
 from hybridmap.graph.agreement import Indices
 from hybridmap.graph.edges import Check, Edge, Lack
@@ -22,6 +23,23 @@ HELD_IMAGES = 100
 """Newest nodes whose images stay in memory; the map file holds all. An image of 640 x 480 with its depth takes 2 MB."""
 UNEXPECTED = (None, Lack.UNSUPPORTED, Lack.CONTRADICTED)
 """What a loop may lack that is refused only because the map did not expect it: nothing, or others that agree with it."""
+
+
+F = TypeVar("F")
+
+
+def held(frames: Iterable[tuple[int, F]], node: int) -> F:
+    """The frame of a node among (node, frame) pairs.
+
+    Raises:
+        StreamError: the node's frame is no longer held (see `HELD_IMAGES`); the map file has it.
+    """
+    found = [frame for number, frame in frames if number == node]
+    if not found:
+        raise StreamError(
+            f"vision: node {node}: only the newest {HELD_IMAGES} images are held, take older ones from the map file"
+        )
+    return found[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +87,8 @@ class View:
         stamp_ns: time of the frame.
         profile: (bands, width) float32, normalised as configured.
         template: number of the most similar view template, or of the new one made from this frame; -1 if there are none.
-        new_template: whether a new view template was made from this frame.
+        new_template: whether a new view template was made from this frame; with RatSLAM, whether it is of another experience
+            than the frame before.
     """
 
     stamp_ns: int

@@ -324,12 +324,14 @@ class Recognition:
     Attributes:
         template: number of the template: the nearest one, even where it does not match yet, or the new one.
         founded: whether a new template was made from this frame.
-        difference: mean absolute difference to the nearest older template, a match up to `THRESHOLD`; inf for the first one.
+        difference: mean absolute difference to the nearest older template, a match up to the threshold; inf for the first one.
+        shift: best shift against the template, columns; positive when things lie farther right in the frame.
     """
 
     template: int
     founded: bool
     difference: float
+    shift: int
 
 
 THRESHOLD = 0.5
@@ -345,10 +347,15 @@ class ViewTemplates:
     Args:
         max_shift: largest shift tried, columns.
         mu_r, mu_d: weights of intensity and depth.
+        threshold: largest difference of two views that are one.
+        stable_frames: consecutive frames that must match no template before a new one is made.
     """
 
-    def __init__(self, max_shift: int, mu_r: float, mu_d: float) -> None:
+    def __init__(
+        self, max_shift: int, mu_r: float, mu_d: float, threshold: float = THRESHOLD, stable_frames: int = STABLE_FRAMES
+    ) -> None:
         self._matcher = Matcher("plain", mu_r, mu_d, max_shift)
+        self._threshold, self._stable_frames = threshold, stable_frames
         self._new_for = 0
 
     def __len__(self) -> int:
@@ -360,11 +367,11 @@ class ViewTemplates:
         A new template is made from it if it and the frames just before match none; until then the nearest template is returned.
         """
         if len(self) == 0:
-            return Recognition(self._matcher.add(profile), True, float("inf"))
+            return Recognition(self._matcher.add(profile), True, float("inf"), 0)
         match = self._matcher.best(profile, 1)
-        best, difference = int(match.indices[0]), float(match.score[0])
-        self._new_for = self._new_for + 1 if difference > THRESHOLD else 0
-        if self._new_for < STABLE_FRAMES:
-            return Recognition(best, False, difference)
+        best, difference, shift = int(match.indices[0]), float(match.score[0]), int(match.shift[0])
+        self._new_for = self._new_for + 1 if difference > self._threshold else 0
+        if self._new_for < self._stable_frames:
+            return Recognition(best, False, difference, shift)
         self._new_for = 0
-        return Recognition(self._matcher.add(profile), True, difference)
+        return Recognition(self._matcher.add(profile), True, difference, 0)

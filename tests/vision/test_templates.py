@@ -116,3 +116,17 @@ def test_a_template_is_founded_only_when_the_view_stays_new():
     assert [s.founded for s in seen] == [False, False, True, False]
     assert seen[-1].template == 1
     assert len(templates) == 2
+
+
+def test_a_template_of_another_threshold_is_made_at_once_and_a_match_tells_its_shift():
+    rng = np.random.default_rng(5)
+    view = rng.normal(size=(2, 32)).astype(np.float32)
+    templates = ViewTemplates(max_shift=4, mu_r=0.5, mu_d=0.5, threshold=0.05, stable_frames=1)
+    assert templates.recognise(view).founded
+    again = templates.recognise(np.roll(view, 3, axis=1))
+    assert (again.founded, again.template, again.shift) == (False, 0, 3)
+    other = templates.recognise(view + 0.2 * rng.normal(size=view.shape).astype(np.float32))
+    assert (other.founded, other.template, other.shift) == (True, 1, 0)
+    loose = ViewTemplates(max_shift=4, mu_r=0.5, mu_d=0.5, threshold=0.5, stable_frames=1)
+    loose.recognise(view)
+    assert not loose.recognise(view + 0.2 * rng.normal(size=view.shape).astype(np.float32)).founded

@@ -16,7 +16,7 @@ from hybridmap.graph.edges import Check, Edge
 from hybridmap.metrics import StageClock
 from hybridmap.streams.base import Observation, Rig
 from hybridmap.streams.rgbd import RGBD, Camera, RgbdFrame
-from hybridmap.vision.base import HELD_IMAGES, UNEXPECTED, Belief, Division, View
+from hybridmap.vision.base import HELD_IMAGES, UNEXPECTED, Belief, Division, View, held
 from hybridmap.vision.profile import image_profile
 from hybridmap.vision.rgbd import checks
 from hybridmap.vision.rgbd.closing import LoopCloser
@@ -178,14 +178,9 @@ class RgbdFrontEnd:
             StreamError: the node's images are no longer held (see `HELD_IMAGES`); the map file has them.
         """
         kept = self.keyframes[node]
-        held = [frame for number, frame in self._images if number == node]
-        if not held:
-            raise StreamError(
-                f"vision: node {node}: only the newest {HELD_IMAGES} images are held, take older ones from the map file"
-            )
         return {
             "profile": kept.profile,
-            **RGBD.compact(held[0]),
+            **RGBD.compact(held(self._images, node)),
             "T_base_camera": kept.surface.stance.T_base_camera,
             **self.closer.note(node),
         }

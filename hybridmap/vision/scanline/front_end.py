@@ -8,16 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.vision import VisionConfig
-from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import IDENTITY, Array, RelativePose
 from hybridmap.graph.edges import Edge
 from hybridmap.metrics import StageClock
 from hybridmap.streams.base import Observation, Rig
-from hybridmap.streams.laser import LASER
-from hybridmap.streams.rgbd import RGBD
-from hybridmap.vision.base import HELD_IMAGES, Belief, SeenGain, View
+from hybridmap.vision.base import HELD_IMAGES, Belief, SeenGain, View, held
 from hybridmap.vision.scanline.closing import Measured, ScanlineCloser, seen_from_newer
-from hybridmap.vision.scanline.retina import CameraRetina, Glance, LaserRetina, Retina
+from hybridmap.vision.scanline.retina import Glance, Retina, retina_of
 from hybridmap.vision.scanline.sequences import Sequences
 from hybridmap.vision.scanline.way_ahead import GainMeter, way_ahead
 from hybridmap.vision.templates import ViewTemplates
@@ -104,12 +101,7 @@ class ScanlineFrontEnd:
         Raises:
             StreamError: the node's frame is no longer held (see `HELD_IMAGES`); the map file has it.
         """
-        held = [frame for number, frame in self._frames if number == node]
-        if not held:
-            raise StreamError(
-                f"vision: node {node}: only the newest {HELD_IMAGES} images are held, take older ones from the map file"
-            )
-        return {"profile": self._glances[node].profile, **self._retina.compact(held[0])}
+        return {"profile": self._glances[node].profile, **self._retina.compact(held(self._frames, node))}
 
     def _measured(self, node: int, older: int) -> Measured:
         yaw = self._retina.yaw_rad(float(self._sequences.shifts[older]))
@@ -133,11 +125,4 @@ def create(config: VisionConfig, rig: Rig, seed: int, clock: StageClock) -> Scan
         ConfigError: the rig has neither laser nor camera of that name.
     """
     del seed, clock
-    for kind in (LASER, RGBD):
-        sensor = rig.sensors.get(kind.sensor_name)
-        if sensor is not None and config.sensor in ("auto", kind.name):
-            retina: Retina = LaserRetina(config, sensor) if kind is LASER else CameraRetina(config, sensor)
-            return ScanlineFrontEnd(config, retina)
-    raise ConfigError(
-        f"vision.closing.by is scanline: expected a laser or an RGB-D camera, found vision.sensor {config.sensor}"
-    )
+    return ScanlineFrontEnd(config, retina_of(config, rig))

@@ -1,4 +1,4 @@
-"""What the scanline front-end takes of a frame, by camera or laser: a profile, and how far things are column by column."""
+"""What the front-ends by scanline take of a frame, by camera or laser: a profile, and how far things are column by column."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hybridmap.config.vision import VisionConfig
 from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import Array, wrap_angle
-from hybridmap.streams.base import Observation
+from hybridmap.streams.base import Observation, Rig
 from hybridmap.streams.laser import LASER, Laser, LaserScan
 from hybridmap.streams.rgbd import RGBD, Camera, RgbdFrame
 from hybridmap.vision.profile import Profile, image_profile, laser_profile
@@ -83,7 +83,8 @@ class CameraRetina:
         if -turned[2, 1] < _UPRIGHT_COS:
             tilt_deg = np.rad2deg(np.arccos(np.clip(-turned[2, 1], -1.0, 1.0)))
             raise ConfigError(
-                f"vision.closing.by is scanline: expected a camera upright to 60 deg, found one tilted by {tilt_deg:.0f} deg"
+                f"vision.closing.by is {config.closing.by}: expected a camera upright to 60 deg, found one tilted by "
+                f"{tilt_deg:.0f} deg"
             )
         x = (np.arange(camera.width_px) - camera.cx_px) / camera.fx_px
         y = -(turned[2, 0] * x + turned[2, 2]) / turned[2, 1]
@@ -146,6 +147,21 @@ class LaserRetina:
     def compact(self, frame: Observation) -> dict[str, NDArray[Any]]:
         """The ranges."""
         return LASER.compact(frame)
+
+
+def retina_of(config: VisionConfig, rig: Rig) -> Retina:
+    """Make the retina of the sensor that `vision.sensor` names, or of the first of the rig that has one.
+
+    Raises:
+        ConfigError: the rig has neither laser nor camera of that name.
+    """
+    for kind in (LASER, RGBD):
+        sensor = rig.sensors.get(kind.sensor_name)
+        if sensor is not None and config.sensor in ("auto", kind.name):
+            return LaserRetina(config, sensor) if kind is LASER else CameraRetina(config, sensor)
+    raise ConfigError(
+        f"vision.closing.by is {config.closing.by}: expected a laser or an RGB-D camera, found vision.sensor {config.sensor}"
+    )
 
 
 def _from_left(bearings_rad: Array) -> tuple[Indices, Array]:
