@@ -71,6 +71,7 @@ def test_wheel_holds_every_file_that_the_package_reads(wheel: Path) -> None:
     expected = {str(path) for path in MODULES}
     expected |= {f"hybridmap/configs/{path.name}" for path in (ROOT / "configs").glob("*.yaml")}
     expected |= {str(path.relative_to(ROOT)) for path in PACKAGE.rglob("*.j2")}
+    expected.add("hybridmap/docs/paper.md")
     assert expected - names == set()
     assert [name for name in names if name.endswith("licenses/LICENSE")]
 

@@ -22,6 +22,7 @@ from hybridmap.cli.export import export
 from hybridmap.cli.inspect import inspect
 from hybridmap.cli.map import map_source
 from hybridmap.cli.optimize import optimize
+from hybridmap.cli.reproduce import reproduce
 from hybridmap.cli.simulate import simulate
 from hybridmap.cli.study import study
 from hybridmap.cli.verify import verify
@@ -98,6 +99,13 @@ _COMMANDS: dict[str, tuple[Callable[..., None], dict[int, str]]] = {
     "verify": (
         verify,
         {0: "every value keeps its limit", 1: "a value misses its limit, and everything is written all the same"},
+    ),
+    "reproduce": (
+        reproduce,
+        {
+            0: "every drive has a result, and no limit is missed",
+            1: "a drive has no result or a limit is missed, and everything is written all the same",
+        },
     ),
 }
 """Name -> the command, and what its exit codes mean, beside those of every command."""

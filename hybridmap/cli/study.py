@@ -67,7 +67,7 @@ def study(
     (`failed`, `unmapped`, `crashed`) keeps its row, with the reason. A back-end that diverged is a result. A cell without the
     figure of a limit (bar) misses it.
     """
-    _one_thread()
+    one_thread()
     from hybridmap.cli.choose import parse_settings
     from hybridmap.cli.show import emit, progress
     from hybridmap.report.study_page import write_study_page
@@ -76,7 +76,7 @@ def study(
 
     chosen = StudyConfig.load(config, parse_settings(setting))
     with progress(f"study {chosen.name}") as advance:
-        done = run_study(chosen, out, _pool(workers, scheduler), advance)
+        done = run_study(chosen, out, pool_of(workers, scheduler), advance)
     page = write_study_page(done)
     if as_json:
         emit(done.head, done.metrics, as_json=True)
@@ -87,13 +87,14 @@ def study(
         raise typer.Exit(1)
 
 
-def _one_thread() -> None:
+def one_thread() -> None:
     """Limit the numerical libraries to one thread, as in workers; they read these variables when they are imported."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"
 
 
-def _pool(workers: int, scheduler: str | None) -> Pool:
+def pool_of(workers: int, scheduler: str | None = None) -> Pool:
+    """The workers of a command: a Dask scheduler's, so many processes of this machine, or with 0 of them this process."""
     from hybridmap.study.pools import LocalProcesses, ThisProcess
 
     if scheduler is not None:

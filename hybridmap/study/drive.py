@@ -102,6 +102,7 @@ class MappedDrive:
             mapper.backends.primary,
             _figures(mapper, track, truth, relations, {**watch.figures(), **_of_session(mapper, verdict)}),
             _timings(clock.cpu_s["mapping"], float(track.stamps_ns[-1] - track.stamps_ns[0]) / NS_PER_S, views),
+            _poses(mapper),
         )
         return Frozen(graph, reference, of_truth=truth is not None, mapped=mapped)
 
@@ -181,6 +182,12 @@ def _figures(
             figures |= of_primary
         found[name] = {key: value if value is not None and math.isfinite(value) else None for key, value in figures.items()}
     return found
+
+
+def _poses(mapper: Mapper) -> dict[str, Array]:
+    """Poses (N, 3) of the nodes by odometry and by every back-end, each in its own frame."""
+    by_odometry = np.array([node.pose_odom for node in mapper.map.nodes])
+    return {ODOMETRY: by_odometry} | {name: one.poses for name, one in mapper.backends.solutions.items() if name != ODOMETRY}
 
 
 def _of_trajectory(estimate: Trajectory, truth: Trajectory | None, relations: Relations | None) -> Iterator[tuple[str, float]]:

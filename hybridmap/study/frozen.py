@@ -14,6 +14,7 @@ from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
 
 _ARRAYS = tuple(one.name for one in fields(PoseGraph) if one.name != "file")
+_POSES_OF = "poses of "
 Figures = Mapping[str, float | None]
 
 
@@ -25,11 +26,13 @@ class Mapped:
         primary: name of the back-end whose map the mapper used.
         figures: name of a back-end (or `odometry`) -> its figures, named as in `measures.MAPPED`.
         timings: name -> value, for the names in `measures.TIMINGS`.
+        poses: name of a back-end (or `odometry`) -> (N, 3) poses of the nodes in its map of the drive, m and rad.
     """
 
     primary: str
     figures: Mapping[str, Figures]
     timings: Mapping[str, float]
+    poses: Mapping[str, Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +62,7 @@ class Frozen:
             arrays |= {name: array for name, array in given.items() if array is not None}
         if self.mapped is not None:
             arrays["mapped"] = json.dumps([self.mapped.primary, self.mapped.figures, self.mapped.timings], allow_nan=False)
+            arrays |= {_POSES_OF + name: poses for name, poses in self.mapped.poses.items()}
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays)
         return buffer.getvalue()
@@ -72,6 +76,10 @@ class Frozen:
         """
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             given = {name: arrays[name] for name in _ARRAYS if name in arrays}
-            mapped = Mapped(*json.loads(str(arrays["mapped"]))) if "mapped" in arrays else None
+            poses = {name.removeprefix(_POSES_OF): arrays[name] for name in arrays if name.startswith(_POSES_OF)}
+            mapped = None
+            if "mapped" in arrays:
+                primary, figures, timings = json.loads(str(arrays["mapped"]))
+                mapped = Mapped(primary, figures, timings, poses)
             graph = PoseGraph(**given) if given else None
             return cls(graph, arrays["reference"], bool(arrays["of_truth"]), str(arrays["failure"]), mapped)

@@ -18,7 +18,7 @@ SCHEMA = 1
 """Raised when the meaning of a figure changes."""
 
 _LIBRARIES = ("gtsam", "numba", "numpy", "scipy", "opencv-python-headless")
-_SHOWING = ("cli", "export", "report", "session.py", "study")
+_SHOWING = ("cli", "export", "report", "reproduction", "session.py", "study")
 _SOLVING = (
     "backends",
     "config/backends.py",

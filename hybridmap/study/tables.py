@@ -57,23 +57,25 @@ def cells_csv(cells: Sequence[Cell], results: Mapping[str, CellResult], measures
     """
     names = tuple(dict.fromkeys((*measures, *_COUNTS)))
     columns = (*_LABELS, "status", *names, "message", "key")
-    return _text(columns, (_cell_row(cell, results[cell.key], names) for cell in cells))
+    return csv_text(columns, (_cell_row(cell, results[cell.key], names) for cell in cells))
 
 
 def timings_csv(cells: Sequence[Cell], results: Mapping[str, CellResult]) -> str:
     """The text of `timings.csv`: one line per cell with its process times; a table of its own, as times differ between runs."""
     rows = ((cell, results[cell.key].timings) for cell in cells)
-    return _text(TIMING_COLUMNS, ((*_labels(cell), *(shown(spent.get(n)) for n in TIMINGS), cell.key) for cell, spent in rows))
+    return csv_text(
+        TIMING_COLUMNS, ((*_labels(cell), *(shown(spent.get(n)) for n in TIMINGS), cell.key) for cell, spent in rows)
+    )
 
 
 def bars_csv(verdicts: Sequence[Verdict]) -> str:
     """The text of `bars.csv`: one line per bar, group and back-end. The last column has the value of each seed, or a dash."""
-    return _text(BAR_COLUMNS, (_bar_row(one) for one in verdicts))
+    return csv_text(BAR_COLUMNS, (_bar_row(one) for one in verdicts))
 
 
 def effects_csv(effects: Sequence[Effect]) -> str:
     """The text of `effects.csv`: a line for each setting but the first, source and back-end, and one over all its sources."""
-    return _text(EFFECT_COLUMNS, (_effect_row(one) for one in effects))
+    return csv_text(EFFECT_COLUMNS, (_effect_row(one) for one in effects))
 
 
 def shown(value: float | None) -> str:
@@ -97,7 +99,8 @@ def _cell_row(cell: Cell, result: CellResult, names: Sequence[str]) -> tuple[str
     return (*_labels(cell), result.status, *figures, result.message, cell.key)
 
 
-def _text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """The text of a CSV file: a line of the names of its columns, then a line for each row."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)
@@ -107,7 +110,7 @@ def _text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 def summary_csv(summaries: Sequence[Summary]) -> str:
     """The text of `summary.csv`: one line per group, back-end and measure; empty where a number is not known."""
-    return _text(SUMMARY_COLUMNS, (_summary_row(one) for one in summaries))
+    return csv_text(SUMMARY_COLUMNS, (_summary_row(one) for one in summaries))
 
 
 def _summary_row(one: Summary) -> tuple[str, ...]:

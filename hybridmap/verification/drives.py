@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridmap import geometry
 from hybridmap.geometry import Array
@@ -13,7 +14,8 @@ from hybridmap.simulation.motion import drive as simulated_drive
 from hybridmap.simulation.stream import ODOMETRY_RATE_HZ, TURN_RATE_RAD_S
 from hybridmap.simulation.worlds import build_world
 
-_ROOM_M = (10.0, 3.0)
+ROOM_M = (10.0, 3.0)
+"""Length and width of the room of the drives: those of the paper's laboratory."""
 _MARGIN_M = 0.9
 
 
@@ -42,7 +44,7 @@ def wander(rng: np.random.Generator, distance_m: float, hz: float) -> ExactDrive
         distance_m: the drive ends with the step that reaches it.
         hz: steps per second.
     """
-    half = np.array(_ROOM_M) / 2 - _MARGIN_M
+    half = np.array(ROOM_M) / 2 - _MARGIN_M
     dt = 1.0 / hz
     x = y = yaw = omega = driven = 0.0
     v = 0.7
@@ -85,18 +87,44 @@ def raster(side_m: float, pitch_m: float, angle_rad: float, *, upright: bool = F
     order = pixel_order(count, upright=upright)
     points = np.stack([ticks[order[:, 0]], ticks[order[:, 1]]], axis=1)
     turn = np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
-    path = np.concatenate([np.zeros((1, 2)), points @ turn.T])
+    return _through(points @ turn.T)
+
+
+def pixel_order(count: int, *, upright: bool = False) -> NDArray[np.int64]:
+    """The pixels (count^2, 2), (x index, y index), in the order in which the drive of `raster` reaches them."""
+    order = _back_and_forth(count, count)
+    return order[:, ::-1] if upright else order
+
+
+def room_lines(sides_m: tuple[float, float], pitch_m: float) -> tuple[ExactDrive, NDArray[np.int64]]:
+    """A drive from the middle of a room to a corner, then back and forth along its length, one step per pixel.
+
+    Args:
+        sides_m: length and width of the room.
+        pitch_m: side of a pixel.
+
+    Returns:
+        The drive, and the pixel (x index, y index) that each of its steps reaches.
+    """
+    counts = np.round(np.array(sides_m) / pitch_m).astype(int)
+    pixels = _back_and_forth(*counts.tolist())
+    return _through((pixels - 0.5 * (counts - 1)) * pitch_m), pixels
+
+
+def _back_and_forth(length: int, lines: int) -> NDArray[np.int64]:
+    """(length x lines, 2): place on the line, and line, of each step along one line after the other."""
+    there = np.arange(length)
+    along = np.tile(np.concatenate([there, there[::-1]]), -(-lines // 2))[: length * lines]
+    return np.stack([along, np.repeat(np.arange(lines), length)], axis=1)
+
+
+def _through(points: Array) -> ExactDrive:
+    """The drive from the origin straight to each of the points (N, 2) in turn, m; 30 points a second."""
+    path = np.concatenate([np.zeros((1, 2)), points])
     ways = np.diff(path, axis=0)
     poses = np.column_stack([path, np.concatenate([[0.0], np.arctan2(ways[:, 1], ways[:, 0])])])
     deltas = geometry.between(poses[:-1], poses[1:])
     return ExactDrive(deltas, poses[1:], np.cumsum(np.linalg.norm(ways, axis=1)), 30.0)
-
-
-def pixel_order(count: int, *, upright: bool = False) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-    """The pixels (count^2, 2), (x index, y index), in the order in which the drive of `raster` reaches them."""
-    lines = np.repeat(np.arange(count), count)
-    along = np.tile(np.concatenate([np.arange(count), np.arange(count)[::-1]]), -(-count // 2))[: count * count]
-    return np.stack([lines, along] if upright else [along, lines], axis=1)
 
 
 def _along(motions: Array, hz: float) -> ExactDrive:

@@ -10,6 +10,7 @@ import numpy as np
 from hybridmap.report import style
 from hybridmap.verification.physiology import autocorrelogram
 from hybridmap.verification.rate_maps import LatticeMaps, PlaceMaps, PlaceResult
+from hybridmap.verification.room_fields import RoomFields
 from hybridmap.verification.single_cells import BAND, GRID, HEADING, HEADING_BINS, PLACE, SCORES, PathVerification
 
 _RATES, _CORRELATION = "viridis", "RdBu_r"
@@ -19,6 +20,7 @@ _TIGHT = {"wspace": 0.07, "hspace": 0.07}
 _SPACINGS_SHOWN = 1.9
 _ZOOM_M = 0.4
 _EXAMPLES = 8
+_FIELD = 0.2  # of its peak rate: where a cell fires above that is drawn as its field
 _SPIKE_COLOUR, _PATH_COLOUR = "#d40000", "#b8b8b8"
 _KIND_COLOURS = {GRID: "#0072b2", BAND: "#e69f00", PLACE: "#009e73", HEADING: "#0072b2"}
 _POINT = 3.0
@@ -92,6 +94,30 @@ def place_figure(place: PlaceResult) -> str:
         panels[1, -1].set_title("% of cells, by fields", fontsize=_SMALL + 1.0, fontweight="normal")
         _name_rows(panels, ("recruited,\nenlarged", *(f"{name}\nn = {len(group.fields)}" for name, group in groups)))
         _rate_bar(picture, panels)
+        return style.svg_uri(picture)
+
+
+def room_figure(room: RoomFields) -> str:
+    """Draw the fields of some place cells in the room of 10 x 3 m, one colour each, and how many fields the cells have.
+
+    Returns:
+        A `data:` URI.
+    """
+    import matplotlib
+
+    colours = matplotlib.colormaps["tab20"]
+    half = 0.5 * room.pitch_m * np.array(room.sampled.examples.shape[1:])
+    with style.figure(style.PAGE_WIDTH_IN, 2.6) as picture:
+        hall, counts = picture.subplots(1, 2, gridspec_kw={"width_ratios": (5.2, 1.0)})
+        hall.plot(*room.way_m.T, color=_PATH_COLOUR, linewidth=0.4, zorder=1)
+        ticks = [np.linspace(-end, end, count) for end, count in zip(half, room.sampled.examples.shape[1:], strict=True)]
+        for number, rates in enumerate(room.sampled.examples):
+            firing = {"levels": [_FIELD * float(rates.max()), np.inf], "colors": [colours(number)], "zorder": 3}
+            hall.contourf(*ticks, rates.T, **firing)
+        style.metric_axes(hall, "box")
+        hall.set(xlim=(-half[0], half[0]), ylim=(-half[1], half[1]))
+        _field_counts(counts, room.sampled)
+        counts.set_title(f"% of {len(room.sampled.fields)} cells,\nby fields", fontsize=_SMALL + 1.0, fontweight="normal")
         return style.svg_uri(picture)
 
 

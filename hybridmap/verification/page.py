@@ -135,21 +135,29 @@ def _render(head: dict[str, Any], rows: Sequence[Metric], result: CellVerificati
     return rendered(
         _TEMPLATE,
         **_table_of(head, rows),
+        **figures_of(result),
         drives=len(first),
         scale=_scale_of(result),
         distance=f"{first[0].distance_m[-1]:.0f}",
         verdict=recurrence_verdict(result.place),
-        heading=heading_figure(result.head_direction),
-        stripes=maps_figure.stripes_figure(result.lattice),
-        grid=maps_figure.grid_figure(result.lattice),
-        square=maps_figure.grid_figure(result.square),
-        place=maps_figure.place_figure(result.place),
-        phase=phase_figure(result),
-        modules=module_figure(first, result.lattice.spacings_m),
-        shadow=shadow_figure(result.overwritten["softplus"]),
-        noise=noise_figure(result),
         printed_kernel=result.printed_kernel,
     )
+
+
+def figures_of(result: CellVerification) -> dict[str, str]:
+    """Every picture of the page: its name in the template -> a `data:` URI."""
+    return {
+        "heading": heading_figure(result.head_direction),
+        "stripes": maps_figure.stripes_figure(result.lattice),
+        "grid": maps_figure.grid_figure(result.lattice),
+        "square": maps_figure.grid_figure(result.square),
+        "place": maps_figure.place_figure(result.place),
+        "room": maps_figure.room_figure(result.room_fields),
+        "phase": phase_figure(result),
+        "modules": module_figure(next(iter(result.room.values())), result.lattice.spacings_m),
+        "shadow": shadow_figure(result.overwritten["softplus"]),
+        "noise": noise_figure(result),
+    }
 
 
 _COLOURS = {"relu": "#0072b2", "softplus": "#009e73"}

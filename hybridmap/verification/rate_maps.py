@@ -151,7 +151,7 @@ def place_maps(
     learnt, bump = np.array(inputs), np.array(bumps)
     drive = raster(side_m, pitch_m, angle, upright=True)
     mapper = PathIntegrator(config)
-    seen = np.array([_inputs_after(mapper, delta) for delta in drive.deltas])
+    seen = np.array([inputs_after(mapper, delta) for delta in drive.deltas])
     order = pixel_order(count, upright=True)
     printed = PrintedRule(rng, cells, learnt.shape[1], config.place.learning_rate)
     for _ in range(epochs):
@@ -160,10 +160,10 @@ def place_maps(
     maps, sheet, one_bump = {}, {}, {}
     for name, population in (("recruited", integrator.place), ("printed", printed)):
         rates = population.respond(seen.T)
-        maps[name] = _population(_as_maps(rates, order, count))
+        maps[name] = fields_of(_as_maps(rates, order, count))
         shown = _onto_sheet(population.respond(learnt.T), bump, rates)
         for stage, activity in (("input", shown), ("settled", settled_sheets(integrator, shown))):
-            sheet[name, stage] = _population(_as_maps(activity, order, count), floor=_FIRING)
+            sheet[name, stage] = fields_of(_as_maps(activity, order, count), floor=_FIRING)
             one_bump[name, stage] = one_bump_share(activity)
     return PlaceResult(pitch_m, maps["recruited"], maps["printed"], sheet, one_bump)
 
@@ -195,7 +195,8 @@ class PrintedRule:
         self.weights[active] = grown / np.linalg.norm(grown, axis=1, keepdims=True)
 
 
-def _inputs_after(integrator: PathIntegrator, delta: Array) -> NDArray[np.float32]:
+def inputs_after(integrator: PathIntegrator, delta: Array) -> NDArray[np.float32]:
+    """Take one step of 1/30 s; returns what the place cells then get from the grid cells, (inputs,)."""
     integrator.step(delta, 1.0 / 30.0)
     return integrator.place.inputs(integrator.grid.activity)
 
@@ -250,8 +251,8 @@ def _as_maps(rates: NDArray[np.float32], order: NDArray[np.int64], count: int) -
     return maps
 
 
-def _population(maps: NDArray[np.float32], floor: float = 0.0) -> PlaceMaps:
-    """Count the fields of the cells whose peak is above a share of the population's highest."""
+def fields_of(maps: NDArray[np.float32], floor: float = 0.0) -> PlaceMaps:
+    """Count the fields of the cells, by their maps (C, H, W), whose peak is above a share of the population's highest."""
     peaks = maps.max(axis=(1, 2))
     firing = maps[(peaks > 0.0) & (peaks >= floor * peaks.max())]
     return PlaceMaps(firing[:: max(1, len(firing) // 12)][:12].copy(), field_counts(firing))

@@ -171,9 +171,12 @@ def place_rows(result: CellVerification) -> list[Metric]:
     place = result.place
     recruited = f"of {len(place.recruited.fields)} recruited place cells have one field"
     printed = f"of {len(place.printed.fields)} cells by the printed rule have one field"
+    sampled, of = len(result.room_fields.sampled.fields), result.room_fields.recruited
+    room = f"of {sampled} of the {of} cells recruited on a drive through 10 x 3 m have one field in all of it"
     return [
         _row("place_single_recruited", 100.0 * place.recruited.single, "%", recruited, 95.0, _AT_LEAST),
         _row("place_single_printed", 100.0 * place.printed.single, "%", printed),
+        _row("place_single_room", 100.0 * result.room_fields.sampled.single, "%", room, 95.0, _AT_LEAST),
     ]
 
 

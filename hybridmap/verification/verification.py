@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,9 +18,11 @@ from hybridmap.errors import ConfigError
 from hybridmap.neural import PathIntegrator
 from hybridmap.study.pools import one_thread_for_children
 from hybridmap.verification import laps, path_error, rate_maps, shadow
+from hybridmap.verification.drives import ROOM_M
 from hybridmap.verification.laps import LapErrors
 from hybridmap.verification.path_error import HeadDirectionResult, PathErrors, StandstillResult
 from hybridmap.verification.rate_maps import LatticeMaps, PlaceResult
+from hybridmap.verification.room_fields import RoomFields, room_fields
 from hybridmap.verification.shadow import Overwriting
 
 RECTIFIERS = ("relu", "softplus")
@@ -38,6 +41,7 @@ class Scale:
         arena_m: side of the arena of all rate maps.
         lattice_pitch_m, lattice_cells: pixel of the maps of band and grid cells; sampled grid cells per module.
         place_pitch_m, place_cells, place_epochs: pixel of the place cells' maps; cells and passes of the paper's rule.
+        room_m, room_pitch_m: part of the room of 10 x 3 m over which place cells are mapped, and pixel of these maps.
         noise: standard deviations of the neuron noise, as a share of the rate; `noise_repeats` drives of `noise_distance_m`
             for each.
         laps_m, laps_alone_m: length of the drive in laps of the office with noisy neurons, with closures and without.
@@ -56,6 +60,8 @@ class Scale:
     place_pitch_m: float = 0.02
     place_cells: int = 512
     place_epochs: int = 10
+    room_m: tuple[float, float] = ROOM_M
+    room_pitch_m: float = 0.03
     noise: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1)
     noise_repeats: int = 12
     noise_distance_m: float = 40.0
@@ -73,6 +79,7 @@ class CellVerification:
         standstill: the path integrator while the robot stands still.
         lattice, square: rate maps with the hexagonal and with the square metric.
         place: place fields.
+        room_fields: place fields in the room of 10 x 3 m.
         room: (rectifier, steps per second) -> errors of every drive through the room.
         corridor: rectifier -> errors of the drive down the corridor.
         overwritten: rectifier -> response of the pose to a shift of the cells' activity.
@@ -86,6 +93,7 @@ class CellVerification:
     lattice: LatticeMaps
     square: LatticeMaps
     place: PlaceResult
+    room_fields: RoomFields
     recalibrated: LapErrors
     alone: LapErrors
     room: dict[tuple[str, float], list[PathErrors]] = field(default_factory=dict)
@@ -129,7 +137,7 @@ def _tasks(seed: np.random.SeedSequence, scale: Scale, settings: dict[str, objec
     """Every experiment by name, the longest first; each has a seed of its own."""
     paths, others, noises = seed.spawn(3)
     path_seeds = paths.spawn(scale.paths)
-    still, turns, lattice, square, place, corridor, overwritten, lapped = others.spawn(8)
+    still, turns, lattice, square, place, corridor, overwritten, lapped, wandered = others.spawn(9)
     tasks: dict[tuple[Any, ...], Task] = {}
     tasks["recalibrated",] = laps.office_errors, (lapped, settings, scale.laps_m, True)
     tasks["alone",] = laps.office_errors, (lapped, settings, scale.laps_alone_m, False)
@@ -137,6 +145,7 @@ def _tasks(seed: np.random.SeedSequence, scale: Scale, settings: dict[str, objec
         for f in reversed(RECTIFIERS):
             for k, path_seed in enumerate(path_seeds):
                 tasks["room", f, hz, k] = path_error.room_errors, (path_seed, settings | {"rectifier": f}, scale.distance_m, hz)
+    tasks["room_fields",] = room_fields, (wandered, settings, scale.distance_m, scale.room_m, scale.room_pitch_m)
     pitch, cells = scale.lattice_pitch_m, scale.lattice_cells
     tasks["place",] = (
         rate_maps.place_maps,
@@ -184,9 +193,10 @@ def run_tasks(
     progress = progress or (lambda _done, _total: None)
     done = {}
     if count == 1:
-        for number, (key, (function, arguments)) in enumerate(tasks.items()):
-            progress(number, len(tasks))
-            done[key] = function(*arguments)
+        with _quiet():
+            for number, (key, (function, arguments)) in enumerate(tasks.items()):
+                progress(number, len(tasks))
+                done[key] = function(*arguments)
         return done
     with (
         one_thread_for_children(),
@@ -199,6 +209,18 @@ def run_tasks(
             progress(number, len(tasks))
             done[key] = future.result()
     return done
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """What is logged of the cells is left out, as in the processes of a pool."""
+    logger = logging.getLogger("hybridmap")
+    before = logger.level
+    _be_quiet()
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def _be_quiet() -> None:

@@ -37,7 +37,7 @@ def test_verify_keeps_its_bars_and_writes_a_page_that_needs_nothing(run, tmp_pat
     assert json.loads((tmp_path / "cells" / "metrics.json").read_text()) == shown
     page = (tmp_path / "cells" / "verify.html").read_text()
     assert '<meta name="generator" content="hybridmap ' in page  # by which --overwrite knows it
-    assert page.count("data:image/svg+xml;base64,") == 9
+    assert page.count("data:image/svg+xml;base64,") == 10
     assert "http" not in page.replace("http-equiv", "")
     assert sorted(entry.name for entry in (tmp_path / "cells").iterdir()) == ["metrics.json", "verify.html"]
 

@@ -1,5 +1,6 @@
 """One cell: what is disturbed, solved and judged, and that a failure is a result."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -16,7 +17,7 @@ from hybridmap.study import cell as cells
 from hybridmap.study.cells import lay_out
 from hybridmap.study.drive import MappedDrive
 from hybridmap.study.false_loops import with_drift, with_false_loops
-from hybridmap.study.frozen import Frozen
+from hybridmap.study.frozen import Frozen, Mapped
 from hybridmap.study.measures import OF_ODOMETRY
 from hybridmap.study.model import DriftConfig, SyntheticConfig
 from hybridmap.study.sources import SourceTask, laps, prepare
@@ -41,6 +42,14 @@ def test_a_packed_graph_is_the_same_afterwards(frozen):
     assert np.array_equal(known(again.graph).deltas, frozen.graph.deltas)
     assert known(again.graph).entered is None
     assert again.of_truth
+
+
+def test_a_packed_drive_keeps_its_figures_and_its_poses(frozen):
+    drive = Mapped("gtsam-gnc", {"odometry": {"ate_m": 0.5}}, {"cpu_s": 1.0}, {"odometry": frozen.reference + 0.1})
+    again = known(Frozen.unpack(replace(frozen, mapped=drive).pack()).mapped)
+    assert (again.primary, again.figures, again.timings) == (drive.primary, drive.figures, drive.timings)
+    assert set(again.poses) == {"odometry"}
+    assert np.array_equal(again.poses["odometry"], drive.poses["odometry"])
 
 
 def test_figures_say_what_became_of_true_and_false_loops(frozen):
