@@ -264,10 +264,10 @@ class PathIntegrator:
     def _learn(self) -> None:
         """Let the place cells learn, and the attractor receive their input where it is configured."""
         share = self.config.place.attractor_input
-        rates = self.place.learn(self.grid.activity, self.attractor.unwrapped_m(self._last_decoded_m))
+        cells, rates = self.place.learn(self.grid.activity, self.attractor.unwrapped_m(self._last_decoded_m))
         if share > 0.0:
-            self.attractor.receive(self._projection.onto(rates), share)
-            self._projection.learn(rates, self.attractor.activity.ravel())
+            self.attractor.receive(self._projection.onto(rates, cells), share)
+            self._projection.learn(rates, self.attractor.activity.ravel(), cells)
 
     def _disturb(self, translates: bool) -> None:
         """Multiply the rates by 1 + noise: of the ring, which turns, and of the cells that this step updates."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -23,6 +24,18 @@ MAX_CELLS = 32768
 """No more place cells than this are recruited: with their weights some 16 MB, with those onto the attractor 134 MB more."""
 
 log = logging.getLogger(__name__)
+
+
+class Firing(NamedTuple):
+    """What some place cells do; all others are silent.
+
+    Attributes:
+        cells: (k,) int64 numbers of the cells, ascending.
+        rates: (k,) float32, 1 at the peak of a field.
+    """
+
+    cells: NDArray[np.int64]
+    rates: NDArray[np.float32]
 
 
 class PlaceCells:
@@ -53,29 +66,30 @@ class PlaceCells:
         """Return p = A f[W (s - C_inh_g) - C_inh_p] of every recruited cell, (cells,), for sheets (M, N, N); 1 at a peak."""
         return self.respond(self.inputs(sheets))
 
-    def learn(self, sheets: NDArray[np.floating], near_m: Array | None = None) -> NDArray[np.float32]:
+    def learn(self, sheets: NDArray[np.floating], near_m: Array | None = None) -> Firing:
         """One learning step: recruit where nothing responds, else move the responding cells' weights (eq. 8).
 
         Args:
             sheets: (M, N, N) rates of the grid cells.
             near_m: (2,) about where the robot is, m: only cells recruited around there are asked (`around`), as the field of
-                any other lies elsewhere: of the cost of a step only that of a list of rates grows with all cells. None: all
-                are asked. Side peaks of the others, weaker than what recruits, are left out.
+                any other lies elsewhere: a step costs what lies near. None: all are asked. Side peaks of the others, weaker
+                than what recruits, are left out.
 
         Returns:
-            The rates (cells,) of all cells at this position; for a newly recruited cell, its rate after recruiting.
+            What the cells that were asked do at this position; for a newly recruited cell, its rate after recruiting.
         """
         drive = self.inputs(sheets)
-        rates = self._local(drive, near_m)
-        if rates.size == 0 or float(rates.max()) < RECRUIT_THRESHOLD:
+        firing = self._local(drive, near_m)
+        if firing.rates.size == 0 or float(firing.rates.max()) < RECRUIT_THRESHOLD:
             if self._recruit(drive) and near_m is not None:
                 self._in_block.setdefault(_block(near_m), []).append(self._recruited - 1)
             return self._local(drive, near_m)
-        for cell in rates.nonzero()[0].tolist():
+        active = firing.rates.nonzero()
+        for cell, rate in zip(firing.cells[active].tolist(), firing.rates[active].tolist(), strict=True):
             weights = self._weights[cell]
-            weights += np.float32(self.config.learning_rate * float(rates[cell])) * drive  # neither is negative
+            weights += np.float32(self.config.learning_rate * rate) * drive  # neither is negative
             weights *= np.float32(1.0 / math.sqrt(float(weights.dot(weights))))
-        return rates
+        return firing
 
     def respond(self, drive: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the rates (cells,) of the cells to one input vector (inputs,), or (cells, P) to P of them, (inputs, P)."""
@@ -85,16 +99,14 @@ class PlaceCells:
         """Numbers of the cells that were recruited around a position (2,), m: those that are asked there."""
         x, y = _block(near_m)
         blocks = [(x + across, y + along) for across in (-1, 0, 1) for along in (-1, 0, 1)]
-        return [cell for block in blocks for cell in self._in_block.get(block, ())]
+        return sorted(cell for block in blocks for cell in self._in_block.get(block, ()))
 
-    def _local(self, drive: NDArray[np.float32], near_m: Array | None) -> NDArray[np.float32]:
-        """The rates (cells,) of all cells, those recruited far from a position (2,), m, taken as silent."""
+    def _local(self, drive: NDArray[np.float32], near_m: Array | None) -> Firing:
+        """What the cells recruited around a position (2,), m, do; None: all cells."""
         if near_m is None:
-            return self.respond(drive)
-        cells = self.around(near_m)
-        rates = np.zeros(self._recruited, dtype=np.float32)
-        rates[cells] = _above_inhibition(self._weights[cells].dot(drive))
-        return rates
+            return Firing(np.arange(self._recruited), self.respond(drive))
+        cells = np.array(self.around(near_m), dtype=np.int64)
+        return Firing(cells, _above_inhibition(self._weights[cells].dot(drive)))
 
     def _recruit(self, drive: NDArray[np.float32]) -> bool:
         if self._recruited == MAX_CELLS:
@@ -131,30 +143,36 @@ def _above_inhibition(drive: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 class PlaceProjection:
-    """Hebbian weights from the place cells onto the place attractor: a cell learns where the bump is when it fires."""
+    """Hebbian weights from the place cells onto the place attractor: a cell learns where the bump is when it fires.
+
+    Rates are those of the cells of the given numbers (k,), ascending; None: of all cells, from the first on.
+    """
 
     def __init__(self, attractor_cells: int) -> None:
         self._weights = np.zeros((256, attractor_cells), dtype=np.float32)
         self._fired = np.zeros(256, dtype=np.float32)
 
-    def learn(self, rates: NDArray[np.float32], bump: NDArray[np.floating]) -> None:
-        """Move each cell's weights to the mean of the bumps (N * N,) it fired with, weighted by its rates (cells,)."""
-        self._grow(len(rates))
+    def learn(self, rates: NDArray[np.float32], bump: NDArray[np.floating], cells: NDArray[np.int64] | None = None) -> None:
+        """Move each cell's weights to the mean of the bumps (N * N,) it fired with, weighted by its rates (k,)."""
         active = np.flatnonzero(rates)
-        self._fired[active] += rates[active]
-        step = (rates[active] / self._fired[active])[:, None]
-        self._weights[active] += step * (bump.astype(np.float32) - self._weights[active])
+        rows = self._rows(active, cells)
+        self._fired[rows] += rates[active]
+        step = (rates[active] / self._fired[rows])[:, None]
+        self._weights[rows] += step * (bump.astype(np.float32) - self._weights[rows])
 
-    def onto(self, rates: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the input (N * N,) that place cells of rates (cells,) give the attractor; (N * N, P) for P sets (cells, P)."""
-        self._grow(len(rates))
+    def onto(self, rates: NDArray[np.float32], cells: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
+        """Return the input (N * N,) that place cells of rates (k,) give the attractor; (N * N, P) for P sets (k, P)."""
         active = np.flatnonzero(rates.reshape(len(rates), -1).any(axis=1))
-        return np.asarray(self._weights[active].T @ rates[active])
+        rows = self._rows(active, cells)
+        return np.asarray(self._weights[rows].T @ rates[active])
 
-    def _grow(self, cells: int) -> None:
-        while cells > len(self._weights):
+    def _rows(self, active: NDArray[np.int64], cells: NDArray[np.int64] | None) -> NDArray[np.int64]:
+        """Numbers of the cells that fire; there are weights for each of them."""
+        rows = active if cells is None else cells[active]
+        while len(rows) and int(rows[-1]) >= len(self._weights):
             self._weights = np.concatenate([self._weights, np.zeros_like(self._weights)])
             self._fired = np.concatenate([self._fired, np.zeros_like(self._fired)])
+        return rows
 
 
 ATTRACTOR_WIDTH_CELLS = 1.4

@@ -84,12 +84,13 @@ def test_cells_asked_around_the_robot_fire_as_if_all_were_asked():
         if k not in learnt:
             continue
         here, sheets = poses[k, :2], integrator.grid.activity
-        asked, rates = near.around(here), near.learn(sheets, here)
-        of_all, elsewhere = near.rates(sheets), np.ones(len(rates), dtype=bool)
-        elsewhere[asked] = elsewhere[len(rates) - 1 :] = False
+        fired = near.learn(sheets, here)
+        of_all = near.rates(sheets)
+        elsewhere = np.ones(len(of_all), dtype=bool)
+        elsewhere[fired.cells] = False
         every.learn(sheets)
-        assert rates[~elsewhere] == pytest.approx(of_all[~elsewhere], abs=2e-3)  # one step of learning between them
-        assert not rates[elsewhere].any()
+        assert fired.rates == pytest.approx(of_all[fired.cells], abs=2e-3)  # one step of learning between them
+        assert np.array_equal(fired.cells, near.around(here))
         assert of_all[elsewhere].max(initial=0.0) < RECRUIT_THRESHOLD
         silent += not of_all[elsewhere].any()
     assert silent >= 0.75 * len(learnt)
@@ -108,6 +109,21 @@ def test_a_step_asks_no_more_cells_however_many_there_are(integrator):
     assert counts[len(straight) - 1] > 3.5 * counts[quarter]
     assert max(asked[: len(straight)]) <= max(asked[:quarter])
     assert max(asked[laps:]) <= 1.1 * max(asked[len(straight) : laps])
+
+
+def test_what_fires_is_told_by_the_cells_that_were_asked_alone(integrator):
+    """So that a step lists no rate of the thousands of cells elsewhere; what they project is the same."""
+    place, projection, by_all = cells(integrator), PlaceProjection(4), PlaceProjection(4)
+    bumps = np.eye(4, dtype=np.float32)
+    for k, x in enumerate(np.arange(0.0, 20.0, 0.05)):
+        fired = place.learn(sheets_at(integrator, x, 0.0), np.array([x, 0.0]))
+        every = np.zeros(len(place.weights), dtype=np.float32)
+        every[fired.cells] = fired.rates
+        assert projection.onto(*fired[::-1]) == pytest.approx(by_all.onto(every))
+        projection.learn(fired.rates, bumps[k % 4], fired.cells)
+        by_all.learn(every, bumps[k % 4])
+    assert len(place.weights) > 256  # more than there is room for at first
+    assert len(fired.cells) < 0.1 * len(place.weights)
 
 
 def test_newly_recruited_cells_project_nothing_until_they_fire():
