@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from typing import Any
 
 
@@ -131,6 +132,9 @@ FIGURES: dict[str, tuple[str, str]] = {
 A measure that ends in `/` is of a back-end or stage, whose name follows.
 """
 
+PROVED = {"chi2_bound": True, "chi2_gap": False, "certificate_gap": False}
+"""Figures that are proved, and whether they are lower bounds: they are rounded to the safe side."""
+
 ONLINE = "_online"
 """After a measure: of the trajectory that the robot believed at the time."""
 
@@ -149,6 +153,17 @@ def figure(name: str, value: float, **facts: object) -> Metric:
     measure, slash, _ = name.partition("/")
     unit, words = FIGURES[measure.removesuffix(ONLINE) + slash]
     return Metric(name, float(value), unit, words.format(**facts))
+
+
+def proved(value: float, digits: int, *, at_least: bool = False) -> float:
+    """A proved upper bound rounded up to so many significant digits, or a lower one (`at_least`) rounded down.
+
+    Rounded to the nearest it could say more than is proved.
+    """
+    if not math.isfinite(value):
+        return value
+    rounding = ROUND_FLOOR if at_least else ROUND_CEILING
+    return float(Context(prec=digits, rounding=rounding).create_decimal(Decimal(float(value))))
 
 
 def to_json(head: dict[str, Any], metrics: Iterable[Metric]) -> str:

@@ -155,7 +155,7 @@ def _emit(
         "verdicts": {title: one["verdict"] for title, one in said.items()},
         "reasons": {title: one["reasons"] for title, one in said.items()},
         "message": {row.title: row.message for row in rows},
-        "chi2_bound": {row.title: row.certificate.chi2_message for row in rows if row.certificate is not None},
+        "chi2_proof": {row.title: row.certificate.chi2_message for row in rows if row.certificate is not None},
         "certificate": {row.title: row.certificate.message for row in rows if row.certificate is not None},
     }
     emit(head, [*metrics_of(rows), *judged], as_json=True)

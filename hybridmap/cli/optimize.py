@@ -53,7 +53,7 @@ def optimize(
         "backend": backend,
         "status": str(report.status),
         "message": report.summary,
-        "chi2_bound": proof.chi2_message,
+        "chi2_proof": proof.chi2_message,
         "certificate": proof.message,
         "rejected_edge_ids": list(report.rejected_edge_ids),
         "rejected_clusters": [list(cluster) for cluster in report.rejected_clusters],

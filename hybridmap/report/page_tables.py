@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hybridmap.metrics import Metric
+from hybridmap.metrics import PROVED, Metric, proved
 from hybridmap.study.statistics import Interval
 
 _FIRST = ("ate", "relation")
@@ -61,9 +61,11 @@ def of_session(metrics: Sequence[Metric], backends: Sequence[str]) -> list[Table
 
 
 def shown(metric: Metric) -> str:
-    """The value of a metric with four significant digits, and a tick or cross if it has a limit."""
+    """The value of a metric with four significant digits, and a tick or cross if it has a limit. Bounds stay bounds."""
     verdict = "" if metric.passed is None else " ✓" if metric.passed else " ✗"
-    return number(metric.value) + verdict
+    measure = metric.name.partition("/")[0]
+    value = proved(metric.value, 4, at_least=PROVED[measure]) if measure in PROVED else metric.value
+    return number(value) + verdict
 
 
 def number(value: float) -> str:

@@ -85,6 +85,17 @@ def test_a_gap_of_chi2_in_words(gap, word):
     assert Certificate(np.inf, "", chi2=2.0, chi2_bound=2.0 * (1.0 - gap)).chi2_word == word
 
 
+@pytest.mark.parametrize(
+    ("gap", "word"), [(2.401e-6, "<= 2.5e-06"), (0.12301, "<= 12.4 %"), (0.00991, "<= 0.01"), (0.99999, "<= 100 %")]
+)
+def test_what_is_printed_of_a_proof_claims_no_more_than_is_proved(gap, word):
+    proof = Certificate(np.inf, "", chi2=2.0, chi2_bound=2.0 * (1.0 - gap))
+    assert proof.chi2_word == word
+    stated = float(proof.chi2_message.partition("less than ")[2].split()[0])
+    assert proof.chi2_bound * (1.0 - 1e-6) <= stated <= proof.chi2_bound
+    assert Certificate(1.2e-11, "").word == "gap <= 2e-11"
+
+
 def test_a_proved_gap_is_never_below_the_true_one():
     graph, _ = laps(np.random.default_rng(1), nodes=60, noise=6.0)
     best = prove(graph, backends.create("gtsam-lm").solve(graph).poses).objective

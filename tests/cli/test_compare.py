@@ -59,7 +59,7 @@ def test_json_has_a_figure_and_a_status_of_each_back_end(monkeypatch, capsys, sq
     assert told["backends"] == names
     assert told["ways"] == (["incremental"] if "--incremental" in way else ["batch"])
     assert told["start"] == "the poses of the file"
-    assert set(told["status"]) == set(told["chi2_bound"]) == set(told["certificate"]) == set(names)
+    assert set(told["status"]) == set(told["chi2_proof"]) == set(told["certificate"]) == set(names)
     assert told["verdicts"] == {name: "doubtful" if name.startswith("odometry") else "trusted" for name in names}
     assert {name for name, reasons in told["reasons"].items() if reasons} == {"odometry"}
     assert figures["certificate_gap/gtsam-lm"] <= 1e-6

@@ -48,7 +48,7 @@ def test_json_holds_the_figures_and_the_file_has_the_poses_they_are_of(monkeypat
     assert told["status"] == "converged"
     assert told["certificate"].startswith("F = ")
     assert figures["certificate_gap/gtsam-lm"] <= 1e-6
-    assert "no map has less than" in told["chi2_bound"]
+    assert "no map has less than" in told["chi2_proof"]
     assert figures["chi2_bound/gtsam-lm"] <= figures["chi2/gtsam-lm"]
     assert figures["chi2_gap/gtsam-lm"] <= 1e-4
     assert (told["nodes"], told["edges"], told["loops"]) == (4, 4, 1)

@@ -124,6 +124,19 @@ def test_the_figures_of_a_closure_are_in_words_with_units(scene: SessionScene) -
     ]
 
 
+def test_bounds_that_are_proved_stay_bounds_when_they_are_rounded() -> None:
+    texts = [
+        page_tables.shown(Metric(f"{name}/gtsam-lm", value, "1", ""))
+        for name, value in (
+            ("chi2_gap", 0.123412),
+            ("certificate_gap", 1.00001e-9),
+            ("chi2_bound", 20160.96),
+            ("chi2", 1.23456),
+        )
+    ]
+    assert texts == ["0.1235", "1.001e-09", "20160", "1.235"]
+
+
 @pytest.mark.parametrize("measured", [True, False])
 def test_titles_of_overlays_are_as_wide_as_their_axes(scene: SessionScene, measured: bool) -> None:
     from matplotlib.font_manager import FontProperties

@@ -21,6 +21,7 @@ from hybridmap.backends.judging.minorant import chi2_bound
 from hybridmap.backends.objective import chi2
 from hybridmap.geometry import Array
 from hybridmap.graph.pose_graph import PoseGraph
+from hybridmap.metrics import proved
 
 CERTIFIED_GAP = 1e-6
 """Relative gap up to which a solution is called certified."""
@@ -61,7 +62,7 @@ class Certificate:
     @property
     def word(self) -> str:
         """`gap <= 1e-11`, or `not certified`."""
-        return f"gap <= {self.gap:.0e}" if self.certified else "not certified"
+        return f"gap <= {proved(self.gap, 1):.0e}" if self.certified else "not certified"
 
     @property
     def chi2_gap(self) -> float:
@@ -75,7 +76,9 @@ class Certificate:
         """The gap of chi2: `<= 2.4e-06`, `<= 44 %`, or `not proved`."""
         if self.chi2_gap >= 1.0:
             return "not proved"
-        return f"<= {self.chi2_gap:.2g}" if self.chi2_gap < 0.01 else f"<= {100.0 * self.chi2_gap:.3g} %"
+        if self.chi2_gap < 0.01:
+            return f"<= {proved(self.chi2_gap, 2):.2g}"
+        return f"<= {proved(100.0 * self.chi2_gap, 3):.3g} %"
 
     @property
     def chi2_message(self) -> str:
@@ -85,7 +88,7 @@ class Certificate:
         if self.chi2 <= _EXACT:
             return "chi2 is zero up to rounding: every measurement is met, and no map has less"
         return (
-            f"proved: no map has less than {self.chi2_bound:.7g} over the edges kept;"
+            f"proved: no map has less than {proved(self.chi2_bound, 7, at_least=True):.7g} over the edges kept;"
             f" this one has {self.chi2:.7g}, gap {self.chi2_word}"
         )
 
