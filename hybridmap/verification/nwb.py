@@ -13,7 +13,7 @@ import numpy as np
 from hybridmap.errors import ExportError, HybridMapError, StreamError, quoted
 from hybridmap.geometry import Array, wrap_angle
 from hybridmap.trajectory import LATEST_S, NS_PER_S
-from hybridmap.verification.recorded import RATE_HZ, RecordedPath, checked
+from hybridmap.verification.recorded import RATE_HZ, RecordedPath, checked, require_increasing
 from hybridmap.verification.single_cells import PEAK_HZ, PathVerification
 
 _METRES = {"m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 0.01, "centimeter": 0.01, "centimetre": 0.01, "mm": 0.001}
@@ -79,9 +79,10 @@ def _path_in(file: Any, path: Path, pynwb: Any) -> RecordedPath:
     stamps_s = _stamps_s(position, len(values), where)
     headings = None
     if compasses:
-        compass = series[compasses[0]]
-        turned = _values(compass, f"{path}: {compasses[0]}", _RADIANS, "radians").reshape(-1)
-        at_s = _stamps_s(compass, len(turned), f"{path}: {compasses[0]}")
+        compass, there = series[compasses[0]], f"{path}: {compasses[0]}"
+        turned = _values(compass, there, _RADIANS, "radians").reshape(-1)
+        at_s = _stamps_s(compass, len(turned), there)
+        require_increasing(at_s, there)
         headings = np.interp(stamps_s, at_s, np.unwrap(turned))
     stamps_ns = np.round(stamps_s * NS_PER_S).astype(np.int64)
     recorded = RecordedPath(stamps_ns, values[:, :2], headings, file.timestamps_reference_time, f"{path.name}, {name}")

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,7 @@ _COLUMNS = {
     "heading": ("heading", "yaw", "theta", "hd", "head_direction"),
 }
 _UNITS = {"": 1.0, "s": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "rad": 1.0, "deg": np.pi / 180.0}
+_UNITS_OF = {"t": ("s",), "x": ("m", "cm", "mm"), "y": ("m", "cm", "mm"), "heading": ("rad", "deg")}
 _HEADER = "t,x,y (s, m) and, if there is one, heading (rad)"
 
 
@@ -116,6 +118,9 @@ def _columns_of(path: Path, header: Sequence[str]) -> dict[str, tuple[int, float
         for index, name in enumerate(header):
             parts = re.fullmatch(r"(\w+?)(?:_(s|m|cm|mm|rad|deg))?", name.strip().lower())
             if parts and parts[1] in names and quantity not in found:
+                if parts[2] and parts[2] not in _UNITS_OF[quantity]:
+                    expected = " or ".join(_UNITS_OF[quantity])
+                    raise StreamError(f"{path}: the column {quoted(name.strip())} is in {parts[2]}; expected {expected}")
                 found[quantity] = (index, _UNITS[parts[2] or ""])
     if not {"t", "x", "y"} <= found.keys():
         said = quoted(",".join(header)) if header else "nothing"
@@ -138,14 +143,23 @@ def checked(recorded: RecordedPath, where: str) -> RecordedPath:
             f"{where}: found NaN or Inf in {bad.sum()} of {bad.size} samples, first in number {int(bad.argmax())}; "
             "leave such samples out"
         )
-    late = np.diff(recorded.stamps_ns) <= 0
+    require_increasing(recorded.stamps_ns, where)
+    if np.abs(recorded.positions_m).max() > FARTHEST_M:
+        raise StreamError(f"{where}: found positions beyond 1e9 m; expected metres")
+    return recorded
+
+
+def require_increasing(stamps: NDArray[Any], where: str) -> None:
+    """Refuse stamps (N,) that do not increase.
+
+    Raises:
+        StreamError: a stamp is not after the one before.
+    """
+    late = np.diff(stamps) <= 0
     if late.any():
         raise StreamError(
             f"{where}: the stamp of sample {int(late.argmax()) + 1} is not after the one before; sort the samples"
         )
-    if np.abs(recorded.positions_m).max() > FARTHEST_M:
-        raise StreamError(f"{where}: found positions beyond 1e9 m; expected metres")
-    return recorded
 
 
 @dataclass(frozen=True, slots=True)

@@ -109,6 +109,15 @@ def test_units_stamps_and_head_direction_are_those_of_the_file(pynwb, tmp_path):
     assert raw.headings_rad is None
 
 
+def test_head_directions_whose_stamps_go_back_are_refused(pynwb, tmp_path):
+    stamps = 0.04 * np.arange(50)
+    stamps[30] = stamps[10]
+    turn = series(pynwb, np.linspace(0.0, 3.0, 50), "hd", "radians", timestamps=stamps)
+    place = file_with(pynwb, tmp_path / "rat.nwb", series(pynwb, np.ones((50, 2))), compass=turn)
+    with pytest.raises(StreamError, match=r"CompassDirection/hd: the stamp of sample 30 is not after the one before"):
+        read_nwb(place)
+
+
 def nan_at(xy, row):
     xy = xy.copy()
     xy[row] = np.nan

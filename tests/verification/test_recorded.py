@@ -40,6 +40,9 @@ def test_a_table_and_a_tum_file_give_the_same_path(tmp_path):
         ("t,x,y\n1,1,2\n0,1,2\n", ":3: the stamp 0 is not after"),
         ("t,x,y\n1,1,2\n1,1,2\n", ":3: the stamp 1 is not after"),
         ("t,x,y\n0,1e10,2\n", "beyond 1e9 m"),
+        ("t_m,x,y\n0,1,2\n", "column 't_m' is in m; expected s$"),
+        ("t,x_deg,y\n0,1,2\n", "column 'x_deg' is in deg; expected m or cm or mm$"),
+        ("t,x,y,heading_cm\n0,1,2,3\n", "column 'heading_cm' is in cm; expected rad or deg$"),
     ],
 )  # fmt: skip
 def test_a_table_that_is_no_path_is_refused(tmp_path, text, said):
