@@ -79,6 +79,21 @@ class RgbdFrame(Observation):
     depth_m: NDArray[np.float32]
 
 
+def checked_frame(frame: Observation, camera: Camera) -> RgbdFrame:
+    """Return an observation as a frame of a camera.
+
+    Raises:
+        StreamError: not an RGB-D frame, or its size is not the camera's.
+    """
+    if not isinstance(frame, RgbdFrame):
+        raise StreamError(f"vision: expected colour with depth, found {type(frame).__name__}")
+    size = (camera.height_px, camera.width_px)
+    if frame.color.shape[:2] != size or frame.depth_m.shape != size:
+        found = f"colour {frame.color.shape[:2]} and depth {frame.depth_m.shape}"
+        raise StreamError(f"vision: frame at {frame.stamp_ns} ns has {found}, expected {size} rows and columns")
+    return frame
+
+
 def pinhole(calibration: Calibration, T_base_camera: Array) -> Camera:
     """The camera of the undistorted images of a calibration; `T_base_camera` (4, 4) is its optical frame in `base_link`, m."""
     K = calibration.K

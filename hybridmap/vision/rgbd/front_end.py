@@ -15,7 +15,7 @@ from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.edges import Check, Edge
 from hybridmap.metrics import StageClock
 from hybridmap.streams.base import Observation, Rig
-from hybridmap.streams.rgbd import RGBD, Camera, RgbdFrame
+from hybridmap.streams.rgbd import RGBD, Camera, RgbdFrame, checked_frame
 from hybridmap.vision.base import HELD_IMAGES, UNEXPECTED, Belief, Division, View, held
 from hybridmap.vision.profile import image_profile
 from hybridmap.vision.rgbd import checks
@@ -90,14 +90,8 @@ class RgbdFrontEnd:
         Raises:
             StreamError: not an RGB-D frame, or its size is not the camera's.
         """
-        if not isinstance(frame, RgbdFrame):
-            raise StreamError(f"vision: the RGB-D front-end needs colour with depth, found {type(frame).__name__}")
-        size = (self._full_camera.height_px, self._full_camera.width_px)
-        if frame.color.shape[:2] != size or frame.depth_m.shape != size:
-            found = f"colour {frame.color.shape[:2]} and depth {frame.depth_m.shape}"
-            raise StreamError(f"vision: frame at {frame.stamp_ns} ns has {found}, expected {size} rows and columns")
-        self._frame = frame
-        self._image = working_image(frame, self._factor)
+        self._frame = checked_frame(frame, self._full_camera)
+        self._image = working_image(self._frame, self._factor)
         settings = self._config.profile
         profile = image_profile(self._image.grey, self._image.depth_m, settings.width, self._bands, settings.normalise)
         seen = self._templates.recognise(profile)

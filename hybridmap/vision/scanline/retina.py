@@ -13,7 +13,7 @@ from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import Array, wrap_angle
 from hybridmap.streams.base import Observation, Rig
 from hybridmap.streams.laser import LASER, Laser, LaserScan
-from hybridmap.streams.rgbd import RGBD, Camera, RgbdFrame
+from hybridmap.streams.rgbd import RGBD, Camera, checked_frame
 from hybridmap.vision.profile import Profile, image_profile, laser_profile
 
 Indices = NDArray[np.int64]
@@ -97,15 +97,9 @@ class CameraRetina:
         """Take in an RGB-D frame; see `Retina.glance`."""
         import cv2
 
-        if not isinstance(frame, RgbdFrame):
-            raise StreamError(f"vision: scanline by camera needs colour with depth, found {type(frame).__name__}")
-        size = (self._camera.height_px, self._camera.width_px)
-        if frame.color.shape[:2] != size or frame.depth_m.shape != size:
-            found = f"colour {frame.color.shape[:2]} and depth {frame.depth_m.shape}"
-            raise StreamError(f"vision: frame at {frame.stamp_ns} ns has {found}, expected {size} rows and columns")
-        settings = self._settings
-        grey = np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-        depth = np.nan_to_num(frame.depth_m, posinf=0.0)
+        seen, settings = checked_frame(frame, self._camera), self._settings
+        grey = np.asarray(cv2.cvtColor(seen.color, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        depth = np.nan_to_num(seen.depth_m, posinf=0.0)
         profile = image_profile(grey, depth, settings.width, settings.bands, settings.normalise)
         return Glance(profile, (_horizon(depth, self._horizon_row) * self._ahead_per_depth)[self._order])
 
