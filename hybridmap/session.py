@@ -32,6 +32,8 @@ from hybridmap.verdict import Facts, reasons_of, said_of
 
 log = logging.getLogger(__name__)
 
+CORRECTED_ODOMETRY = "odometry, gains corrected"
+"""Title of odometry where gains that were found while driving are in it: it is better than what the wheels said."""
 LOOK_M = 40.0
 """Path length after which a first look ends, m: most drives have told the offset of their clocks by then."""
 
@@ -241,6 +243,7 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: _Recorder, folder: Sessi
         "graph_hash": graph_hash(mapper.map),
         "primary_backend": mapper.backends.primary,
         "backends": list(mapper.backends.names),
+        "titles": {ODOMETRY: CORRECTED_ODOMETRY} if mapper.calibration.changes else {},
         "source": stream.name,
         "failed_backends": dict(mapper.backends.failures),
         "stream": dict(stream.report.counts),

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from hybridmap.calibration.sessions import read_drive
+from hybridmap.calibration.sessions import estimate_of, read_drive
+from hybridmap.cli.show import emit
 from hybridmap.config import Config
+from hybridmap.errors import EvaluationError
 from hybridmap.evaluate import absolute_error
 from hybridmap.evaluate.explain import Explainer
 from hybridmap.geometry import between
@@ -124,6 +126,26 @@ def test_a_calibration_takes_the_gain_off_again(bionic):
     stream = SimulatedStream(Config.load("bionic", DRIVE).simulation, 0)
     raw_m = np.hypot(*np.diff(stream.odometry.poses[:, :2], axis=0).T).sum()
     assert np.hypot(*read_drive(bionic.session.folder.path).motion.steps[:, :2].T).sum() == pytest.approx(raw_m, rel=1e-3)
+
+
+@pytest.mark.parametrize("how", ["bionic", "by_laser"])
+def test_loops_by_profile_tell_no_scale_and_calibrate_nothing(how, request):
+    """The gain of such a map is that of its own odometry: an estimate would be as sure as it is circular."""
+    drive = read_drive(request.getfixturevalue(how).session.folder.path)
+    with pytest.raises(EvaluationError, match=r"loops are by profile alone and tell no scale.*give --reference"):
+        estimate_of([drive])
+
+
+def test_a_reference_calibrates_them_all_the_same(bionic):
+    estimate = estimate_of([read_drive(bionic.session.folder.path)], [bionic.truth])
+    assert estimate.gains.gain == pytest.approx(0.98, abs=0.005)
+
+
+def test_figures_of_odometry_say_that_the_gain_by_the_views_is_in_them(bionic, capsys):
+    head = bionic.session.head
+    assert head["titles"] == {"odometry": "odometry, gains corrected"}
+    emit(head, bionic.session.metrics, as_json=False)
+    assert "gains corrected" in " ".join(capsys.readouterr().out.split())
 
 
 def test_the_rule_as_printed_gives_no_map_and_says_so(tmp_path, bionic):

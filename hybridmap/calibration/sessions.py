@@ -20,7 +20,7 @@ from hybridmap.config import Config
 from hybridmap.config.gone import without_gone
 from hybridmap.errors import EvaluationError, StoreError, counted
 from hybridmap.geometry import Array, between
-from hybridmap.graph.edges import EdgeKind
+from hybridmap.graph.edges import EdgeKind, Method, Status
 from hybridmap.graph.pose_graph import PoseGraph
 from hybridmap.odometry_model import GAIN_KEYS, Gains, remove
 from hybridmap.store import MapStore, SessionFolder
@@ -55,6 +55,7 @@ class Drive:
         config: the part of the session's configuration that a calibration needs: gains, delay and back-ends.
         config_tree: the whole configuration, as stored in the map file.
         sensors: description of the session's sensors, for people.
+        by_profile: whether nothing is registered, and its loops are by profiles along the way, which tell no scale.
         delay_s: delay of the odometry in use: as configured, or as estimated while driving, s.
     """
 
@@ -66,6 +67,7 @@ class Drive:
     config: Config
     config_tree: dict[str, Any]
     sensors: str
+    by_profile: bool = False
     delay_s: float = 0.0
 
 
@@ -95,7 +97,11 @@ def read_drive(folder: Path) -> Drive:
     graph = experiences.pose_graph()
     poses = solutions[primary].poses if primary in solutions else graph.initial
     stamps = np.array([node.stamp_ns for node in experiences.nodes], dtype=np.int64)
-    return Drive(str(folder), motion, graph, stamps, poses, config, tree, sensors, delay_s)
+    measured = {
+        edge.method for edge in experiences.edges if edge.status is Status.ACCEPTED and edge.kind is not EdgeKind.ODOMETRY
+    }
+    by_profile = measured == {Method.SEQUENCE}
+    return Drive(str(folder), motion, graph, stamps, poses, config, tree, sensors, by_profile, delay_s)
 
 
 def estimate_of(
@@ -222,11 +228,16 @@ def alternating(drives: Sequence[Drive], leg_m: float | None = None) -> Estimate
 
 
 def require_closures(drive: Drive) -> None:
-    """Refuse a map of odometry alone: a calibration against it would only give back the odometry.
+    """Refuse a map of odometry alone, or one whose loops tell no scale: a calibration would only give back their odometry.
 
     Raises:
-        EvaluationError: there is no edge besides odometry; registrations suffice, too.
+        EvaluationError: there is no edge besides odometry (registrations suffice, too), or all of them are loops by profile.
     """
+    if drive.by_profile:
+        raise EvaluationError(
+            f"{drive.name}: its loops are by profile alone and tell no scale, so the gain of its map is that of its odometry: "
+            f"give --reference GT.tum, or a session with registrations (configuration rgbd or laser)"
+        )
     if not np.any(drive.graph.kinds != EdgeKind.ODOMETRY):
         raise EvaluationError(
             f"{drive.name}: its map holds odometry edges only; a calibration needs others: give --reference GT.tum, "

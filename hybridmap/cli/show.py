@@ -27,7 +27,8 @@ def emit(head: dict[str, Any], metrics: Iterable[Metric], *, as_json: bool, titl
 
     Args:
         head: facts about the run, the keys of the JSON object beside `metrics`. As text only its `remarks`, `reasons` and
-            `verdict` are shown, below the tables; metrics of its `backends` get a table with a column for each.
+            `verdict` are shown, below the tables; metrics of its `backends` get a table with a column for each, headed by
+            its name or what `titles` calls it.
         metrics: the values to print.
         as_json: print JSON.
         title: title of the tables; not in JSON.
@@ -48,7 +49,7 @@ def emit(head: dict[str, Any], metrics: Iterable[Metric], *, as_json: bool, titl
     if plain:
         console.print(_plain_table(plain))
     if columns:
-        console.print(_table_by_backend([row for row in rows if row not in plain], columns))
+        console.print(_table_by_backend([row for row in rows if row not in plain], columns, head.get("titles", {})))
     lines = [f"note: {remark}" for remark in head.get("remarks", ())]
     lines += [f"reason: {reason['words']}" for reason in head.get("reasons", ())]
     lines += [f"verdict: {head['verdict']}"] if "verdict" in head else []
@@ -83,7 +84,7 @@ def _plain_table(rows: list[Metric]) -> Table:
     return table
 
 
-def _table_by_backend(rows: list[Metric], columns: list[str]) -> Table:
+def _table_by_backend(rows: list[Metric], columns: list[str], titles: dict[str, str]) -> Table:
     from rich.table import Table
 
     from hybridmap.report.page_tables import shown
@@ -92,7 +93,7 @@ def _table_by_backend(rows: list[Metric], columns: list[str]) -> Table:
     table.add_column("figure", no_wrap=True)
     table.add_column("unit")
     for column in columns:
-        table.add_column(column, justify="right", no_wrap=True)
+        table.add_column(titles.get(column, column), justify="right")
     by_name = {row.name: row for row in rows}
     for measure in dict.fromkeys(row.name.partition("/")[0] for row in rows):
         cells = [by_name.get(f"{measure}/{column}") for column in columns]

@@ -60,6 +60,7 @@ def _content(scene: SessionScene, store: MapStore) -> dict[str, Any]:
         "source": scene.source,
         "primary": scene.primary,
         "backends": scene.backends,
+        "titles": scene.head.get("titles", {}),
         "reports": [scene.reports[name] for name in scene.backends if name in scene.reports],
         "known_truth": scene.truth is not None,
         "judged_by": {"reference": "", "relations": ""} | scene.head.get("judged_by", {}),
@@ -86,10 +87,11 @@ def _content(scene: SessionScene, store: MapStore) -> dict[str, Any]:
 def tiles(scene: SessionScene) -> list[Tile]:
     """The main values of a session: accuracy, travel, loops and computing time; those without a metric are left out."""
     named = {metric.name: metric for metric in scene.metrics}
+    odometry = scene.head.get("titles", {}).get(ODOMETRY, ODOMETRY)
     wanted = [
-        (f"ate_rmse/{ODOMETRY}", "ATE of odometry"),
+        (f"ate_rmse/{ODOMETRY}", f"ATE of {odometry}"),
         (f"ate_rmse/{scene.primary}", f"ATE of {scene.primary}"),
-        (f"relation_trans_mean/{ODOMETRY}", "relation error of odometry"),
+        (f"relation_trans_mean/{ODOMETRY}", f"relation error of {odometry}"),
         (f"relation_trans_mean/{scene.primary}", f"relation error of {scene.primary}"),
         ("travel", "driven"),
         ("duration", "recorded"),

@@ -93,6 +93,16 @@ def test_one_loop_is_no_plural(tmp_path: Path) -> None:
         assert [tile.label for tile in tiles(load_scene(folder, store))] == ["nodes", "loop accepted"]
 
 
+def test_odometry_with_corrected_gains_is_called_so(tmp_path: Path) -> None:
+    folder = write_session(tmp_path / "session", ring_map(1.2), keyframes=False)
+    named = {"titles": {"odometry": "odometry, gains corrected"}}
+    folder.write_metrics(
+        named, [Metric("ate_rmse/odometry", 0.3, "m", "error"), Metric("ate_rmse/gtsam-lm", 0.1, "m", "error")]
+    )
+    text = Page(write_report(folder).read_text()).text
+    assert text.count("odometry, gains corrected") == 2  # the tile and the head of the table
+
+
 @pytest.mark.parametrize(
     ("reasons", "said"), [([], "Nothing that was checked"), ([{"words": "node 3: <bent>"}], "node 3: <bent>")]
 )
