@@ -86,7 +86,7 @@ def checked_frame(frame: Observation, camera: Camera) -> RgbdFrame:
         StreamError: not an RGB-D frame, or its size is not the camera's.
     """
     if not isinstance(frame, RgbdFrame):
-        raise StreamError(f"vision: expected colour with depth, found {type(frame).__name__}")
+        raise StreamError(f"vision: mapping by camera needs colour with depth, found {type(frame).__name__}")
     size = (camera.height_px, camera.width_px)
     if frame.color.shape[:2] != size or frame.depth_m.shape != size:
         found = f"colour {frame.color.shape[:2]} and depth {frame.depth_m.shape}"
