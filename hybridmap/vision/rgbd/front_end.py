@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.vision import VisionConfig
-from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.edges import Check, Edge
 from hybridmap.metrics import StageClock
