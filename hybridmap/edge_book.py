@@ -161,13 +161,13 @@ class EdgeBook:
             poses_of: returns the poses (N, 3) of a graph's nodes, as the primary back-end solves it or as the cells show them.
             outliers: numbers of edges that are left out of the graph.
         """
-        own, nodes = self._config.gate == "odometry", self._map.nodes
+        own = self._config.gate == "odometry"
         graph = self._map.pose_graph().only(EdgeKind.ODOMETRY) if own else self._map.pose_graph()
         graph = graph.with_edges(~np.isin(graph.edge_ids, outliers)) if len(outliers) else graph
         return Belief(
             poses_map_node=graph.initial if own else poses_of(graph),
-            stamps_s=np.array([node.stamp_ns for node in nodes]) / NS_PER_S,
-            travel_m=np.array([node.travel_m for node in nodes]),
+            stamps_s=self._map.stamps_ns / NS_PER_S,
+            travel_m=self._map.travel_m,
             covariance_from=covariances_from(graph),
         )
 

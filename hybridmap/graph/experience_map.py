@@ -41,6 +41,8 @@ class ExperienceMap:
     def __init__(self) -> None:
         self._nodes: list[Node] = []
         self._edges: list[Edge] = []
+        self._stamps_ns = _Rows((), np.int64)
+        self._travel_m = _Rows((), np.float64)
         self._initial = _Rows((3,), np.float64)
         self._ends = _Rows((2,), np.int64)
         self._deltas = _Rows((3,), np.float64)
@@ -59,6 +61,16 @@ class ExperienceMap:
     def edges(self) -> tuple[Edge, ...]:
         """Every edge ever proposed, by number, whatever its status."""
         return tuple(self._edges)
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """(N,) time at which each node was made; a copy."""
+        return self._stamps_ns.view().copy()
+
+    @property
+    def travel_m(self) -> Array:
+        """(N,) path length of the drive up to each node, m; a copy."""
+        return self._travel_m.view().copy()
 
     @property
     def initial(self) -> Array:
@@ -83,6 +95,8 @@ class ExperienceMap:
     def add_node(self, node: Node, initial: Array) -> int:
         """Append a node; `initial` (3,) is its pose along the chain of odometry edges, m and rad. Returns its number."""
         self._nodes.append(node)
+        self._stamps_ns.append(node.stamp_ns)
+        self._travel_m.append(node.travel_m)
         self._initial.append(initial)
         return len(self._nodes) - 1
 
@@ -181,7 +195,7 @@ class _Rows:
             self._data = np.concatenate([self._data, np.zeros_like(self._data)])
         self._count += 1
 
-    def append(self, row: NDArray[Any]) -> None:
+    def append(self, row: NDArray[Any] | float) -> None:
         self.grow()
         self._data[self._count - 1] = row
 

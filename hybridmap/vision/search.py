@@ -158,7 +158,8 @@ class ProfileIndex:
 
         most, bands, length = min(count, len(block)), len(self._bands), sought.shape[1]
         if self._circular:
-            turned = np.stack([np.roll(sought[0], -bands * c) for c in self._shifts.tolist()])
+            windows = np.lib.stride_tricks.sliding_window_view(np.concatenate([sought[0], sought[0]]), length)
+            turned = windows[bands * self._shifts % length]
             sums, rows = cv2.batchDistance(turned, block, cv2.CV_32S, None, None, cv2.NORM_L1, most)
             return rows.ravel().astype(np.int64) + first, sums.ravel() / self._width, np.repeat(self._shifts, most)
         sums, rows = np.empty((2, len(self._shifts), 1, most), dtype=np.int32)
