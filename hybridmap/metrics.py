@@ -51,6 +51,7 @@ FIGURES: dict[str, tuple[str, str]] = {
     "loops_pending": ("1", "loop closures still waiting at the end"),
     "loops_rejected": ("1", "loop closures refused, each with its reason"),
     "loops_retracted": ("1", "loop closures that were removed from the graph again"),
+    "loops_proposed_by/": ("1", "of the accepted ones, those that were first proposed by {what}"),
     "loops_tried_again": ("1", "outlier loops, measured again on the final map"),
     "loops_readmitted": ("1", "of those, the ones that now agree with it"),
     "odometry_dropped": ("1", "odometry edges that a registration contradicted"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from hybridmap.config import Config
 from hybridmap.edge_book import Update
 from hybridmap.errors import StreamError, counted
 from hybridmap.geometry import Array, between, compose
-from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Proposer, Status
 from hybridmap.graph.gaps import kidnappings, unobserved
 from hybridmap.graph.io import graph_hash
 from hybridmap.mapper import Mapper
@@ -297,6 +297,12 @@ def _clock_figures(offset: ClockOffset) -> list[Metric]:
     ]
 
 
+def _proposed_by(loops: Sequence[Edge]) -> list[Metric]:
+    """How many accepted loops each proposer found first."""
+    accepted = [loop.proposed_by for loop in loops if loop.status is Status.ACCEPTED]
+    return [figure(f"loops_proposed_by/{who}", accepted.count(who), what=who.words) for who in Proposer]
+
+
 def _measured_again(mapper: Mapper) -> list[Metric]:
     tried, edges = mapper.book.tried_again, mapper.map.edges
     solution = mapper.backends.solutions.get(mapper.backends.primary)
@@ -327,6 +333,7 @@ def _figures(mapper: Mapper, recorder: _Recorder, duration_s: float) -> list[Met
         figure("loops_pending", count[Status.PENDING]),
         figure("loops_rejected", count[Status.REJECTED]),
         figure("loops_retracted", count[Status.RETRACTED]),
+        *_proposed_by(loops),
         *_measured_again(mapper),
         figure("odometry_dropped", len(dropped)),
         *_learnt_noise(mapper),

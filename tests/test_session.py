@@ -20,7 +20,7 @@ from hybridmap.errors import OutputError, StreamError
 from hybridmap.evaluate import evaluate_session
 from hybridmap.evaluate.explain import Explainer
 from hybridmap.geometry import between
-from hybridmap.graph.edges import Search, Status
+from hybridmap.graph.edges import Proposer, Search, Status
 from hybridmap.graph.io import graph_hash
 from hybridmap.store import MapStore
 from hybridmap.trajectory import read_tum
@@ -63,6 +63,16 @@ def test_the_words_of_a_figure_hold_for_every_back_end(finished):
     said = {words["chi2/gtsam-gnc"], words["chi2/relaxation-ratslam"]}
     assert len(said) == 1
     assert not [status for status in SolveStatus if any(status in text for text in said)]
+
+
+def test_each_accepted_loop_counts_for_what_proposed_it(finished):
+    count = {metric.name: metric.value for metric in finished.metrics}
+    by = {who: count[f"loops_proposed_by/{who}"] for who in ("profile", "proximity", "global")}
+    assert sum(by.values()) == count["loops_accepted"]
+    assert by["profile"] > 0
+    with MapStore.open(finished.folder.path) as store:
+        loops = [edge.proposed_by for edge in store.map().edges if edge.status is Status.ACCEPTED]
+    assert {who: loops.count(Proposer(who)) for who in by} == by
 
 
 def test_a_pose_for_every_distinct_stamp(finished):

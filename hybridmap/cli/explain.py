@@ -139,6 +139,8 @@ def _decisions(decisions: Iterable[Decision], node: int) -> Iterator[str]:
         edge = decision.edge
         other = edge.source if edge.target == node else edge.target
         yield f"  {edge.kind.name.lower():12} {other:>5}  {str(edge.status).upper():9} {edge.reason}"
+        if edge.proposed_by is not None:
+            yield _indented("proposed", f"by {edge.proposed_by.words}")
         if edge.checks:
             yield _indented("figures", "; ".join(f"{check} {'yes' if check.passed else 'NO'}" for check in edge.checks))
         if edge.figures:

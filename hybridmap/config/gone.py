@@ -57,7 +57,8 @@ vision.laser.relocalising vision/laser/kidnapping.py span_m unrecognised_probes 
 vision.laser.relocalising vision/laser/kidnapping.py map_violation sure_m
 vision.laser.relocalising vision/laser/checks.py contradiction_sigmas violation:WAY_VIOLATION
 vision.laser.relocalising vision/laser/hypotheses.py modes:MODES_ANYWHERE
-vision.laser.revisits vision/laser/revisits.py radius_m every_m apart_m partners probe_half_m target_half_m
+vision.laser.revisits vision/laser/revisits.py radius_m partners probe_half_m target_half_m
+vision.laser.revisits vision/laser/panorama.py every_m apart_m
 vision.laser.revisits vision/laser/revisits.py search_m search_deg ambiguous_m floor_m floor_deg
 vision.laser.retrace vision/laser/dense_trajectory.py block_nodes radius_m map_nodes prior_m prior_deg
 vision.laser.retrace vision/laser/dense_trajectory.py inliers_min off_max_m off_max_deg

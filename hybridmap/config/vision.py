@@ -75,8 +75,9 @@ class TrackingConfig(Section):
 class ClosingConfig(Section):
     """Search for loop closures by laser or camera."""
 
-    by: Literal["geometry", "scanline", "ratslam", "nothing"] = "geometry"
-    """`geometry`: scans, features and depth are registered to each other, and measure motion and loops; `scanline`: the paper's
+    by: Literal["geometry", "proximity", "scanline", "ratslam", "nothing"] = "geometry"
+    """`geometry`: profiles propose loops, scans, features and depth are registered to each other, and measure motion and loops;
+    `proximity`: the same, but no profile proposes a loop unless the robot is lost (for comparison); `scanline`: the paper's
     means alone, profiles that match along a stretch of the way (`vision.matching.sequence`); `ratslam`: RatSLAM's view cells
     and pose cells; `nothing`: registrations measure motion as with `geometry`, and no loop is closed.
 
@@ -186,9 +187,8 @@ class RgbdClosingConfig(Section):
 class RgbdConfig(Section):
     """Mapping with an RGB-D camera: scanline profiles, visual features, depth registration."""
 
-    matching: Literal["literal", "ratio", "signed", "plain", "four-band", "nearest"] = "four-band"
-    """How candidates are ranked: by the paper's single-band profile with one of four readings of G, by four row bands, or
-    without a profile, the nearest on the map first (for comparison; a robot that is lost is still searched for by four bands).
+    matching: Literal["literal", "ratio", "signed", "plain", "four-band"] = "four-band"
+    """How candidates are ranked: by the paper's single-band profile with one of four readings of G, or by four row bands.
 
     Watch: `literal` is inverted, see [the paper](paper.md).
     """
@@ -212,12 +212,6 @@ class RgbdConfig(Section):
     """Verification."""
     closing: RgbdClosingConfig = RgbdClosingConfig()
     """Gate and candidates."""
-
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        if self.matching == "nearest" and self.verify == "none":
-            raise ValueError("expected verify: pnp where matching is nearest, as no profile gives an edge, found none")
-        return self
 
 
 class VisionConfig(Section):
@@ -243,3 +237,9 @@ class VisionConfig(Section):
     """Laser front-end."""
     rgbd: RgbdConfig = RgbdConfig()
     """RGB-D front-end."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.closing.by == "proximity" and self.rgbd.verify == "none":
+            raise ValueError("expected verify: pnp where closing.by is proximity, as no profile gives an edge, found none")
+        return self

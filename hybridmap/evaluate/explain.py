@@ -61,6 +61,7 @@ class Decision:
             "lack": e.lack,
             "method": e.method,
             "search": e.search,
+            "proposed_by": e.proposed_by,
             "figures": {name: _plain(value) for name, value in e.figures.items()},
             "carried_m": e.kidnapped_m,
             "broken_by": [_told(check) for check in e.broken_by],
@@ -68,8 +69,7 @@ class Decision:
             "otherwise": e.otherwise,
             "weights": dict(self.weights),
             "inconsistent": list(self.inconsistent),
-            "error_m": None if self.error is None else self.error[0],
-            "error_deg": None if self.error is None else self.error[1],
+            **dict(zip(("error_m", "error_deg"), self.error or (None, None), strict=True)),
         }
 
 

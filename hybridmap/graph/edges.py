@@ -73,6 +73,19 @@ class Search(StrEnum):
         return _SEARCHES[self]
 
 
+class Proposer(StrEnum):
+    """What proposed the two nodes of a loop first."""
+
+    PROFILE = "profile"
+    PROXIMITY = "proximity"
+    GLOBAL = "global"
+
+    @property
+    def words(self) -> str:
+        """The proposer in words."""
+        return _PROPOSERS[self]
+
+
 class Lack(StrEnum):
     """Why an edge is not in the graph, if it is not for a failed check."""
 
@@ -111,6 +124,11 @@ _SEARCHES = {
     Search.WHOLE_MAP: "found on the whole map",
     Search.NEAR: "near on the map",
     Search.AGAIN: "measured again, as a back-end gave it no weight",
+}
+_PROPOSERS = {
+    Proposer.PROFILE: "their profiles",
+    Proposer.PROXIMITY: "their nearness on the map",
+    Proposer.GLOBAL: "a search of the whole map",
 }
 _LACKS = {
     Lack.WAITING: ("waits for other edges that agree with it", "other edges near it that agree with it"),
@@ -240,6 +258,7 @@ class Edge:
         checks: the measured values that decided, with their limits, in order.
         lack: what the edge lacked beside checks; None if nothing.
         method, search: what measured the edge, and why its nodes were compared; None if unknown.
+        proposed_by: of a loop, what proposed it first, however often it was measured later; None if unknown.
         shift: columns by which the view of the target is shifted against that of the source.
         figures: further measured values, by name; nothing is decided by them.
         kidnapped_m: for the edge across a kidnapping, how far from its pose by odometry the robot was found;
@@ -261,6 +280,7 @@ class Edge:
     lack: Lack | None = field(default=None, kw_only=True)
     method: Method | None = field(default=None, kw_only=True)
     search: Search | None = field(default=None, kw_only=True)
+    proposed_by: Proposer | None = field(default=None, kw_only=True)
     shift: int = field(default=0, kw_only=True)
     figures: Mapping[str, float] = field(default_factory=dict, kw_only=True)
     kidnapped_m: float | None = field(default=None, kw_only=True)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, inverse
-from hybridmap.graph.edges import Edge, EdgeKind, Method, Search, at_most
+from hybridmap.graph.edges import Edge, EdgeKind, Method, Proposer, Search, at_most
 from hybridmap.metrics import StageClock
 from hybridmap.neural.pose_cells import CELL_M, CELL_RAD, PoseCells
 from hybridmap.ratslam.experiences import Decision, Experience, Experiences
@@ -101,6 +101,7 @@ class RatslamFrontEnd:
                 checks,
                 method=Method.PROFILE,
                 search=Search.GATE,
+                proposed_by=Proposer.PROFILE,
                 shift=seen.shift,
             )
         ]

@@ -18,7 +18,7 @@ from pydantic import TypeAdapter
 
 from hybridmap.backends.base import SolveReport, SolveStatus
 from hybridmap.errors import StoreError
-from hybridmap.graph.edges import Check, Edge, Lack, Method, Need, Search
+from hybridmap.graph.edges import Check, Edge, Lack, Method, Need, Proposer, Search
 from hybridmap.streams.base import Rig
 from hybridmap.streams.cameras import decode_picture
 from hybridmap.streams.sensors import kinds
@@ -266,6 +266,7 @@ def record_to_json(edge: Edge) -> str:
         "lack": edge.lack,
         "method": edge.method,
         "search": edge.search,
+        "proposed_by": edge.proposed_by,
         "figures": {name: float(value) for name, value in edge.figures.items()},
         "shift": edge.shift,
         "carried_m": edge.kidnapped_m,
@@ -309,6 +310,7 @@ _OF_EDGES: dict[str, Callable[[Any], Any]] = {
     "lack": Lack,
     "method": Method,
     "search": Search,
+    "proposed_by": Proposer,
     "figures": _figures,
     "shift": int,
     "contradicts_odometry": bool,

@@ -75,6 +75,33 @@ def laser_profile(ranges_m: NDArray[np.float32], bearings_rad: Array, width: int
     return normalised(_fill_with_mean(mean, seen[None]), normalise).astype(np.float32)
 
 
+FARTHEST_M, UNIT_M = 20.0, 2.0
+"""Distance beyond which nothing counts in a panoramic profile, and the one whose logarithm is 0 there, m."""
+
+
+def panoramic_profile(points: Array, width: int) -> Profile:
+    """Profile of all surroundings of a robot: the distance of the nearest and of the farthest point in each column of bearing.
+
+    Distances are logarithms, so that ratios count. They are not normalised: a laser measures metres, and a wide corridor is
+    another place than a narrow one.
+
+    Args:
+        points: (P, 2) what the scans around saw, in the robot's frame, m.
+        width: columns, which divide the full circle, beginning behind the robot.
+
+    Returns:
+        (2, width) float32: nearest, farthest. Columns without any point have the largest distance in both.
+    """
+    away = np.clip(np.hypot(points[:, 0], points[:, 1]), 0.1 * UNIT_M, FARTHEST_M)
+    turn = np.arctan2(points[:, 1], points[:, 0]) + np.pi
+    column = (turn * (width / (2.0 * np.pi))).astype(np.int64) % width
+    out = np.full((2, width), FARTHEST_M)
+    out[1, column] = 0.0
+    np.minimum.at(out[0], column, away)
+    np.maximum.at(out[1], column, away)
+    return np.log(out / UNIT_M).astype(np.float32)
+
+
 def normalised(bands: NDArray[np.floating], how: Normalise) -> NDArray[np.floating]:
     """Normalise each row of `(bands, width)`: `z` to mean 0 and standard deviation 1, `mean` to mean 1; flat rows stay flat."""
     mean = bands.mean(axis=1, keepdims=True)

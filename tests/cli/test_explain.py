@@ -36,6 +36,7 @@ def test_a_node_is_told_in_words(run, session):
     assert "nearest      of the older nodes on the final map: 19, 0.00 m" in out
     assert "loops to older nodes: 2 accepted, 1 rejected" in out
     assert "REJECTED  matches 8 < 12" in out
+    assert out.count("proposed   by their profiles") == 1
     assert "off by     3.804 m" in out
 
 
@@ -80,6 +81,7 @@ def test_json_is_one_object(run, session):
     assert tree["primary_backend"] == "gtsam-lm"
     assert tree["frame"]["made_node"] is True
     assert [row["target"] for row in tree["node"]["loops"]] == [19, 29, 3]
+    assert [row["proposed_by"] for row in tree["node"]["loops"]] == ["profile", None, None]
     assert tree["metrics"] == []
     assert "node" not in json.loads(run(session, "--frame", 12.5, "--json")[1])
 

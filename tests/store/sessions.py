@@ -8,7 +8,7 @@ import numpy as np
 
 from hybridmap.backends.base import SolveReport, SolveStatus
 from hybridmap.geometry import RelativePose, between, compose
-from hybridmap.graph.edges import Edge, EdgeKind, Status, at_least
+from hybridmap.graph.edges import Edge, EdgeKind, Proposer, Status, at_least
 from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.store import MapStore, SessionFolder, trajectory_of
 from hybridmap.streams.base import Rig
@@ -58,7 +58,18 @@ def ring_map(laps: float = 1.5, *, loops: bool = True, false_loop: bool = False)
             relative = RelativePose(between(truth[k], truth[k - 40]) + np.array([0.01, 0, 0]), covariance)
             figures = {"overlap": 0.1 + 0.2}
             checks = (at_least("fit", 0.9, 0.7, "vision.laser.probes.fit_min"),)
-            experiences.add_edge(Edge(k, k - 40, EdgeKind.LOOP, Status.ACCEPTED, relative, checks=checks, figures=figures))
+            experiences.add_edge(
+                Edge(
+                    k,
+                    k - 40,
+                    EdgeKind.LOOP,
+                    Status.ACCEPTED,
+                    relative,
+                    checks=checks,
+                    figures=figures,
+                    proposed_by=Proposer.PROFILE,
+                )
+            )
             experiences.add_edge(Edge.decided(k, k - 30, EdgeKind.LOOP, None, [at_least("matches", 8, 12)]))
     if false_loop:
         relative = RelativePose(np.zeros(3), covariance)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hybridmap.vision.profile import image_profile, laser_profile, normalised
+from hybridmap.vision.profile import FARTHEST_M, UNIT_M, image_profile, laser_profile, normalised, panoramic_profile
 
 RNG = np.random.default_rng(5)
 
@@ -82,3 +82,27 @@ def test_each_column_of_a_scan_is_the_mean_of_its_returns_from_the_first_to_the_
     assert np.allclose(laser_profile(ranges, bearings, 8, "mean")[0], expected)
     pairs = np.repeat(np.arange(1.0, 9.0), 2) + np.tile([-0.25, 0.25], 8)
     assert np.allclose(laser_profile(pairs.astype(np.float32), np.linspace(-1, 1, 16), 8, "mean")[0], np.arange(1.0, 9.0) / 4.5)
+
+
+def test_a_panorama_holds_the_nearest_and_the_farthest_point_of_each_column():
+    bearings = np.deg2rad([0.5, 1.0, 91.0])
+    away = np.array([2.0, 6.0, 40.0])
+    profile = panoramic_profile(away[:, None] * np.column_stack([np.cos(bearings), np.sin(bearings)]), 8)
+    assert profile.shape == (2, 8)
+    assert profile.dtype == np.float32
+    farthest = np.log(FARTHEST_M / UNIT_M)
+    expected = np.full((2, 8), farthest)
+    expected[:, 4] = np.log(np.array([2.0, 6.0]) / UNIT_M)  # straight ahead is the middle; what is too far is not seen
+    assert np.allclose(profile, expected)
+
+
+def test_a_turn_of_the_robot_shifts_a_panorama():
+    points = RNG.uniform(-8.0, 8.0, (400, 2))
+    turn = 2.0 * np.pi * 5 / 64
+    cos, sin = np.cos(turn), np.sin(turn)
+    seen = points @ np.array([[cos, -sin], [sin, cos]])  # by a robot that turned left by five columns
+    assert np.allclose(np.roll(panoramic_profile(points, 64), -5, axis=1), panoramic_profile(seen, 64), atol=1e-5)
+
+
+def test_without_points_a_panorama_is_open_all_around():
+    assert np.allclose(panoramic_profile(np.zeros((0, 2)), 16), np.log(FARTHEST_M / UNIT_M))

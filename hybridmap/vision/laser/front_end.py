@@ -23,6 +23,7 @@ from hybridmap.vision.laser.dense_trajectory import DenseTrajectory, ObservedSca
 from hybridmap.vision.laser.division import divide
 from hybridmap.vision.laser.hypotheses import LENGTH_M, Prober
 from hybridmap.vision.laser.kidnapping import Continuity, GlobalLocalisation
+from hybridmap.vision.laser.panorama import ALIKE, Panoramas
 from hybridmap.vision.laser.revisits import Reviser
 from hybridmap.vision.laser.submap import Atlas, violation_of_step
 from hybridmap.vision.laser.tracking import Step, Tracker, contradicts
@@ -53,8 +54,10 @@ class LaserFrontEnd:
         self._laser = laser
         self.atlas = Atlas()
         self._tracker = Tracker(self.atlas)
-        self._prober = Prober(config, self.atlas, laser)
-        self._reviser = Reviser(config, self.atlas, laser)
+        proposed = 0 if config.closing.by == "proximity" else ALIKE
+        self._panoramas = Panoramas(self.atlas, config.profile.width, proposed)
+        self._prober = Prober(config, self.atlas, laser, self._panoramas)
+        self._reviser = Reviser(config, self.atlas, laser, self._panoramas)
         self._commitment = Commitment(self.atlas.travel_m.__getitem__)
         self._templates = ViewTemplates(config.profile.width // 16, config.matching.mu_r, config.matching.mu_d)
         self._profiles: list[NDArray[np.float32]] = []
@@ -139,6 +142,7 @@ class LaserFrontEnd:
 
     def _probe(self, node: int, belief: Belief) -> list[Edge]:
         self._last_probe_m = self.atlas.travel_m[node]
+        self._panoramas.extend()
         hypotheses, out = self._prober.probe(node, belief, self.localisation.since), []
         self.localisation.probed(node, hypotheses, belief)
         for hypothesis in hypotheses:
@@ -152,6 +156,7 @@ class LaserFrontEnd:
 
         See `FrontEnd.finish`.
         """
+        self._panoramas.extend(to_the_end=True)
         last, out = len(self.atlas) - 1, []
         if last >= 0 and self.atlas.travel_m[last] - self._last_probe_m > LAST_PROBE_M:
             out = self._probe(last, belief)
@@ -165,7 +170,8 @@ class LaserFrontEnd:
     def verify(self, outliers: Sequence[Edge], belief: Belief) -> list[Edge]:
         """Measure again, from the poses of the map, loops that a back-end down-weighted as outliers; returns all of them."""
         poses = belief.poses_map_node
-        return [self._reviser.register(edge.source, edge.target, poses, Search.AGAIN).proposed(edge.key) for edge in outliers]
+        again = [self._reviser.register(e.source, e.target, poses, e.proposed_by, Search.AGAIN) for e in outliers]
+        return [found.proposed(edge.key) for found, edge in zip(again, outliers, strict=True)]
 
     @property
     def reach_m(self) -> float:

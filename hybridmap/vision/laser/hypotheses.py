@@ -9,17 +9,21 @@ import numpy as np
 
 from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, invert_relative, wrap_angle
-from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, passed
+from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Proposer, Search, passed
 from hybridmap.streams.laser import Laser
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser import checks
 from hybridmap.vision.laser.cloud import CELL_M, Cloud
+from hybridmap.vision.laser.panorama import Panoramas
 from hybridmap.vision.laser.scan_matching import (
+    SEPARATE_DEG,
+    SEPARATE_M,
     STEP_DEG,
     STEP_M,
     Start,
     align,
     ambiguity_of,
+    score_starts,
     sharpened,
     spaced,
     square,
@@ -44,6 +48,14 @@ TARGETS = 16
 MODES_PER_TARGET, MODES, MODES_SURE, MODES_ANYWHERE = 2, 6, 3, 8
 """Separated modes that are verified: of a target; of a probe; of one in narrow gates, where one place is in question; of one
 on the whole map."""
+LEADS = 8
+"""Starts by profile that are searched closely, those on which most profiles agree first."""
+OLD_WAY_M = 3.0
+"""Largest travel from a node by profile to the anchor of its target, m: half of that between two anchors, and a step more."""
+ABOUT_M, ABOUT_DEG = 0.9, 6.0
+"""Half-widths of the search about a start by profile, m and degrees."""
+ABOUT_MIN = 0.4
+"""Least likelihood of the best start near it: where it is less, hardly a registration passes."""
 SURE_SIGMA_M = 0.8
 """A gate is narrow below this standard deviation, m: rooms are farther apart."""
 FLOOR_M, FLOOR_DEG = 0.004, 0.04
@@ -75,6 +87,7 @@ class Hypothesis:
         fits: whether enough points of the scans fit, whatever the other checks say.
         misfit: share of points that do not fit, plus share of walls in the other's free space.
         pieces: number of separate things that the probe saw; 0 if not counted.
+        proposed_by: what proposed the loop first.
     """
 
     probe: int
@@ -88,6 +101,7 @@ class Hypothesis:
     fits: bool
     misfit: float
     pieces: int = 0
+    proposed_by: Proposer | None = None
 
     @property
     def passed(self) -> bool:
@@ -115,6 +129,7 @@ class Hypothesis:
             lack if self.passed else None,
             method=Method.SCANS,
             search=self.search,
+            proposed_by=self.proposed_by,
             figures=self.figures,
             key=key,
         )
@@ -142,18 +157,26 @@ class _Candidate:
 
 @dataclass(frozen=True, slots=True)
 class _Mode:
-    """A promising start: pose (3,) of the probe in the target's frame and its score."""
+    """A promising start: pose (3,) of the probe in the target's frame, its score, and what proposed it."""
 
     gate: _Gate
     target: Submap
     pose: Array
     score: float
+    proposed_by: Proposer
+
+    def is_near(self, other: _Mode) -> bool:
+        """Whether a registration from one start would find that of the other: both are on one target and not separated."""
+        off = between(self.pose, other.pose)
+        near = np.hypot(off[0], off[1]) < SEPARATE_M and abs(off[2]) < np.deg2rad(SEPARATE_DEG)
+        return self.gate.anchor == other.gate.anchor and bool(near)
 
 
 class Prober:
     """Registers the submap of the last metres (the probe) to old submaps, to find loop closures."""
 
-    def __init__(self, config: VisionConfig, atlas: Atlas, laser: Laser) -> None:
+    def __init__(self, config: VisionConfig, atlas: Atlas, laser: Laser, panoramas: Panoramas) -> None:
+        self._panoramas = panoramas
         self._gate_sigmas, self._fit_min = config.closing.gate_sigmas, config.laser.probes.fit_min
         self._atlas = atlas
         self._laser = laser
@@ -161,6 +184,8 @@ class Prober:
 
     def probe(self, node: int, belief: Belief, since: int = 0) -> list[Hypothesis]:
         """Register the last metres before a node to the old submaps that may be nearby.
+
+        The starts that profiles propose come first. Only if none of these passes all checks, the whole gate is searched.
 
         Args:
             node: the newest node of the probe.
@@ -176,14 +201,18 @@ class Prober:
         middle = 0.5 * (atlas.travel_m[int(recent[0])] + atlas.travel_m[node])
         probe = atlas.submap(int(recent[np.searchsorted(np.asarray(atlas.travel_m)[recent], middle)]), recent)
         gates = self._gates(probe.anchor, int(recent[0]), since, belief)
-        modes = self._search(gates, probe)
-        sure = all(mode.gate.sigma_m < SURE_SIGMA_M for mode in modes)
-        return _distinct([self._verify(mode, probe, Search.GATE) for mode in modes[: MODES_SURE if sure else MODES]])
+        by_profile = self._by_profile(gates, probe)
+        found = self._verified(by_profile, probe)
+        if not any(h.passed for h in found):
+            modes = self._search(gates, probe, Proposer.PROXIMITY)
+            tried = by_profile[: len(found)]
+            found += self._verified([m for m in modes if not any(m.is_near(t) for t in tried)], probe)
+        return _distinct(found)
 
     def probe_anywhere(self, probe: Submap, anchors: Sequence[int]) -> list[Hypothesis]:
         """Register a submap to the old submaps around the nodes `anchors`, without an expected pose; returns as `probe`."""
         gates = [_Gate(anchor, IDENTITY, UNKNOWN, np.pi, UNKNOWN) for anchor in anchors]
-        modes = self._search(gates, probe)[:MODES_ANYWHERE]
+        modes = self._search(gates, probe, Proposer.GLOBAL)[:MODES_ANYWHERE]
         return _distinct([self._verify(mode, probe, Search.WHOLE_MAP) for mode in modes])
 
     def anchors_before(self, node: int) -> list[int]:
@@ -194,12 +223,54 @@ class Prober:
         first = atlas.piece(node).start
         return [a for a in self._anchors if a < first or (a < node and atlas.travel_m[a] < limit)]
 
-    def _search(self, gates: list[_Gate], probe: Submap) -> list[_Mode]:
+    def _verified(self, modes: list[_Mode], probe: Submap) -> list[Hypothesis]:
+        """The most promising starts inside the gate, registered."""
+        sure = all(mode.gate.sigma_m < SURE_SIGMA_M for mode in modes)
+        return [self._verify(mode, probe, Search.GATE) for mode in modes[: MODES_SURE if sure else MODES]]
+
+    def _by_profile(self, gates: list[_Gate], probe: Submap) -> list[_Mode]:
+        """Starts inside the gate where the profiles of the probe put it, the best first."""
+        if not gates:
+            return []
+        leads = self._panoramas.leads(probe.anchor, probe.nodes)
+        chain, travel = self._atlas.chain, self._atlas.travel_m
+        if len(leads.old) == 0:
+            return []
+        ways_m = (np.array([travel[i] for i in nodes]) for nodes in (leads.old.tolist(), [gate.anchor for gate in gates]))
+        away_m = np.abs(np.subtract.outer(*ways_m))
+        of = away_m.argmin(axis=1)
+        expected, anchors = (np.array(rows)[of] for rows in zip(*((g.expected, chain[g.anchor]) for g in gates), strict=True))
+        radius, heading = np.array([(gate.radius_m, gate.heading_rad) for gate in gates])[of].T
+        off = between(anchors, leads.poses) - expected
+        inside = (away_m.min(axis=1) <= OLD_WAY_M) & (np.hypot(off[:, 0], off[:, 1]) <= radius + ABOUT_M)
+        inside &= np.abs(wrap_angle(off[:, 2])) <= heading + np.deg2rad(ABOUT_DEG)
+        modes: list[_Mode] = []
+        for old, pose in leads.where(inside).agreed()[:LEADS]:
+            gate = min(gates, key=lambda g: abs(travel[old] - travel[g.anchor]))
+            modes += self._about(gate, between(chain[gate.anchor], pose), probe)
+        return sorted(modes, key=lambda m: -m.score)
+
+    def _about(self, gate: _Gate, start: Array, probe: Submap) -> list[_Mode]:
+        """The likeliest start near a pose (3,) of the probe in a target's frame; none where nothing fits."""
+        if np.hypot(start[0], start[1]) > WINDOW_M:
+            return []
+        target = self._atlas.around(gate.anchor, TARGET_HALF_M)
+        sharp = self._atlas.scoring_field(target, Field.SHARP)
+        headings = start[2] + np.deg2rad(spaced(ABOUT_DEG, STEP_DEG))
+        offsets = square(ABOUT_M, STEP_M)
+        scores = score_starts(sharp, probe.cloud.thinned(POINTS).points, start[:2], headings, offsets)
+        h, t = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        if scores[h, t] < ABOUT_MIN:
+            return []
+        pose = np.array([*(start[:2] + offsets[t]), headings[h]])
+        return [_Mode(gate, target, pose, float(scores[h, t]), Proposer.PROFILE)]
+
+    def _search(self, gates: list[_Gate], probe: Submap, proposed_by: Proposer) -> list[_Mode]:
         """Promising starts on the likeliest targets, the best first."""
         candidates = [self._candidate(gate, probe) for gate in gates]
         candidates = sorted((k for k in candidates if k.starts), key=lambda k: -k.starts[0].score)
         chosen = candidates[:TARGETS]
-        return sorted((mode for k in chosen for mode in self._modes(k, probe)), key=lambda m: -m.score)
+        return sorted((mode for k in chosen for mode in self._modes(k, probe, proposed_by)), key=lambda m: -m.score)
 
     def _extend_anchors(self) -> None:
         travel = self._atlas.travel_m
@@ -240,11 +311,11 @@ class Prober:
         wide = self._atlas.scoring_field(target, Field.WIDE)
         return _Candidate(gate, target, survivors(wide, points, offsets[inside], headings))
 
-    def _modes(self, candidate: _Candidate, probe: Submap) -> list[_Mode]:
+    def _modes(self, candidate: _Candidate, probe: Submap, proposed_by: Proposer) -> list[_Mode]:
         """Separated maxima of the likelihood on one target."""
         sharp = self._atlas.scoring_field(candidate.target, Field.SHARP)
         starts = sharpened(sharp, probe.cloud.thinned(POINTS).points, candidate.starts, MODES_PER_TARGET)
-        return [_Mode(candidate.gate, candidate.target, start.pose, start.score) for start in starts]
+        return [_Mode(candidate.gate, candidate.target, start.pose, start.score, proposed_by) for start in starts]
 
     def _verify(self, mode: _Mode, probe: Submap, search: Search) -> Hypothesis:
         gate = mode.gate
@@ -279,13 +350,14 @@ class Prober:
             fits,
             1.0 - fit + seen,
             pieces,
+            mode.proposed_by,
         )
 
 
 def _pieces(cloud: Cloud) -> int:
     """Number of separate things in a cloud: of squares in which it has points."""
-    squares = np.floor(cloud.points / (PIECE_M * cloud.cell_m / CELL_M)).astype(np.int64)
-    return len(np.unique(squares, axis=0))
+    x, y = np.floor(cloud.points / (PIECE_M * cloud.cell_m / CELL_M)).astype(np.int64).T
+    return len(np.unique((x << 32) + y))
 
 
 def _distinct(found: list[Hypothesis]) -> list[Hypothesis]:

@@ -9,20 +9,21 @@ from numpy.typing import NDArray
 
 from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import Array, between, invert_relative, wrap_angle
-from hybridmap.graph.edges import Search, passed
+from hybridmap.graph.edges import Proposer, Search, passed
 from hybridmap.streams.laser import Laser
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser import checks
 from hybridmap.vision.laser.hypotheses import Hypothesis
+from hybridmap.vision.laser.panorama import APART_M, Panoramas
 from hybridmap.vision.laser.scan_matching import Prior, align, ambiguity_of, score_starts, spaced, square
 from hybridmap.vision.laser.submap import Atlas, Field, violation_both_ways
 
+Indices = NDArray[np.int64]
+
 RADIUS_M = 2.5
 """Largest distance of nodes that are registered again, m: they see the same room."""
-EVERY_M = 1.0
-"""Travel between two nodes that take part, m."""
-APART_M, PARTNERS = 12.0, 3
-"""Travel between two passes, m, and most earlier passes that a node is registered to."""
+PARTNERS = 3
+"""Most earlier passes that a node is registered to."""
 PROBE_HALF_M, TARGET_HALF_M = 1.5, 4.0
 """Half-lengths of the submaps about a node and about its partner, m: short, so that neither bends."""
 SEARCH_M, SEARCH_DEG = 0.45, 4.5
@@ -42,17 +43,19 @@ FLOOR_M, FLOOR_DEG = 0.002, 0.025
 class Reviser:
     """Registers nodes that are near each other on the optimised map, in rounds."""
 
-    def __init__(self, config: VisionConfig, atlas: Atlas, laser: Laser) -> None:
+    def __init__(self, config: VisionConfig, atlas: Atlas, laser: Laser, panoramas: Panoramas) -> None:
         self._most_rounds, self._fit_min = config.closing.revisit_rounds, config.laser.probes.fit_min
         self._atlas = atlas
         self._laser = laser
+        self._panoramas = panoramas
         self._rounds = 0
         self._done: set[tuple[int, int]] = set()
 
     def round(self, belief: Belief, since: int = 0) -> list[Hypothesis]:
-        """Register nodes, one a metre of travel, to the nearest of up to three earlier passes; failed ones are returned too.
+        """Register nodes with a panorama to one of each of up to three earlier passes; failed ones are returned too.
 
-        Pairs of earlier rounds are left out. The list is empty after the configured number of rounds.
+        Partners are what the panoramas propose out of the whole map, if that is near on this map; then, of passes without any,
+        the nearest. Pairs of earlier rounds are left out. The list is empty after the configured number of rounds.
 
         Args:
             belief: the map, which gives the poses of the nodes.
@@ -61,13 +64,13 @@ class Reviser:
         if self._rounds >= self._most_rounds or len(self._atlas) == 0:
             return []
         self._rounds += 1
-        grid = self._grid()
+        grid = np.array(self._panoramas.nodes)
         found = []
-        for node in grid:
-            beside = grid[(grid < since) == (node < since)]
-            for other in self._partners(int(node), beside, belief.poses_map_node):
-                self._done.add((int(node), other))
-                found.append(self.register(int(node), other, belief.poses_map_node))
+        for number, node in enumerate(grid.tolist()):
+            beside = (grid < since) == (node < since)
+            for other, proposed_by in self._partners(number, grid, beside, belief.poses_map_node):
+                self._done.add((node, other))
+                found.append(self.register(node, other, belief.poses_map_node, proposed_by))
         return found
 
     def restart(self, carried_to: int, retracted: Collection[tuple[int, int]]) -> None:
@@ -75,30 +78,27 @@ class Reviser:
         across = {(node, other) for node, other in self._done if other < carried_to <= node}
         self._rounds, self._done = 0, self._done - across - set(retracted)
 
-    def _grid(self) -> NDArray[np.int64]:
-        """Nodes about every so many metres of travel."""
-        travel = np.asarray(self._atlas.travel_m)
-        wanted = np.arange(0.0, travel[-1] + 1e-9, EVERY_M)
-        return np.unique(np.searchsorted(travel, wanted).clip(0, len(travel) - 1))
-
-    def _partners(self, node: int, grid: NDArray[np.int64], poses: Array) -> list[int]:
-        """Nearest older node of each earlier pass, at most a few."""
-        travel = self._atlas.travel_m
-        old = grid[: np.searchsorted(grid, node)]
-        distance = np.hypot(*(poses[old, :2] - poses[node, :2]).T)
-        near = [int(i) for i in np.argsort(distance, kind="stable") if distance[i] < RADIUS_M]
-        chosen: list[int] = []
-        for i in near:
-            other = int(old[i])
-            apart = [abs(travel[other] - travel[o]) > APART_M for o in chosen]
+    def _partners(self, number: int, grid: Indices, beside: NDArray[np.bool_], poses: Array) -> list[tuple[int, Proposer]]:
+        """Older nodes near a node, at most one of each earlier pass: by profile, the most similar first; then the nearest."""
+        travel, node = self._atlas.travel_m, int(grid[number])
+        distance = np.hypot(*(poses[grid[:number], :2] - poses[node, :2]).T)
+        near = (distance < RADIUS_M) & beside[:number]
+        proposed = [(i, Proposer.PROFILE) for i in self._panoramas.alike(number).numbers.tolist() if near[i]]
+        proposed += [(i, Proposer.PROXIMITY) for i in np.argsort(distance, kind="stable").tolist() if near[i]]
+        chosen: list[tuple[int, Proposer]] = []
+        for i, proposed_by in proposed:
+            other = int(grid[i])
+            apart = [abs(travel[other] - travel[o]) > APART_M for o, _ in chosen]
             if travel[node] - travel[other] > APART_M and all(apart):
-                chosen.append(other)
-        return [o for o in chosen[:PARTNERS] if (node, o) not in self._done]
+                chosen.append((other, proposed_by))
+        return [pair for pair in chosen[:PARTNERS] if (node, pair[0]) not in self._done]
 
-    def register(self, node: int, other: int, poses: Array, search: Search = Search.NEAR) -> Hypothesis:
+    def register(
+        self, node: int, other: int, poses: Array, proposed_by: Proposer | None, search: Search = Search.NEAR
+    ) -> Hypothesis:
         """Register the scans around a node to those around an older one (`other`), starting from the map's poses (N, 3).
 
-        `search` is the reason that the hypothesis records. The hypothesis may have failed its checks.
+        `proposed_by` and `search` are what the hypothesis records. The hypothesis may have failed its checks.
         """
         target, probe = self._atlas.around(other, TARGET_HALF_M), self._atlas.around(node, PROBE_HALF_M)
         sharp, fine = self._atlas.scoring_field(target, Field.SHARP), self._atlas.fine_field(target)
@@ -126,4 +126,5 @@ class Reviser:
             asked += checks.of_free_space(seen)
         relative = invert_relative(self._atlas.joining(other, pose, covariance, node))
         figures = {"ambiguity": ambiguity}
-        return Hypothesis(node, other, relative, near * fit, 0.0, search, asked, figures, fits, 1.0 - fit + seen)
+        misfit = 1.0 - fit + seen
+        return Hypothesis(node, other, relative, near * fit, 0.0, search, asked, figures, fits, misfit, proposed_by=proposed_by)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import Array, RelativePose, between, wrap_angle
-from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Search, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Proposer, Search, Status
 from hybridmap.metrics import StageClock
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import MIN_AGE_S, Gate, nodes_within
@@ -22,7 +22,7 @@ from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp import Candidate, Verification, Verifier
 from hybridmap.vision.rgbd.revisits import MAP_SIGMA_DEG, MAP_SIGMA_M, Reverification, Revisits
 from hybridmap.vision.rgbd.support import MeasuredLoop, Support
-from hybridmap.vision.templates import MODERATE_THRESHOLD, Matcher, Mode
+from hybridmap.vision.templates import MODERATE_THRESHOLD, Matcher
 
 Indices = NDArray[np.int64]
 GATE_PER_M, GATE_GROWTH_M = 0.1, 10.0
@@ -81,13 +81,14 @@ class LoopCloser:
         self._yaw_of_shift = yaw_of_shift
         self._new_key = new_key
         self._clock = clock
-        self._by_profile = rgbd.matching != "nearest"
-        mode: Mode = "four-band" if rgbd.matching == "nearest" else rgbd.matching
-        self._matcher = Matcher(mode, matching.mu_r, matching.mu_d, config.profile.max_shift, matching.g_bar, matching.sequence)
+        self._by_profile = config.closing.by != "proximity"
+        self._matcher = Matcher(
+            rgbd.matching, matching.mu_r, matching.mu_d, config.profile.max_shift, matching.g_bar, matching.sequence
+        )
         whereabouts = Whereabouts(UNRECOGNISED_NODES if self._may_be_lost else 0, UNCERTAIN_NODES)
         self._relocaliser = Relocaliser(whereabouts, new_key, SPAN_M)
         self._global_search = GlobalSearch(keyframes, self._matcher, verifier, new_key)
-        self._c_t = matching.c_t if matching.c_t is not None or not self._unverified else MODERATE_THRESHOLD[mode]
+        self._c_t = matching.c_t if matching.c_t is not None or not self._unverified else MODERATE_THRESHOLD[rgbd.matching]
         self.support = Support()
         self._revisits = Revisits()
         self._tried: set[tuple[int, int]] = set()
@@ -212,7 +213,7 @@ class LoopCloser:
         out = []
         for edge in outliers:
             found = self._reverification.measure(edge, belief)
-            out.append(found.proposed(edge.source, edge.target, edge.key, Candidate(Search.AGAIN)))
+            out.append(found.proposed(edge.source, edge.target, edge.key, Candidate(Search.AGAIN, edge.proposed_by)))
             self.support.replace(out[-1])
         return out
 
@@ -242,7 +243,10 @@ class LoopCloser:
         return np.flatnonzero(inside).astype(np.int64)
 
     def _ranked(self, node: int, gated: Indices, belief: Belief) -> dict[int, Candidate]:
-        """The best candidates by profile, or those nearest on the map where profiles do not rank; some nodes apart."""
+        """The best candidates by profile, or those nearest on the map where profiles do not rank; some nodes apart.
+
+        Profiles proposed them if there are more nodes in the gate than are verified; else each would be verified anyway.
+        """
         if not self._by_profile:
             gap = np.hypot(*(belief.poses_map_node[gated, :2] - belief.poses_map_node[node, :2]).T)
             nearest = np.argsort(gap, kind="stable")
@@ -251,13 +255,14 @@ class LoopCloser:
         with self._clock.stage("search"):
             match = self._matcher.best(self._keyframes[node].profile, ranked, gated, ending_at=node)
         self._ranking = np.column_stack([match.indices, match.score, match.shift])
+        proposer = Proposer.PROFILE if len(gated) > self._closing.candidates else Proposer.PROXIMITY
         chosen: dict[int, Candidate] = {}
         for i, target in enumerate(match.indices.tolist()):
             if self._c_t is not None and match.score[i] >= self._c_t:
                 break
             if all(abs(target - other) >= SEPARATION for other in chosen):
                 profile = {"profile_G": float(match.score[i])}
-                chosen[target] = Candidate(Search.GATE, int(match.shift[i]), profile)
+                chosen[target] = Candidate(Search.GATE, proposer, int(match.shift[i]), profile)
             if len(chosen) == self._closing.candidates:
                 break
         return chosen
@@ -331,6 +336,7 @@ class LoopCloser:
                 asked,
                 method=Method.PROFILE,
                 search=candidate.search,
+                proposed_by=candidate.proposed_by,
                 shift=candidate.shift,
                 figures=candidate.figures,
                 key=self._new_key(),
@@ -344,7 +350,7 @@ def _first_apart(targets: Indices, gap_m: Array, most: int, search: Search) -> d
     chosen: dict[int, Candidate] = {}
     for target, gap in zip(targets.tolist(), gap_m.tolist(), strict=True):
         if all(abs(target - other) >= SEPARATION for other in chosen):
-            chosen[target] = Candidate(search, figures={"map_distance_m": gap})
+            chosen[target] = Candidate(search, Proposer.PROXIMITY, figures={"map_distance_m": gap})
         if len(chosen) == most:
             break
     return chosen

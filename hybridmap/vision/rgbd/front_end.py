@@ -61,7 +61,7 @@ class RgbdFrontEnd:
         self._factor = working_factor(camera, rgbd.max_width_px)
         self._camera = working_camera(camera, rgbd.max_width_px)
         self._cell_px = cell_px(self._camera.width_px)
-        self._bands = config.profile.bands if rgbd.matching in ("four-band", "nearest") else 1
+        self._bands = config.profile.bands if rgbd.matching == "four-band" else 1
         self._templates = ViewTemplates(config.profile.width // 16, matching.mu_r, matching.mu_d)
         self.keyframes: list[Keyframe] = []
         self._images: deque[tuple[int, RgbdFrame]] = deque(maxlen=HELD_IMAGES)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.geometry import loosest_direction
-from hybridmap.graph.edges import Edge, Lack, Search, Status
+from hybridmap.graph.edges import Edge, Lack, Proposer, Search, Status
 from hybridmap.vision.relocalising import ChainState
 from hybridmap.vision.rgbd.keyframe import Keyframe
 from hybridmap.vision.rgbd.pnp import Candidate, Verifier
@@ -60,7 +60,7 @@ class GlobalSearch:
         chosen: dict[int, Candidate] = {}
         for target, score, shift in zip(match.indices.tolist(), match.score, match.shift, strict=True):
             if len(chosen) < most and all(abs(target - other) >= SEPARATION for other in chosen):
-                chosen[target] = Candidate(Search.WHOLE_MAP, int(shift), {"profile_G": float(score)})
+                chosen[target] = Candidate(Search.WHOLE_MAP, Proposer.GLOBAL, int(shift), {"profile_G": float(score)})
         return chosen
 
     def _measured(self, node: int, target: int, candidate: Candidate) -> Edge:

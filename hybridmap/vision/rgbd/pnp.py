@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.geometry import Array, RelativePose, between, loosest_direction, wrap_angle
-from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, passed
+from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Proposer, Search, passed
 from hybridmap.streams.rgbd import Camera
 from hybridmap.vision.rgbd import checks
 from hybridmap.vision.rgbd.depth_registration import register
@@ -107,11 +107,13 @@ class Candidate:
 
     Attributes:
         search: by which search the pair was found.
+        proposed_by: what proposed it first.
         shift: columns of the profile, positive when things lie farther right in the newer view than in the older one.
         figures: values measured by the search, by name.
     """
 
     search: Search
+    proposed_by: Proposer | None
     shift: int = 0
     figures: Mapping[str, float] = field(default_factory=dict)
 
@@ -145,6 +147,7 @@ class Verification:
             lack if self.relative is not None else self.lack,
             method=self.method,
             search=candidate.search,
+            proposed_by=candidate.proposed_by,
             shift=candidate.shift,
             figures={**candidate.figures, **self.figures},
             key=key,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.geometry import Array, RelativePose, between, compose, inverse, wrap_angle
-from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Search, Status, at_most, passed
+from hybridmap.graph.edges import Check, Edge, EdgeKind, Lack, Method, Proposer, Search, Status, at_most, passed
 from hybridmap.vision.base import Belief
 from hybridmap.vision.gating import MIN_AGE_S
 from hybridmap.vision.scanline.sequences import Sequences
@@ -184,6 +184,7 @@ class ScanlineCloser:
             Lack.WAITING if passed(checks) else None,
             method=Method.SEQUENCE,
             search=Search.GATE,
+            proposed_by=Proposer.PROFILE,
             shift=round(float(self._sequences.shifts[older])),
             figures={"threshold": self._threshold, "by depth": float(measured.by_depth)},
             key=self._keys - 1,

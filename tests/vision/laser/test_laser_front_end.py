@@ -5,14 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hybridmap.config.vision import VisionConfig
+from hybridmap.config.vision import ClosingConfig, VisionConfig
 from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, between, compose, log
-from hybridmap.graph.edges import Edge, EdgeKind, Lack, Search, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Proposer, Search, Status
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
 from hybridmap.vision.base import DenseFrontEnd, VerifyingFrontEnd
-from hybridmap.vision.laser import checks
+from hybridmap.vision.laser import checks, hypotheses
 from hybridmap.vision.laser.front_end import LaserFrontEnd
 from tests.vision.laser.laser_worlds import LASER, Run, cast, corridor, drifting, ring, ring_drive, room
 
@@ -38,6 +38,43 @@ def test_nothing_is_accepted_on_the_first_lap(two_laps):
     first_lap = 4 * 60
     loops = [p for p in two_laps.proposals if p.kind is EdgeKind.LOOP and p.status is Status.ACCEPTED]
     assert [p for p in loops if p.source < first_lap // 5] == []
+
+
+def loops_of_a_lap_and_a_half(by="geometry"):
+    truth = ring_drive(1.6)
+    config = VisionConfig(closing=ClosingConfig(by=by))
+    run = Run(ring(), truth, drifting(truth, np.random.default_rng(2)), config=config)
+    at_the_end = run.front_end.finish(run.belief(between(truth[0], truth[run.node_at])))
+    return run.loops(Status.ACCEPTED), [p for p in at_the_end if p.search is Search.NEAR]
+
+
+def test_every_loop_names_what_proposed_it_and_most_are_profiles(two_laps):
+    proposed = [p.proposed_by for p in two_laps.loops(Status.ACCEPTED)]
+    assert set(proposed) <= {Proposer.PROFILE, Proposer.PROXIMITY}
+    assert proposed.count(Proposer.PROFILE) > 0.5 * len(proposed)
+
+
+def test_profiles_close_a_lap_where_the_gate_is_not_searched(monkeypatch):
+    monkeypatch.setattr(hypotheses, "survivors", lambda *_: [])
+    accepted, _ = loops_of_a_lap_and_a_half()
+    assert len(accepted) >= 5
+    assert {p.proposed_by for p in accepted} == {Proposer.PROFILE}
+
+
+def test_without_profiles_the_gate_is_searched_and_the_nearest_of_each_pass_are_registered():
+    accepted, near = loops_of_a_lap_and_a_half(by="proximity")
+    assert len(accepted) >= 5
+    assert len(near) >= 10
+    assert {p.proposed_by for p in [*accepted, *near]} == {Proposer.PROXIMITY}
+
+
+def test_the_gate_is_searched_only_where_no_loop_by_profile_passes(two_laps):
+    loops = [p for p in two_laps.proposals if p.kind is EdgeKind.LOOP and p.search is Search.GATE]
+    by_profile = {p.source for p in loops if p.proposed_by is Proposer.PROFILE and not p.failed}
+    others = {p.source for p in loops if p.proposed_by is Proposer.PROXIMITY}
+    assert by_profile
+    assert others
+    assert not by_profile & others
 
 
 def test_a_closure_waits_before_it_is_accepted(two_laps):
@@ -70,6 +107,7 @@ def test_re_proposal_on_the_right_map_is_right_and_ends(two_laps):
     assert len(near) >= 10
     every = ["near", "fit", "off_m", "off_deg", "violation"]
     assert all([check.figure for check in p.checks] == every for p in near if p.search is Search.NEAR)
+    assert {p.proposed_by for p in near} == {Proposer.PROFILE, Proposer.PROXIMITY}
     errors = np.array([two_laps.error(p) for p in near])
     assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.15
     for _ in range(VisionConfig().closing.revisit_rounds):
@@ -95,6 +133,7 @@ def test_a_doubted_loop_is_measured_again_and_one_of_two_places_is_not_found(two
     outliers = [loop, dataclasses.replace(loop, target=other_side, key=4711)]
     found, lost = two_laps.front_end.verify(outliers, two_laps.belief(final))
     assert (found.key, found.source, found.target, found.status) == (loop.key, loop.source, loop.target, Status.ACCEPTED)
+    assert (found.search, found.proposed_by) == (Search.AGAIN, loop.proposed_by)
     assert np.hypot(*two_laps.error(found)[:2]) < 0.05
     assert (lost.key, lost.status) == (4711, Status.REJECTED)
 

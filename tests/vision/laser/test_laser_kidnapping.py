@@ -9,6 +9,7 @@ from hybridmap.graph.edges import EdgeKind, Lack, Method, Search, Status
 from hybridmap.vision import relocalising
 from hybridmap.vision.laser import kidnapping
 from hybridmap.vision.laser.hypotheses import WINDOW_M, Prober
+from hybridmap.vision.laser.panorama import Panoramas
 from tests.vision.laser.laser_worlds import LASER, Run, drifting, ring, ring_drive
 
 EVERY = 5
@@ -111,7 +112,8 @@ def test_scans_are_traced_on_either_side_of_the_carry(found):
 def test_of_many_submaps_those_with_the_likeliest_views_are_searched(found, monkeypatch):
     run, down = found
     searched = run.front_end.localisation
-    anchors = Prober(VisionConfig(), run.front_end.atlas, LASER).anchors_before(down)
+    atlas = run.front_end.atlas
+    anchors = Prober(VisionConfig(), atlas, LASER, Panoramas(atlas, 64)).anchors_before(down)
     assert searched.most_similar(down + 2, anchors) == anchors
     monkeypatch.setattr(kidnapping, "SUBMAPS", 3)
     places = run.truth[run.node_at]

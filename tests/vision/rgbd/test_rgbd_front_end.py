@@ -7,13 +7,14 @@ from pydantic import ValidationError
 from hybridmap.config.vision import (
     ClosingConfig,
     RelocalisingConfig,
+    RgbdClosingConfig,
     RgbdConfig,
     TrackingConfig,
     VisionConfig,
 )
 from hybridmap.errors import ConfigError, StreamError
 from hybridmap.geometry import RelativePose, between, compose
-from hybridmap.graph.edges import Edge, EdgeKind, Method, Search, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Method, Proposer, Search, Status
 from hybridmap.streams.base import Rig
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
@@ -127,7 +128,7 @@ def test_features_that_no_depth_confirms_must_be_many(poses, frames, monkeypatch
 
 
 def test_without_profiles_the_nearest_on_the_map_are_tried_first(poses, frames):
-    front_end, proposals, odometry = drive(VisionConfig(rgbd=RgbdConfig(matching="nearest")), poses, np.deg2rad(0.5), frames)
+    front_end, proposals, odometry = drive(VisionConfig(closing=ClosingConfig(by="proximity")), poses, np.deg2rad(0.5), frames)
     tried = [p for p in proposals.values() if p.kind is EdgeKind.LOOP and p.search is Search.GATE]
     accepted = [p for p in tried if p.status is Status.ACCEPTED]
     assert len({p.source for p in accepted}) > 0.6 * PER_LAP
@@ -141,8 +142,19 @@ def test_without_profiles_the_nearest_on_the_map_are_tried_first(poses, frames):
 
 
 def test_profiles_must_rank_where_the_match_alone_is_the_closure():
-    with pytest.raises(ValidationError, match="expected verify: pnp where matching is nearest"):
-        RgbdConfig(matching="nearest", verify="none")
+    with pytest.raises(ValidationError, match=r"expected verify: pnp where closing\.by is proximity"):
+        VisionConfig(closing=ClosingConfig(by="proximity"), rgbd=RgbdConfig(verify="none"))
+
+
+@pytest.mark.parametrize(("candidates", "proposer"), [(1, Proposer.PROFILE), (1000, Proposer.PROXIMITY)])
+def test_profiles_propose_only_where_not_all_of_the_gate_is_verified(candidates, proposer, poses, frames):
+    config = VisionConfig(rgbd=RgbdConfig(closing=RgbdClosingConfig(candidates=candidates)), relocalising=NOT_CARRIED)
+    _, proposals, _ = drive(config, poses[: PER_LAP + 5], 0.0, frames[: PER_LAP + 5])
+    gated = [p.proposed_by for p in proposals.values() if p.search is Search.GATE]
+    near = {p.proposed_by for p in proposals.values() if p.search is Search.NEAR}
+    assert proposer in gated
+    assert set(gated) <= {proposer, Proposer.PROXIMITY}
+    assert near <= {Proposer.PROXIMITY}
 
 
 def test_every_refusal_has_a_reason(driven):

@@ -63,7 +63,7 @@ def test_a_true_loop_is_found_again_from_where_the_map_has_it(driven, poses, by)
     front_end, loops = driven
     found = again(front_end, loops[0], moved(poses, loops[0].source, np.array(by)))
     assert found.status is Status.ACCEPTED
-    assert found.search is Search.AGAIN
+    assert (found.search, found.proposed_by) == (Search.AGAIN, loops[0].proposed_by)
     assert errors([found], poses)[0] == pytest.approx([0.0, 0.0], abs=0.3)
     assert errors([found], poses)[0, 0] < 0.01
 
