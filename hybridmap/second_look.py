@@ -20,6 +20,7 @@ from hybridmap.backends.judging.breaks import (
     Freed,
     drove,
     freed,
+    is_group,
     leads_across,
     loosened,
     shift,
@@ -66,6 +67,8 @@ class _Trial:
         solved: (N, 3) poses with the loose chain, m and rad.
         found: what that changes.
         blurred: numbers of the loops, refused ones among them, that are measured by views from both sides.
+        wanted: whether a group of loops against the map want the place moved. In a small world most of them are blurred, and
+            then free no others: views alone can tell.
     """
 
     place: int
@@ -73,6 +76,12 @@ class _Trial:
     solved: Array
     found: Freed
     blurred: tuple[int, ...]
+    wanted: bool
+
+    @property
+    def promises(self) -> bool:
+        """Whether the loops do not contradict a carry here."""
+        return self.found.pays or self.found.straightens or (self.wanted and self.found.gain > 0.0 and self.found.lost == 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,9 +160,9 @@ class SecondLook:
             return None
         known = {one.after for one in kidnappings(self._map)}
         trials = [self._trial(disputed, place) for place in sorted((disputed.claimed | _oddest(disputed.asked)) - known)]
-        paying = [trial for trial in trials if trial is not None and (trial.found.pays or trial.found.straightens)]
-        most = max((trial.found.gain for trial in paying), default=0.0)
-        good = [trial for trial in paying if trial.found.gain >= EQUAL * most]
+        promising = [trial for trial in trials if trial is not None and trial.promises]
+        most = max((trial.found.gain for trial in promising), default=0.0)
+        good = [trial for trial in promising if trial.found.gain >= EQUAL * most]
         good.sort(key=lambda trial: (-len(trial.signs), -trial.found.gain))
         divided = (self._divided(disputed, trial) for trial in good if not self._drove(disputed, trial))
         return next((trial for trial in divided if trial is not None), None)
@@ -215,7 +224,7 @@ class SecondLook:
             if divided.node == trial.place:
                 return replace(trial, signs=(*trial.signs, divided.evidence))
             there = self._trial(disputed, divided.node)
-            if there is None or not (there.found.pays or there.found.straightens):
+            if there is None or not there.promises:
                 break
             trial = there
         return trial if trial.signs and trial.found.pays else None
@@ -246,7 +255,7 @@ class SecondLook:
             return None
         solved, found = tried
         signs = tuple(check for check in disputed.asked.get(place, ()) if not check.passed)
-        return _Trial(place, signs, solved, found, tuple(graph.edge_ids[~clear].tolist()))
+        return _Trial(place, signs, solved, found, tuple(graph.edge_ids[~clear].tolist()), is_group(graph, voting))
 
     def _loosened(
         self, graph: PoseGraph, disputed: _Disputed, place: int, motion: Array, clear: NDArray[np.bool_]
