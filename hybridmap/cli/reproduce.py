@@ -33,8 +33,8 @@ def reproduce(
     """Reproduce the paper: its tables, its figures, and its experiments in simulated worlds, beside its own numbers.
 
     Needs no data. Each world is mapped once for each system and seed. An interrupted run continues when it is run again. The
-    page lists all that is done, done differently, or missing. With 10 seeds it takes about an hour on two cores
-    (--workers 2), with --seeds 1 some minutes.
+    page lists all that is done, done differently, or missing. Ten seeds are some 35 minutes of computing, half of that on two
+    free cores (--workers 2); --seeds 1 is 5 minutes.
     """
     from hybridmap.cli.show import progress
     from hybridmap.cli.study import one_thread, pool_of

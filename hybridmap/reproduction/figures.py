@@ -20,8 +20,14 @@ from hybridmap.study.frozen import Frozen
 
 _WALL, _WALL_M = "#c9c9cf", 0.3
 _TRUTH = {"color": style.TRUTH, "linewidth": 2.8, "alpha": 0.25, "label": "truth", "zorder": 3}
-_ODOMETRY = {"color": style.ODOMETRY, "linewidth": 1.1, "linestyle": (0, (1, 1)), "label": "odometry", "zorder": 6}
-_MAP = {"color": style.PRIMARY, "linewidth": 1.4, "label": "map", "zorder": 5}
+_ODOMETRY = {
+    "color": style.ODOMETRY,
+    "linewidth": 2.6,
+    "alpha": 0.45,
+    "label": "odometry",
+    "zorder": 4,
+}  # seen beside a map on it
+_MAP = {"color": style.PRIMARY, "linewidth": 1.2, "label": "map", "zorder": 5}
 _COLUMNS = 2
 _GAP_M = 1.0
 _FLOOR_M = 1e-4
