@@ -122,13 +122,14 @@ def _show(done: Study) -> None:
         title_justify="left",
     )
     measure, others = error_of(done), [name for name in _COLUMNS if _known(done, name)]
+    error = ERRORS[measure] if sum(_known(done, name) for name in ERRORS) < 2 else "error"
     table.add_column("source / setting / false loops")
     table.add_column("back-end")
-    for column in ("own map in", f"median {ERRORS[measure]} (m)", f"median minus {baseline_of(done)} (m)", "p"):
+    for column in ("own map in", f"median {error} (m)", f"median minus {baseline_of(done)} (m)", "p"):
         table.add_column(column, justify="right")
     for name in others:
         table.add_column(_COLUMNS[name], justify="right")
-    for line in _lines(done, measure, others):
+    for line in _lines(done, others):
         table.add_row(*line)
     console.print(table)
     _show_effects(done, console)
@@ -171,14 +172,17 @@ def _known(done: Study, measure: str) -> bool:
     return any(one.measure == measure and one.solved for one in done.summaries)
 
 
-def _lines(done: Study, measure: str, others: list[str]) -> list[list[str]]:
+def _lines(done: Study, others: list[str]) -> list[list[str]]:
     from hybridmap.report.page_tables import interval, number
+    from hybridmap.report.study_page import error_in
 
-    by_row: dict[tuple[str, str], dict[str, Summary]] = {}
+    by_group: dict[str, dict[str, dict[str, Summary]]] = {}
     for one in done.summaries:
-        by_row.setdefault((one.cell.label, one.cell.backend), {})[one.measure] = one
+        by_group.setdefault(one.cell.label, {}).setdefault(one.cell.backend, {})[one.measure] = one
     lines = []
-    for (label, backend), found in by_row.items():
+    for label, backend, found, measure in (
+        (label, backend, found, error_in(done, group)) for label, group in by_group.items() for backend, found in group.items()
+    ):
         error = found[measure]
         apart = error.difference
         paired = "" if apart is None or not apart.count else interval(apart)

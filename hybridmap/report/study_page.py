@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
@@ -67,11 +67,13 @@ class Group:
 
     Attributes:
         label: the conditions in words: source, setting, false loops.
+        error: the error that is compared, which not every source of a study has.
         lines: one row per back-end that has a map in any cell of the group.
         without: names of the other back-ends.
     """
 
     label: str
+    error: str
     lines: tuple[Line, ...]
     without: tuple[str, ...]
 
@@ -288,17 +290,25 @@ def groups_of(study: Study) -> list[Group]:
 
     A back-end that has a map in any cell of the group gets a row; the others are in `Group.without`.
     """
-    measure, others = error_of(study), _others(study)
+    others = _others(study)
     found: dict[str, dict[str, dict[str, Summary]]] = {}
     for one in study.summaries:
         found.setdefault(one.cell.label, {}).setdefault(one.cell.backend, {})[one.measure] = one
-    return [_group(label, by_backend, measure, others) for label, by_backend in found.items()]
+    return [_group(label, by_backend, error_in(study, by_backend), others) for label, by_backend in found.items()]
+
+
+def error_in(study: Study, by_backend: Mapping[str, Mapping[str, Summary]]) -> str:
+    """Name of the error by which the back-ends of one group are compared: that of the study, or the one that the group has."""
+    known = (name for name in ERRORS if any(name in one and one[name].solved for one in by_backend.values()))
+    return next(known, error_of(study))
 
 
 def _group(label: str, by_backend: dict[str, dict[str, Summary]], measure: str, others: Sequence[str]) -> Group:
     solved = {backend: any(one.solved for one in by_measure.values()) for backend, by_measure in by_backend.items()}
     lines = tuple(_line(by_measure, measure, others) for backend, by_measure in by_backend.items() if solved[backend])
-    return Group(label, lines, tuple(quoted(backend) for backend in by_backend if not solved[backend]))
+    return Group(
+        label, _HEADS.get(measure, measure), lines, tuple(quoted(backend) for backend in by_backend if not solved[backend])
+    )
 
 
 def effect_lines(study: Study) -> list[EffectLine]:

@@ -162,6 +162,17 @@ def test_the_axis_of_the_differences_names_the_error_that_is_compared(made, monk
     assert {axes.get_xlabel() for axes in drawn[0].axes} - {""} == {f"{error} minus that of gtsam-lm (m)"}
 
 
+def test_each_group_is_compared_by_the_error_that_its_source_has(made):
+    study = made(better_by_the_seed, false_loops={}, sources=[{"name": name, "synthetic": {"nodes": 40}} for name in "ab"])
+    other = [
+        replace(one, measure="relation_m" if one.measure == "ate_m" and one.cell.source == "b" else one.measure)
+        for one in study.summaries
+    ]
+    groups = groups_of(replace(study, summaries=other))
+    assert [(group.label, group.error) for group in groups] == [("a/default", "ATE"), ("b/default", "relation error")]
+    assert all(line.solved == "2 of 2" for group in groups for line in group.lines)
+
+
 def test_what_a_setting_changes_is_a_table_of_its_own(made):
     settings = [{"name": "as it is"}, {"name": "twice", "drift": {"scale_bias": 0.1}}]
 
