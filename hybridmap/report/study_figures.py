@@ -25,6 +25,7 @@ FLOOR_M = 1e-4
 _LINEAR_M = 0.01  # differences below are drawn to scale
 _MOST_LINES = 9  # with more back-ends each gets a row of its own instead of a line
 _COLUMNS = 2
+_LEVEL_LETTERS = 45  # longer names of all ticks together would overlap
 Figure = Callable[[CellResult], float | None]
 
 
@@ -227,7 +228,8 @@ def _draw_lines(axes: Any, panel: Panel, figure: Figure, looks: dict[str, dict[s
             medians.append(float(np.median(values)) if len(values) else np.nan)
         if np.isfinite(medians).any():
             axes.plot(np.arange(len(medians)) + offset, medians, label=backend, **looks[backend])
-    axes.set_xticks(range(len(panel.ticks)), panel.ticks)
+    slanted = {"rotation": 30.0, "ha": "right"} if sum(map(len, panel.ticks)) > _LEVEL_LETTERS else {}
+    axes.set_xticks(range(len(panel.ticks)), panel.ticks, **slanted)
     axes.set_xlim(-0.3, len(panel.ticks) - 0.7)
 
 
