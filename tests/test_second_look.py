@@ -73,8 +73,12 @@ def test_loops_outside_the_gate_tell_of_a_carry_of_some_metres():
     assert [one.after for one in kidnappings(mapper.map)] == [down]
     assert error_m(stream, mapper) < 0.02
     across = [e for e in mapper.map.edges if e.kind is EdgeKind.LOOP and e.target < down <= e.source]
-    assert sum(edge.status is Status.ACCEPTED for edge in across) >= 6
-    assert all(edge.search is Search.AGAIN for edge in across if edge.status is Status.ACCEPTED)
+    accepted = [edge for edge in across if edge.status is Status.ACCEPTED]
+    refused_at_first = [edge for edge in accepted if edge.search is Search.AGAIN]
+    assert len(refused_at_first) >= 6
+    for edge in accepted:  # the gate is 3.2 m wide: a loop may just lie in it
+        limits = {check.figure: check.limit for check in edge.checks}
+        assert edge in refused_at_first or limits["off_m"] > 3.0
 
 
 @pytest.mark.slow
