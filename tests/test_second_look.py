@@ -74,11 +74,10 @@ def test_loops_outside_the_gate_tell_of_a_carry_of_some_metres():
     assert error_m(stream, mapper) < 0.02
     across = [e for e in mapper.map.edges if e.kind is EdgeKind.LOOP and e.target < down <= e.source]
     accepted = [edge for edge in across if edge.status is Status.ACCEPTED]
-    refused_at_first = [edge for edge in accepted if edge.search is Search.AGAIN]
-    assert len(refused_at_first) >= 6
-    for edge in accepted:  # the gate is 3.2 m wide: a loop may just lie in it
-        limits = {check.figure: check.limit for check in edge.checks}
-        assert edge in refused_at_first or limits["off_m"] > 3.0
+    assert sum(edge.search is Search.AGAIN for edge in accepted) >= 6
+    for edge in accepted:
+        if edge.search is not Search.AGAIN:  # the gate is 3.2 m wide: a loop may just lie in it
+            assert {check.figure: check.limit for check in edge.checks}["off_m"] > 3.0
 
 
 @pytest.mark.slow
