@@ -150,6 +150,8 @@ class SettingConfig(Section):
 
     name: str
     """Title in the tables."""
+    config: str | None = None
+    """For drives: configuration of the mapping in place of the source's."""
     overrides: dict[str, Any] = Field(default_factory=dict)
     """For drives: settings that override the configuration of the mapping, as sections or dotted keys."""
     vary: dict[str, Annotated[tuple[Any, ...], Field(min_length=1)]] = Field(default_factory=dict)
@@ -159,8 +161,7 @@ class SettingConfig(Section):
     drift: DriftConfig = DriftConfig()
     """For every source: errors added to the frozen graph's odometry edges."""
     sources: Names = ()
-    """Titles of the sources that the setting is for; default: all. The first setting is for all, as the others are compared
-    with it."""
+    """Titles of the sources that it is for; default: all, as for the first setting, with which the others are compared."""
 
     @property
     def title(self) -> str:
@@ -227,13 +228,13 @@ class BarConfig(Section):
     figure: str
     """A column of `cells.csv` or `timings.csv`."""
     at_most: float | str | None = None
-    """The largest allowed value, or the title of a back-end whose figure on the same drive is the limit."""
+    """The largest allowed value, or the title of a back-end, or of a setting, whose figure on the same drive is the limit."""
     times: float = Field(default=1.0, gt=0)
-    """Factor on the figure of the back-end that `at_most` names."""
+    """Factor on the figure of the back-end or setting that `at_most` names."""
     at_least: float | None = None
     """The smallest allowed value."""
-    statistic: Literal["worst", "median", "mean"] = "worst"
-    """Statistic compared with the limit: the worst, the median or the mean over the seeds."""
+    statistic: Literal["worst", "nine in ten", "median", "mean"] = "worst"
+    """Statistic compared with the limit: the worst, the worst but a tenth of them, the median or the mean over the seeds."""
     sources: Names = ()
     """Titles of the sources to which the bar applies; default: all."""
     settings: Names = ()

@@ -169,11 +169,11 @@ def _check_source(source: SourceConfig, study: StudyConfig, origin: str) -> None
     if source.kind not in DRIVES and study.maps:
         raise ConfigError(f"{origin}: {source.title}: is a graph; give the back-ends that solve it")
     of_it = (setting for setting in study.settings if not setting.sources or source.title in setting.sources)
-    acting = next((setting.name for setting in of_it if setting.overrides or setting.disturb), None)
+    acting = next((setting.name for setting in of_it if setting.config or setting.overrides or setting.disturb), None)
     if source.kind not in DRIVES and acting is not None:
         raise ConfigError(
-            f"{origin}: {source.title}: is a graph already, and the setting {quoted(acting)} has overrides or disturbances "
-            f"of a drive; use drift, or a study of its own"
+            f"{origin}: {source.title}: is a graph already, and the setting {quoted(acting)} has overrides, disturbances or "
+            f"a configuration of a drive; use drift, or a study of its own"
         )
 
 
@@ -194,7 +194,7 @@ def _check_bar(bar: BarConfig, lists: Mapping[str, list[str]], origin: str) -> N
         raise ConfigError(f"{origin}: no such figure; there are {', '.join(FIGURES)}")
     named = {"sources": bar.sources, "settings": bar.settings, "backends": bar.backends, "false_loops.kinds": bar.kinds}
     named["false_loops.rates"] = tuple(map(str, bar.rates))
-    if isinstance(bar.at_most, str):
+    if isinstance(bar.at_most, str) and bar.at_most not in lists["settings"]:
         named["backends"] = (*bar.backends, bar.at_most)
     for key, titles in named.items():
         if missing := next((title for title in titles if title not in lists[key]), None):

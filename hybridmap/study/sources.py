@@ -110,7 +110,9 @@ def _drive(source: SourceConfig, maps: bool) -> Source:
         if source.simulated is not None:
             overrides["seed"] = seed
         config = Config.load(
-            source.config or source.simulated or "laser", overrides, overridden_by=f"{source.title}: overrides"
+            setting.config or source.config or source.simulated or "laser",
+            overrides,
+            overridden_by=f"{source.title}: overrides",
         )
         if not maps:  # the other back-ends leave no trace in a graph
             backends = config.backends.model_copy(update={"names": config.backends.names[:1]})
