@@ -118,8 +118,9 @@ def test_every_study_that_comes_along_is_whole(name, monkeypatch, tmp_path):
     assert study.description
     assert len(study.backends) > 1 or study.bars
     for source, setting in product(study.sources, study.settings):
-        if source.kind in DRIVES:
-            Config.load(source.config or source.simulated or "laser", {**source.overrides, **setting.overrides})
+        if source.kind in DRIVES and (not setting.sources or source.title in setting.sources):
+            named = setting.config or source.config or source.simulated or "laser"
+            Config.load(named, {**source.overrides, **setting.overrides})
     if all(source.kind in ("simulated", "synthetic") for source in study.sources):
         assert len({cell.key for cell in lay_out(study).cells}) > 1
 
