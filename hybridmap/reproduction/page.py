@@ -148,7 +148,7 @@ def system_cells(one: SystemResult) -> list[str]:
         p = "" if math.isnan(paired.p) else f"{paired.p:.2g}"
         compared = [paired.baseline, _median(paired.difference_m), _percent(paired.lower), p]
     return [
-        *(one.world, one.system, _median(one.error_m), _median(one.odometry_m), _median(one.ratio)),
+        *(one.world, one.system, _median(one.error_m), _alone(one.odometry_m), _alone(one.ratio)),
         *(_whole(one.loops), _percent(one.right), _percent(one.recall)),
         ", ".join(f"{count} {verdict}" for verdict, count in one.verdicts.items()),
         *compared,
@@ -171,7 +171,12 @@ def _system_numbers(one: SystemResult) -> list[Any]:
 
 def _median(found: Interval) -> str:
     """A median, with its interval if there is one."""
-    return interval(found) if found.known else number(found.value) if not found.count else f"{found.value:.3g}"
+    return interval(found) if found.known else _alone(found)
+
+
+def _alone(found: Interval) -> str:
+    """A median without its interval; a dash if there is none."""
+    return f"{found.value:.3g}" if found.count else "–"
 
 
 def _percent(share: float) -> str:
