@@ -48,7 +48,7 @@ Indices = NDArray[np.int64]
 TRIED = 8
 """Places that are tried for each sign of a break: those where it is strongest."""
 ALONG = 5
-"""Places that are tried along the stretch of the chain that the map bends most: views lead to the node from nearby alone."""
+"""Places that are tried along the stretch that the map bends most: from near the node of a carry, views lead to it."""
 EQUAL = 0.5
 """A place is as good as the best one if it gains this share: which one it was, the signs say."""
 DIVISIONS = 3

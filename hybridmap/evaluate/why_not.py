@@ -10,7 +10,7 @@ NO_NODE = {
 """By the rule by which nodes are made (`nodes.rule`); `{}` stands for `nodes.place_threshold`."""
 NO_LOOPS = {
     "scanline": "no older node lay inside the gate, or the robot turned here, or the drive told no threshold yet",
-    "ratslam": "no earlier experience of its view cell was had at its place on the pose cells",
+    "ratslam": "no earlier experience has both its view cell and its place on the pose cells",
     "nothing": "loops are not looked for (vision.closing.by)",
 }
 """By what closes loops (`vision.closing.by`)."""

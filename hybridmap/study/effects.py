@@ -111,7 +111,7 @@ def _paired(cells: Sequence[Cell], against: Sequence[Cell], results: Mapping[str
 
 
 def _of_seed(results: Mapping[int | None, CellResult], seed: int | None) -> CellResult:
-    """The result of a seed, or the one of all seeds where nothing is random: a disturbance of the other setting may be."""
+    """The result of a seed. Where nothing is random, as in an undisturbed recording, one result serves for all seeds."""
     return results[None] if None in results else results[seed]
 
 
