@@ -10,6 +10,7 @@ from pathlib import Path
 from hybridmap.errors import ConfigError
 from hybridmap.reproduction.paper import EQUATIONS, Status
 
+_HEADING = "\n## Equation -> function\n"
 _ROW = re.compile(r"^\| (?P<number>[\d, ]+) \|(?P<cells>.*)\|$")
 _BETWEEN_CELLS = re.compile(r"(?<!\\)\|")
 
@@ -43,7 +44,8 @@ def equations() -> list[Equation]:
     path = next((p for p in (package / "docs" / "paper.md", package.parent / "docs" / "paper.md") if p.is_file()), None)
     if path is None:
         raise ConfigError(f"{package / 'docs' / 'paper.md'}: no such file; install hybridmap again")
-    rows = filter(None, map(_ROW.match, path.read_text(encoding="utf-8").splitlines()))
+    section = path.read_text(encoding="utf-8").partition(_HEADING)[2].partition("\n## ")[0]
+    rows = filter(None, map(_ROW.match, section.splitlines()))
     found = []
     for row, (number, status, why) in zip(rows, EQUATIONS, strict=True):
         assert row["number"] == number, f"{path}: equation {row['number']}, where reproduction/paper.py has {number}"
