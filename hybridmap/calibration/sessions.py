@@ -40,6 +40,8 @@ ESTIMATORS = ("alternating", "joint")
 _IN_USE = {"neural": GAIN_KEYS, "sensors": ("odometry_delay_s",)}
 _KEY_M, _KEY_RAD = 0.25, 0.35  # travel or turn between two instants at which a reference is used
 _ROUNDS = 5
+_BY_PROFILE = {Method.SEQUENCE, Method.PROFILE}
+"""What measures loops by profiles alone, which tell no scale."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,7 @@ class Drive:
         config: the part of the session's configuration that a calibration needs: gains, delay and back-ends.
         config_tree: the whole configuration, as stored in the map file.
         sensors: description of the session's sensors, for people.
-        by_profile: whether nothing is registered, and its loops are by profiles along the way, which tell no scale.
+        by_profile: whether nothing is registered, and all its loops are by profiles, which tell no scale.
         delay_s: delay of the odometry in use: as configured, or as estimated while driving, s.
     """
 
@@ -100,7 +102,7 @@ def read_drive(folder: Path) -> Drive:
     measured = {
         edge.method for edge in experiences.edges if edge.status is Status.ACCEPTED and edge.kind is not EdgeKind.ODOMETRY
     }
-    by_profile = measured == {Method.SEQUENCE}
+    by_profile = bool(measured) and measured <= _BY_PROFILE
     return Drive(str(folder), motion, graph, stamps, poses, config, tree, sensors, by_profile, delay_s)
 
 

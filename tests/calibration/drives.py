@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hybridmap.calibration.legs import Motion, chain
 from hybridmap.calibration.regression import Sighting
 from hybridmap.geometry import RelativePose, between, compose, exp, interpolate
-from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.edges import Edge, EdgeKind, Method, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.odometry_model import Gains, remove
 from hybridmap.store import MapStore, SessionFolder
@@ -104,8 +104,11 @@ def _seen_again(truth, number, registered):
         yield int(np.flatnonzero(near)[0]), EdgeKind.LOOP
 
 
-def write_session(folder, one, rng, registered=True, gains=None, changes=(), poses=None, sensors="{}", rig=None):
-    """Write a session folder for a drive. The stored odometry is the raw one corrected by `gains`."""
+def write_session(folder, one, rng, registered=True, gains=None, changes=(), poses=None, sensors="{}", rig=None, methods=()):
+    """Write a session folder for a drive. The stored odometry is the raw one corrected by `gains`.
+
+    The loops were measured by `methods` in turn, or nobody says by what.
+    """
     from hybridmap.backends.base import SolveReport, SolveStatus
     from hybridmap.odometry_model import NEUTRAL, apply
 
@@ -129,7 +132,8 @@ def write_session(folder, one, rng, registered=True, gains=None, changes=(), pos
             for number, node in enumerate(experiences.nodes):
                 store.add_node(number, node, experiences.initial[number], {}, {})
             for number, edge in enumerate(experiences.edges):
-                store.put_edge(number, edge)
+                by = Method(methods[number % len(methods)]) if methods and edge.kind is EdgeKind.LOOP else edge.method
+                store.put_edge(number, replace(edge, method=by))
             nodes = np.searchsorted(chosen, np.arange(len(odometry)), side="right") - 1
             for stamp, node, pose in zip(one.motion.stamps_ns, nodes, odometry, strict=True):
                 store.add_track(int(stamp), int(node), np.zeros(3), pose)

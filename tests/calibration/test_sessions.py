@@ -68,6 +68,20 @@ def test_a_map_of_odometry_alone_is_refused(tmp_path):
         estimate_of([read], [], "alternating")
 
 
+@pytest.mark.parametrize("methods", [["sequence"], ["profile"], ["profile", "sequence"]])
+@pytest.mark.parametrize("estimator", ["alternating", "joint"])
+def test_loops_by_profile_alone_are_refused_however_they_were_found(one, tmp_path, methods, estimator):
+    """Those of `ratslam`, and those of `paper`, which nobody verified, join two views at no distance from each other."""
+    read = read_drive(write_session(tmp_path / "s", one, np.random.default_rng(0), registered=False, methods=methods))
+    with pytest.raises(EvaluationError, match=r"by profile alone and tell no scale.*give --reference"):
+        estimate_of([read], [], estimator)
+
+
+def test_a_profile_beside_a_measured_loop_is_no_reason_to_refuse(one, tmp_path):
+    folder = write_session(tmp_path / "s", one, np.random.default_rng(0), registered=False, methods=["profile", "scans"])
+    assert not read_drive(folder).by_profile
+
+
 @pytest.mark.parametrize("value", ['{"a": 1}', '"late"', "NaN"])
 def test_a_clock_offset_that_is_no_number_is_refused(one, tmp_path, value):
     folder = write_session(tmp_path / "s", one, np.random.default_rng(0))
