@@ -52,6 +52,30 @@ def test_extending_in_a_circle_is_refused(tmp_path):
             "vision: {closing: {by: ratslam}}\n",
             r"yaml: vision.closing.by is ratslam: expected edges.hanging ratslam, found chain",
         ),
+        (
+            "vision: {sensor: none}\nnodes: {rule: views}\n",
+            r"yaml: nodes.rule is views: expected a vision.sensor, which makes the nodes, found none",
+        ),
+        (
+            "extends: ratslam\nvision: {sensor: none}\n",
+            r"yaml: nodes.rule is views: expected a vision.sensor, which makes the nodes, found none",
+        ),
+        (
+            "extends: laser\nnodes: {rule: views}\n",
+            r"yaml: nodes.rule is views: expected vision.laser.scan.templates true, or no laser, found false",
+        ),
+        (
+            "neural: {modules: 0}\nnodes: {rule: novelty}\n",
+            r"nodes.rule: expected travel or views where neural.modules is 0 \(no place code\), found novelty",
+        ),
+        (
+            "vision: {closing: {by: proximity}, rgbd: {verify: none}}\n",
+            r"vision.rgbd.verify: expected pnp where vision.closing.by is proximity",
+        ),
+        (
+            "extends: ratslam\nvision: {matching: {c_t: 0}}\n",
+            r"vision.matching.c_t: expected more than 0 where vision.closing.by is ratslam, found 0",
+        ),
         ("backends: {names: []}\n", r"backends.names: expected at least 1 of them, found \[\]"),
         ("backends: {names: x}\n", r"backends.names: expected a list, found 'x'"),
         ("backends: {names: [a, b, a]}\n", r"backends.names: expected each back-end once, found 'a' again"),
@@ -64,6 +88,20 @@ def test_refusals_name_the_key(tmp_path, text, expected):
     path.write_text(text)
     with pytest.raises(ConfigError, match=expected):
         Config.load(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [
+        ("laser", {"vision.laser.scan.templates": True}),
+        ("ratslam", {"vision.sensor": "laser", "vision.laser.scan.templates": False}),
+        ("bionic-laser", {}),
+        ("rgbd", {"vision.laser.scan.templates": False}),
+        ("rgbd", {"neural.modules": 0}),
+    ],
+)
+def test_views_make_nodes_wherever_there_are_some(name, overrides):
+    assert Config.load(name, overrides | {"nodes.rule": "views"}).nodes.rule == "views"
 
 
 def test_a_refusal_names_the_file_or_who_overrode_it(tmp_path):

@@ -127,6 +127,8 @@ class NodesConfig(Section):
     alone, for a new view template or, with `vision.closing.by: ratslam`, another experience.
 
     Watch: under `novelty` a known place makes no node, and hence no loop closure; under `passage` it makes one at each visit.
+    `views` makes nodes by nothing else: it needs a sensor, and by laser `vision.laser.scan.templates` (not with `ratslam` and
+    `scanline`).
     """
     distance_m: float = Field(default=0.25, gt=0, le=1000)
     """`travel`: distance between nodes, m.

@@ -46,10 +46,22 @@ class Config(Section):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.neural.modules == 0 and self.nodes.rule not in ("travel", "views"):
-            raise ValueError(f"nodes.rule: expected travel where neural.modules is 0 (no place code), found {self.nodes.rule}")
+            expected = "expected travel or views where neural.modules is 0 (no place code)"
+            raise ValueError(f"nodes.rule: {expected}, found {self.nodes.rule}")
+        if self.nodes.rule == "views":
+            self._require_views()
         if self.vision.closing.by == "ratslam" and self.edges.hanging != "ratslam":  # it reckons with being seen from the match
             raise ValueError(f"vision.closing.by is ratslam: expected edges.hanging ratslam, found {self.edges.hanging}")
         return self
+
+    def _require_views(self) -> None:
+        """Check that views can make nodes: else the whole drive would be one node."""
+        vision = self.vision
+        if vision.sensor == "none":
+            raise ValueError("nodes.rule is views: expected a vision.sensor, which makes the nodes, found none")
+        by_laser = vision.sensor in ("laser", "auto") and vision.closing.by not in ("ratslam", "scanline")
+        if by_laser and not vision.laser.scan.templates:
+            raise ValueError("nodes.rule is views: expected vision.laser.scan.templates true, or no laser, found false")
 
     @classmethod
     def load(

@@ -48,7 +48,7 @@ class MatchingConfig(Section):
     drive; with `ratslam` it is that of view templates, 0.5; without, there is none if matches are verified by features, else a
     moderate one by `vision.rgbd.matching`.
 
-    Watch: the scale of G differs between the readings of `vision.rgbd.matching`.
+    Watch: the scale of G differs between the readings of `vision.rgbd.matching`. With `ratslam` it is a difference, above 0.
     """
     sequence: int = Field(default=1, ge=1, le=50)
     """Consecutive nodes whose views must match, on average; 1: each view by itself.
@@ -82,7 +82,8 @@ class ClosingConfig(Section):
     and pose cells; `nothing`: registrations measure motion as with `geometry`, and no loop is closed.
 
     Watch: with `scanline` and `ratslam` the map between loops is that of the wheels, a robot that was carried is not found, and
-    of `vision` only `sensor`, `profile`, `matching` and, by `ratslam`, `closing.gate_sigmas` are read.
+    of `vision` only `sensor`, `profile`, `matching` and, by `ratslam`, `closing.gate_sigmas` are read. `nothing` ignores
+    `vision.relocalising.enabled`, too: a robot that was carried is not found.
     """
     gate_sigmas: float = Field(default=2.5, gt=0, le=100)
     """Older nodes are considered for a loop within this many standard deviations of the pose uncertainty on the map (the gate).
@@ -114,7 +115,8 @@ class ScanConfig(Section):
     templates: bool = True
     """Whether every scan is compared with the view templates.
 
-    Watch: the node rule `novelty` needs it; otherwise it only costs time.
+    Watch: the node rule `views` needs it, `novelty` and `passage` have the place code alone without; otherwise it only costs
+    time.
     """
 
 
@@ -241,5 +243,10 @@ class VisionConfig(Section):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.closing.by == "proximity" and self.rgbd.verify == "none":
-            raise ValueError("expected verify: pnp where closing.by is proximity, as no profile gives an edge, found none")
+            raise ValueError(
+                "vision.rgbd.verify: expected pnp where vision.closing.by is proximity (no profile gives an edge), found none"
+            )
+        c_t = self.matching.c_t
+        if self.closing.by == "ratslam" and c_t is not None and c_t <= 0.0:
+            raise ValueError(f"vision.matching.c_t: expected more than 0 where vision.closing.by is ratslam, found {c_t:g}")
         return self

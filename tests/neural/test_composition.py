@@ -56,7 +56,7 @@ def test_motion_that_no_robot_makes_is_refused_as_by_the_cells():
     ("settings", "said"),
     [
         ({"neural.modules": 2}, "neural: expected 3 modules or more, or 0 for no cells, found 2"),
-        ({"neural.modules": 0, "nodes.rule": "passage"}, "nodes.rule: expected travel where neural.modules is 0"),
+        ({"neural.modules": 0, "nodes.rule": "passage"}, "nodes.rule: expected travel or views where neural.modules is 0"),
     ],
 )
 def test_what_needs_cells_is_refused_without_them(settings, said):
