@@ -26,10 +26,12 @@ class Effect:
         sources: titles of the sources that the pairs come from: one, or all for which the setting is.
         measures: names of the errors that are compared (`measures.ERRORS`), one for each source.
         lost: number of pairs in which either drive has no map of its own, so that its error is that of odometry.
-        difference: median of this setting's error minus the first one's, m, over seeds and sources that have both.
+        difference: median of this setting's error minus the first one's, m, over seeds and sources that have both; over sources
+            with different measures it mixes these.
         ratio: median of this setting's error over the first one's.
         p: of Wilcoxon's signed-rank test of the logarithms of these ratios, two-sided, corrected by Holm for all settings that
-            are compared on the same sources; NaN for fewer than `statistics.LEAST` pairs.
+            are compared on the same set of sources; NaN for fewer than `statistics.LEAST` pairs. All pairs count alike, and as
+            independent of each other, those of one source too.
         cpu_ratio: median of the CPU times of mapping, this setting's over the first one's; NaN if they are not known.
     """
 
@@ -140,11 +142,10 @@ def _effect(each: Sequence[_Pairs], grid: Grid) -> Effect:
 
 
 def _corrected(effects: Sequence[Effect]) -> list[Effect]:
-    """The effects, their p corrected for all settings on the same sources; those over all sources are a family of their own."""
-    families: dict[tuple[str, str, str, float], list[int]] = {}
+    """The effects, their p corrected for all settings that are compared on the same set of sources."""
+    families: dict[tuple[frozenset[str], str, str, float], list[int]] = {}
     for at, one in enumerate(effects):
-        where = "" if one.pooled else one.cell.source
-        families.setdefault((where, one.cell.backend, one.cell.kind, one.cell.rate), []).append(at)
+        families.setdefault((frozenset(one.sources), one.cell.backend, one.cell.kind, one.cell.rate), []).append(at)
     found = list(effects)
     for members in families.values():
         for at, p in zip(members, holm([effects[at].p for at in members]), strict=True):

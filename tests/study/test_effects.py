@@ -4,6 +4,7 @@ import csv
 import io
 import math
 
+import numpy as np
 import pytest
 
 from hybridmap.errors import ConfigError
@@ -11,6 +12,7 @@ from hybridmap.study import tables
 from hybridmap.study.cell import MAPPED, CellResult
 from hybridmap.study.cells import lay_out
 from hybridmap.study.effects import effects_of
+from hybridmap.study.statistics import signed_rank
 from tests.study.studies import small
 
 MAPS = {
@@ -78,6 +80,18 @@ def test_holm_counts_the_settings_on_the_same_drives():
     assert one["without wheels", "office"].p == pytest.approx(2 * 2.0 / 2**6)
     assert one["without wheels", "all 2"].p == pytest.approx(2.0 / 2**12)
     assert one["office alone", "office"].p == 1.0
+
+
+def test_holm_counts_pooled_settings_only_on_the_same_set_of_sources():
+    wheels = {"edges.drop_contradicted": False}
+    worse = [{"name": f"without wheels {number}", "overrides": wheels} for number in (1, 2)]
+    two = {"name": "two without wheels", "overrides": wheels, "sources": ["office", "lab"]}
+    changes = {"sources": ["lab", "office", "corridor"], "settings": [PARTS[0], *worse, two]}
+    one = by_place(effects(doubled, **changes))
+    assert one["without wheels 1", "all 3"].p == pytest.approx(2 * signed_rank(np.full(18, math.log(2.0))))
+    assert one["without wheels 2", "all 3"].p == pytest.approx(2 * signed_rank(np.full(18, math.log(2.0))))
+    assert one["two without wheels", "all 2"].p == pytest.approx(2.0 / 2**12)
+    assert one["two without wheels", "lab"].p == pytest.approx(3 * 2.0 / 2**6)
 
 
 def test_few_pairs_have_a_difference_and_no_verdict():
