@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -100,6 +101,20 @@ def test_a_view_that_is_seen_over_and_over_soon_adds_nothing():
         cells.step(5, np.zeros(3))
     assert apart_cells(cells.place, places[5]) > 8.0
     assert apart_cells(cells.place, away) < 0.5
+
+
+@pytest.mark.parametrize(("rest", "adds"), [(1, False), (55, False), (65, True)])
+def test_a_view_seen_five_times_adds_again_only_after_a_rest(rest, adds):
+    """It has lost 5.8 by then, regains 0.05 in an iteration, and adds something below ln(30) / 1.2 = 2.83: after 60."""
+    cells, _ = learnt()
+    elsewhere(cells)
+    for _ in range(5):
+        cells.step(5, np.zeros(3))
+    elsewhere(cells, rest)
+    with_view, without = deepcopy(cells), deepcopy(cells)
+    with_view.step(5, np.zeros(3))
+    without.step(len(cells) - 1, np.zeros(3))
+    assert (not np.array_equal(with_view.activity, without.activity)) == adds
 
 
 def test_of_two_packets_the_weaker_one_dies():
