@@ -143,6 +143,7 @@ class SessionFolder:
         """
         if not self.map_db.is_file():
             what = "holds no session (no map.db)" if self.path.is_dir() else "no such session folder"
+            what = "is a file, not a session folder" if self.path.is_file() else what
             raise StoreError(f"{self.path}: {what}; expected what `hybridmap map SOURCE --out DIR` writes")
 
     def require_foreign(self, target: Path) -> None:

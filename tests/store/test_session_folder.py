@@ -112,6 +112,9 @@ def test_require_says_what_is_missing(tmp_path):
         SessionFolder(tmp_path / "gone").require()
     with pytest.raises(StoreError, match="holds no session"):
         SessionFolder(tmp_path).require()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="file: is a file, not a session folder"):
+        SessionFolder(tmp_path / "file").require()
 
 
 def test_a_map_that_was_cut_is_damaged_and_not_said_to_be_broken_off(tmp_path, caplog):
