@@ -171,7 +171,7 @@ def drive(config, stream):
 
 def test_the_gate_of_the_cells_serves_registration_too():
     """With `edges.gate: cells` no back-end decides what is in the graph: two very different ones get the same."""
-    gated = DRIVE | {"edges.gate": "cells", "neural.reanchor_weight": 1.0}
+    gated = DRIVE | {"simulation.duration_s": 76.0, "edges.gate": "cells", "neural.reanchor_weight": 1.0}
     config = Config.load("laser", gated | {"vision.laser.dense_trajectory": False, "vision.closing.revisit_rounds": 0})
     maps = []
     for backend in ("gtsam-gnc", "odometry"):

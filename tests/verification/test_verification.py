@@ -26,8 +26,8 @@ def test_every_row_of_the_table_is_there(rows):
         "gridness", "phase_error_relu_30hz", "phase_error_relu_100hz", "phase_error_softplus_30hz",
         "phase_error_softplus_100hz",
         "position_room_relu", "position_room_softplus", "position_corridor_relu", "position_corridor_softplus",
-        "no_shadow_integrator", "no_shadow_driving_on", "place_single_recruited", "attractor_one_bump_recruited_settled",
-        "attractor_one_bump_printed_settled", "standing_still", "printed_kernel_refused", "recalibrated_5_percent",
+        "no_shadow_integrator", "no_shadow_driving_on", "place_single_recruited", "place_single_room",
+        "attractor_one_bump_recruited_settled", "attractor_one_bump_printed_settled", "standing_still", "printed_kernel_refused", "recalibrated_5_percent",
     }  # fmt: skip
     assert {"gridness_ideal", "gridness_square", "place_single_printed", "noise_1_percent", "turn_rate_modulation"} <= set(rows)
 

@@ -65,6 +65,9 @@ BREAKS = {
     "place_single_recruited": lambda r: with_part(
         r, "place", recruited=dataclasses.replace(r.place.recruited, fields=np.array([1] * 94 + [2] * 6))
     ),
+    "place_single_room": lambda r: with_part(
+        r, "room_fields", sampled=dataclasses.replace(r.room_fields.sampled, fields=np.array([1] * 94 + [2] * 6))
+    ),
     "attractor_one_bump_recruited_settled": lambda r: with_bumps(r, "recruited"),
     "attractor_one_bump_printed_settled": lambda r: with_bumps(r, "printed"),
     "standing_still": lambda r: with_part(r, "standstill", pose_change=1e-15),
