@@ -27,7 +27,8 @@ def test_every_row_of_the_table_is_there(rows):
         "phase_error_softplus_100hz",
         "position_room_relu", "position_room_softplus", "position_corridor_relu", "position_corridor_softplus",
         "no_shadow_integrator", "no_shadow_driving_on", "place_single_recruited", "place_single_room",
-        "attractor_one_bump_recruited_settled", "attractor_one_bump_printed_settled", "standing_still", "printed_kernel_refused", "recalibrated_5_percent",
+        "attractor_one_bump_recruited_settled", "attractor_one_bump_printed_settled", "standing_still",
+        "printed_kernel_refused", "recalibrated_5_percent",
     }  # fmt: skip
     assert {"gridness_ideal", "gridness_square", "place_single_printed", "noise_1_percent", "turn_rate_modulation"} <= set(rows)
 
