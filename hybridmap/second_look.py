@@ -151,7 +151,9 @@ class SecondLook:
             yield "loops without weight measured again", edges
 
     def _solution(self) -> Solution | None:
-        return self._backends.solutions.get(self._backends.primary)
+        """The map of the primary back-end; None if its latest call failed: what it has then is of a smaller graph."""
+        failed = self._backends.primary in self._backends.failures
+        return None if failed else self._backends.solutions.get(self._backends.primary)
 
     def _break(self, solution: Solution) -> _Trial | None:
         """Find the place whose loosening frees the most loops; None if there is none that shows signs of a break."""

@@ -32,7 +32,8 @@ def reproduce(
 ) -> None:
     """Reproduce the paper: its tables, its figures, and its experiments in simulated worlds, beside its own numbers.
 
-    Needs no data. Each world is mapped once for each system and seed. An interrupted run continues when it is run again. The
+    Needs no data. Each world is mapped once for each system and seed. An interrupted run continues when it is run again, after
+    the last finished drive; the verification of the cells, the first two minutes, is stored only when it is whole. The
     page lists all that is done, done differently, or missing. Ten seeds are some 35 minutes of computing, half of that on two
     free cores (--workers 2); --seeds 1 is 5 minutes.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -72,7 +73,7 @@ def measured_cells(folder: Path, scale: Scale, progress: Callable[[int, int | No
     """
     settings = Config.load("paper").neural.model_dump()
     sizes = {name: value for name, value in asdict(scale).items() if name != "workers"}
-    key = provenance.digest({"code": provenance.mapping(), "scale": sizes, "settings": settings, "seed": _SEED})
+    key = provenance.digest({"code": _code(), "scale": sizes, "settings": settings, "seed": _SEED})
     stored = _stored(folder / CELLS, key)
     if stored is None:
         result = verification.verify_cells(_SEED, scale, settings, progress)
@@ -87,7 +88,7 @@ def measured_cells(folder: Path, scale: Scale, progress: Callable[[int, int | No
 
 def ends(folder: Path, seeds: Sequence[int]) -> dict[int, End]:
     """Seed -> where the drive ends, for each of the seeds: stored in the folder by an earlier run, or computed now."""
-    key = provenance.digest({"code": provenance.mapping()})
+    key = provenance.digest({"code": _code(), "settings": _corridor().model_dump(mode="json")})
     stored = _stored(folder / ENDS, key) or {}
     missing = [seed for seed in seeds if str(seed) not in stored]
     if missing:
@@ -98,7 +99,7 @@ def ends(folder: Path, seeds: Sequence[int]) -> dict[int, End]:
 
 def _end(seed: int) -> End:
     """Drive the simulated corridor once, as its robot does, and integrate what its wheels say."""
-    config = Config.load("paper", {"seed": seed, "simulation.world": "corridor"})
+    config = _corridor()
     stream = SimulatedStream(config.simulation, seed)
     truth, wheels = stream.groundtruth.poses, stream.odometry.poses
     ahead_m = truth[:, 0] - truth[0, 0]
@@ -107,6 +108,15 @@ def _end(seed: int) -> End:
     for delta in between(wheels[:last], wheels[1 : last + 1]):
         integrator.step(delta, 1.0 / ODOMETRY_RATE_HZ)
     return End(_place(between(truth[0], truth[last])), _place(between(wheels[0], wheels[last])), _place(integrator.pose))
+
+
+def _corridor() -> Config:
+    return Config.load("paper", {"simulation.world": "corridor"})
+
+
+def _code() -> list[str]:
+    """Digests of the code on which the figures depend: the code of mapping, and this module."""
+    return [provenance.mapping(), hashlib.sha256(Path(__file__).read_bytes()).hexdigest()]
 
 
 def _place(pose: Array) -> tuple[float, float]:

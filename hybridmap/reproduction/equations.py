@@ -38,17 +38,21 @@ def equations() -> list[Equation]:
     """Every row of the table, in order.
 
     Raises:
-        ConfigError: the document is not there.
+        ConfigError: the document is not there, or its table has other rows than `paper.EQUATIONS`.
     """
     package = Path(str(resources.files("hybridmap")))
     path = next((p for p in (package / "docs" / "paper.md", package.parent / "docs" / "paper.md") if p.is_file()), None)
     if path is None:
         raise ConfigError(f"{package / 'docs' / 'paper.md'}: no such file; install hybridmap again")
     section = path.read_text(encoding="utf-8").partition(_HEADING)[2].partition("\n## ")[0]
-    rows = filter(None, map(_ROW.match, section.splitlines()))
+    rows = list(filter(None, map(_ROW.match, section.splitlines())))
+    numbers, known = [row["number"] for row in rows], [number for number, _, _ in EQUATIONS]
+    if numbers != known:
+        raise ConfigError(
+            f"{path}: found the equations {'; '.join(numbers)}, expected those of reproduction/paper.py: {'; '.join(known)}"
+        )
     found = []
     for row, (number, status, why) in zip(rows, EQUATIONS, strict=True):
-        assert row["number"] == number, f"{path}: equation {row['number']}, where reproduction/paper.py has {number}"
         equation, where, here = (cell.strip().replace("\\|", "|") for cell in _BETWEEN_CELLS.split(row["cells"]))
         found.append(Equation(number, equation, where, here, status, why))
     return found

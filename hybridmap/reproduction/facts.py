@@ -42,8 +42,8 @@ def facts_of(rows: Sequence[Metric], results: Sequence[SystemResult], ends: Mapp
     found = {row.name.removeprefix("verify/"): f"{row.value:.3g}" for row in rows}
     found["office lap"] = f"{office_laps(1.0)[1]:.0f}"
     for one in results:
-        for figure, median in (("ate", one.error_m), ("odometry", one.odometry_m)):
-            found[f"{figure} {one.world} {one.system}"] = metres(median)
+        found[f"odometry {one.world} {one.system}"] = metres(one.odometry_m)
+        found[f"ate {one.world} {one.system}"] = metres(one.error_m) + (f" ({one.without_map})" if one.lost else "")
     for name in ("network", "odometry", "truth"):
         x, y = np.median([getattr(end, name) for end in ends.values()], axis=0)
         found |= {f"end {name} x": f"{x:.2f}", f"end {name} y": f"{y:.2f}"}

@@ -10,13 +10,14 @@ import numpy as np
 from hybridmap.backends.base import ODOMETRY
 from hybridmap.backends.registry import create
 from hybridmap.config import Config
+from hybridmap.errors import BackendError
 from hybridmap.geometry import Array, align, compose, inverse
 from hybridmap.graph.pose_graph import PoseGraph, prefix
 from hybridmap.report import style
 from hybridmap.reproduction.cells import PAPER_NETWORK_M, PAPER_ODOMETRY_M, End
 from hybridmap.reproduction.systems import SystemResult
 from hybridmap.simulation.worlds import build_world
-from hybridmap.study.frozen import Frozen
+from hybridmap.study.frozen import Frozen, Mapped
 
 _WALL, _WALL_M = "#c9c9cf", 0.3
 _TRUTH = {"color": style.TRUTH, "linewidth": 2.8, "alpha": 0.25, "label": "truth", "zorder": 3}
@@ -58,14 +59,21 @@ def maps_figure(world: str, drives: Mapping[str, Frozen]) -> str:
             assert drive.mapped is not None
             _draw_walls(axes, walls)
             axes.plot(*truth[:, :2].T, **_TRUTH)
-            for name, looks in ((ODOMETRY, _ODOMETRY), (drive.mapped.primary, _MAP)):
+            drawn = {ODOMETRY: _ODOMETRY} | ({drive.mapped.primary: _MAP} if _has_map(drive.mapped) else {})
+            for name, looks in drawn.items():
                 axes.plot(*_onto(drive.reference, drive.mapped.poses[name]).T, **looks)
-            axes.set_title(system)
+            axes.set_title(system if _has_map(drive.mapped) else f"{system}: no map, only odometry")
             style.metric_axes(axes)
         for axes in panels[len(shown) :]:
             axes.set_axis_off()
-        picture.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
+        shown_lines = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        picture.legend(list(shown_lines.values()), list(shown_lines), loc="outside upper right", ncols=3)
         return style.svg_uri(picture)
+
+
+def _has_map(mapped: Mapped) -> bool:
+    """Whether the primary back-end ended with a map of its own."""
+    return mapped.primary in mapped.poses and mapped.primary not in mapped.lost
 
 
 def realignment_figure(world: str, drive: Frozen, system: str) -> str:
@@ -79,7 +87,7 @@ def realignment_figure(world: str, drive: Frozen, system: str) -> str:
         system: name of the configuration.
 
     Returns:
-        A `data:` URI; an empty string if no loop was closed.
+        A `data:` URI; an empty string if no loop was closed, or if the back-end fails on a part of the graph.
     """
     graph, settings = drive.graph, Config.load(system).backends
     if graph is None or not graph.is_loop.any():
@@ -92,12 +100,15 @@ def realignment_figure(world: str, drive: Frozen, system: str) -> str:
         "after half of the loops": int(np.sort(entered)[len(entered) // 2]) + 1,
         "at the end": graph.n_nodes,
     }
+    try:
+        maps = [backend.solve(prefix(graph, nodes)).poses for nodes in moments.values()]
+    except BackendError:
+        return ""
     walls = _walls(world)
     height = style.fitted_size(np.ptp(np.concatenate(walls), axis=0), _COLUMNS)[1] - 0.3
     with style.figure(style.PAGE_WIDTH_IN, 2 * height) as picture:
         panels = picture.subplots(2, _COLUMNS).ravel()
-        for axes, (title, nodes) in zip(panels, moments.items(), strict=True):
-            poses = backend.solve(prefix(graph, nodes)).poses
+        for axes, (title, nodes), poses in zip(panels, moments.items(), maps, strict=True):
             _draw_walls(axes, walls)
             axes.plot(*drive.reference[:nodes, :2].T, **_TRUTH)
             axes.plot(*_from_start(drive.reference[:nodes], poses).T, **_MAP)
@@ -137,16 +148,18 @@ def errors_figure(results: Sequence[SystemResult]) -> str:
 
 
 def _draw_errors(axes: Any, results: Sequence[SystemResult]) -> None:
-    axes.axvline(max(results[-1].odometry_m.value, _FLOOR_M), color=style.ODOMETRY, linewidth=1.0, linestyle=(0, (1, 1)))
     for row, one in enumerate(results):
-        errors = np.maximum(list(one.errors_m.values()), _FLOOR_M)
-        axes.plot(errors, [row] * len(errors), ".", color=style.PRIMARY, markersize=5.0, alpha=0.6)
-        if len(errors):
-            axes.plot([np.median(errors)], [row], "|", color=style.PRIMARY, markersize=13, markeredgewidth=2)
+        odometry_m = max(one.odometry_m.value, _FLOOR_M)
+        axes.plot([odometry_m] * 2, [row - 0.45, row + 0.45], color=style.ODOMETRY, linewidth=1.2, linestyle=(0, (1, 1)))
+        for lost, mark in ((False, "."), (True, "x")):
+            errors = [max(error, _FLOOR_M) for seed, error in one.errors_m.items() if (seed in one.lost) is lost]
+            axes.plot(errors, [row] * len(errors), mark, color=style.PRIMARY, markersize=5.0, alpha=0.6)
+        if set(one.errors_m) - one.lost:
+            axes.plot([max(one.error_m.value, _FLOOR_M)], [row], "|", color=style.PRIMARY, markersize=13, markeredgewidth=2)
     axes.set_yticks(range(len(results)), [one.system for one in results])
     axes.set_ylim(len(results) - 0.5, -0.5)
     axes.set_xscale("log")
-    axes.set_xlabel("error of the map, ATE (m); dotted: odometry")
+    axes.set_xlabel("error of the map, ATE (m); dotted: its odometry")
     axes.grid(True, axis="x", linewidth=0.5)
 
 

@@ -59,7 +59,7 @@ SYSTEM_COLUMNS = (
 )
 """Columns of the table of systems."""
 _SYSTEM_NUMBERS = (
-    *("world", "system", "drives", "baseline", "error_m", "error_low_m", "error_high_m"),
+    *("world", "system", "drives", "without_map", "baseline", "error_m", "error_low_m", "error_high_m"),
     *("odometry_m", "odometry_low_m", "odometry_high_m", "ratio", "ratio_low", "ratio_high"),
     *("loops", "loops_right", "revisits_closed", *Verdict, "cpu_s"),
     *("difference_m", "difference_low_m", "difference_high_m", "share_lower", "p_holm"),
@@ -144,11 +144,12 @@ def system_cells(one: SystemResult) -> list[str]:
     """A line of the table of systems, a text for each of `SYSTEM_COLUMNS`."""
     paired = one.paired
     compared = ["", "", "", ""]
+    error = _median(one.error_m) + (f" ({one.without_map})" if one.lost else "")
     if paired is not None:
         p = "" if math.isnan(paired.p) else f"{paired.p:.2g}"
         compared = [paired.baseline, _median(paired.difference_m), _percent(paired.lower), p]
     return [
-        *(one.world, one.system, _median(one.error_m), _alone(one.odometry_m), _alone(one.ratio)),
+        *(one.world, one.system, error, _alone(one.odometry_m), _alone(one.ratio)),
         *(_whole(one.loops), _percent(one.right), _percent(one.recall)),
         ", ".join(f"{count} {verdict}" for verdict, count in one.verdicts.items()),
         *compared,
@@ -165,7 +166,7 @@ def _system_numbers(one: SystemResult) -> list[Any]:
     apart = [math.nan] * 5
     if paired is not None:
         apart = [paired.difference_m.value, paired.difference_m.low, paired.difference_m.high, paired.lower, paired.p]
-    named = [one.world, one.system, one.drives, "" if paired is None else paired.baseline]
+    named = [one.world, one.system, one.drives, len(one.lost), "" if paired is None else paired.baseline]
     return [*named, *("" if math.isnan(value) else value for value in (*numbers, *apart))]
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from hybridmap.metrics import Metric
 from hybridmap.output import Held
 from hybridmap.reproduction.cells import CellsMeasured, End, ends, measured_cells
+from hybridmap.reproduction.equations import equations
 from hybridmap.reproduction.systems import SystemResult, results_of
 from hybridmap.study import StudyConfig
 from hybridmap.study.pools import Pool
@@ -85,8 +86,10 @@ def reproduce(
 
     Raises:
         OutputError: the folder cannot be written to.
+        ConfigError: the table of equations in docs/paper.md is not the one of `paper`.
         StudyError: the workers cannot be used.
     """
+    equations()  # read at once: the page needs them after all drives
     with progress("verifying the cells") as advance:
         cells = measured_cells(place.path, scale, advance)
     found = ends(place.path, study.seeds)
@@ -97,11 +100,12 @@ def reproduce(
 
 def _metrics(one: SystemResult) -> list[Metric]:
     stage = f"{one.world}/{one.system}"
-    over = f"median of {one.drives} drives"
+    over = f"median of {one.drives} drives" + (f" ({one.without_map})" if one.lost else "")
     return [
         Metric(f"ate_median/{stage}", one.error_m.value, "m", f"error of the map, {over}; {one.error_m}"),
         Metric(f"ate_odometry_median/{stage}", one.odometry_m.value, "m", f"error of its odometry, {over}"),
         Metric(f"ate_ratio_median/{stage}", one.ratio.value, "1", f"error of the map over that of its odometry, {over}"),
+        Metric(f"without_map/{stage}", len(one.lost), "1", f"of {one.drives} drives: diverged or failed, so odometry counts"),
         Metric(f"loops_median/{stage}", one.loops, "1", f"loops in the graph, {over}"),
         Metric(f"loop_precision_median/{stage}", one.right, "1", f"share of the loops that are right, {over}"),
         Metric(f"loop_recall_median/{stage}", one.recall, "1", f"share of the revisits with a loop, {over}"),

@@ -17,7 +17,7 @@ from hybridmap.study.statistics import Interval, holm, median_of, signed_rank
 from hybridmap.study.study import Study
 from hybridmap.verdict import Verdict
 
-BASELINES = {"lab": "paper", "office": "ratslam", "corridor": "scan-to-map", "corridor-landmarks": "scan-to-map"}
+BASELINES = {"lab": "bionic", "office": "ratslam", "corridor": "scan-to-map", "corridor-landmarks": "scan-to-map"}
 """World -> the system with which the others are compared there, drive by drive."""
 
 SYSTEMS = {
@@ -63,6 +63,7 @@ class SystemResult:
             one; NaN where there are none.
         verdicts: verdict on the map -> number of drives.
         cpu_s: median process time of a drive.
+        lost: seeds of the drives whose back-end diverged or failed: they have no map, and odometry stands for it.
         paired: comparison with the baseline of the world; None for the baseline, or where that was not run.
     """
 
@@ -78,7 +79,16 @@ class SystemResult:
     recall: float
     verdicts: Mapping[str, int]
     cpu_s: float
+    lost: frozenset[int] = frozenset()
     paired: Paired | None = None
+
+    @property
+    def without_map(self) -> str:
+        """Words on the drives that have no map; empty if all have one."""
+        if not self.lost:
+            return ""
+        where = "" if len(self.lost) == self.drives else f" in {len(self.lost)} of {self.drives}"
+        return f"no map{where}: odometry's error"
 
 
 def results_of(study: Study) -> list[SystemResult]:
@@ -115,6 +125,7 @@ def _result(source: SourceConfig, study: Study) -> SystemResult:
         recall=_median(_known(of_map, "loop_recall").values()),
         verdicts={name: grades[grade] for grade, name in _GRADES.items() if grades[grade]},
         cpu_s=_median([result.timings["cpu_s"] for result in of_map.values() if "cpu_s" in result.timings]),
+        lost=frozenset(seed for seed, result in of_map.items() if result.lost),
     )
 
 

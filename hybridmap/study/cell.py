@@ -79,7 +79,8 @@ class CellResult:
     @property
     def lost(self) -> bool:
         """Whether the back-end had a graph and no map of it: the figures `measures.OF_ODOMETRY` are those of odometry."""
-        return self.status in (SolveStatus.FAILED, SolveStatus.DIVERGED, SolveStatus.SINGULAR) and "ate_m" in self.figures
+        without_map = self.status in (SolveStatus.FAILED, SolveStatus.DIVERGED, SolveStatus.SINGULAR)
+        return without_map and any(name in self.figures for name in OF_ODOMETRY)
 
     def figure(self, name: str) -> float | None:
         """Value of the figure or timing of this name; None if missing."""
@@ -161,11 +162,14 @@ def _of_odometry(own: PoseGraph, graph: PoseGraph, reference: Array) -> dict[str
         figures = judge(own, graph, create(ODOMETRY).solve(graph), reference)
     except HybridMapError:
         return {}
-    return {name: figures[name] for name in OF_ODOMETRY}
+    return {name: figures[name] for name in OF_ODOMETRY if name in figures}
 
 
 def _as_mapped(task: CellTask, frozen: Frozen) -> CellResult:
-    """The result of the drive itself; the time of mapping is assigned to the primary back-end."""
+    """The result of the drive itself; the time of mapping is assigned to the primary back-end.
+
+    A back-end that ended the drive without a map gets its own status and the errors of odometry, as in `run`.
+    """
     assert frozen.mapped is not None
     name = frozen.mapped.primary if task.variant.backend == "primary" else task.variant.backend
     if name not in frozen.mapped.figures:
@@ -173,7 +177,12 @@ def _as_mapped(task: CellTask, frozen: Frozen) -> CellResult:
         message = f"{name}: did not follow the drive; there are {known} (`backends.names` of its configuration)"
         return CellResult(task.key, str(SolveStatus.FAILED), message)
     timings = dict(frozen.mapped.timings) if name == frozen.mapped.primary else {}
-    return CellResult(task.key, MAPPED, "", dict(frozen.mapped.figures[name]), timings)
+    figures = dict(frozen.mapped.figures[name])
+    if name in frozen.mapped.lost:
+        odometry = frozen.mapped.figures[ODOMETRY]
+        figures |= {figure: odometry[figure] for figure in OF_ODOMETRY if figure in odometry}
+    status, message = frozen.mapped.lost.get(name, (MAPPED, ""))
+    return CellResult(task.key, status, message, figures, timings)
 
 
 def judge(own: PoseGraph, graph: PoseGraph, solution: Solution, reference: Array) -> dict[str, float | None]:

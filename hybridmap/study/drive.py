@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridmap.backends.base import ODOMETRY, Solution
+from hybridmap.backends.base import ODOMETRY, Solution, SolveStatus
 from hybridmap.config import Config
 from hybridmap.edge_book import Update
 from hybridmap.errors import StudyError, counted
@@ -103,6 +103,7 @@ class MappedDrive:
             _figures(mapper, track, truth, relations, {**watch.figures(), **_of_session(mapper, verdict)}),
             _timings(clock.cpu_s["mapping"], float(track.stamps_ns[-1] - track.stamps_ns[0]) / NS_PER_S, views),
             _poses(mapper),
+            _lost(mapper),
         )
         return Frozen(graph, reference, of_truth=truth is not None, mapped=mapped)
 
@@ -173,7 +174,7 @@ def _figures(
 ) -> Mapping[str, Figures]:
     """Figures of odometry and of every back-end, with those that are `of_primary`; None if not finite."""
     found: dict[str, dict[str, float | None]] = {}
-    estimates = {name: trajectory_of(track, one.poses) for name, one in mapper.backends.solutions.items() if name != ODOMETRY}
+    estimates = {name: trajectory_of(track, mapper.poses(name)) for name in mapper.backends.solutions if name != ODOMETRY}
     for name, estimate in ({ODOMETRY: track.odometry} | estimates).items():
         figures: dict[str, float | None] = dict(_of_trajectory(grounded(estimate, mapper.map), truth, relations))
         if name != ODOMETRY:
@@ -187,7 +188,15 @@ def _figures(
 def _poses(mapper: Mapper) -> dict[str, Array]:
     """Poses (N, 3) of the nodes by odometry and by every back-end, each in its own frame."""
     by_odometry = np.array([node.pose_odom for node in mapper.map.nodes])
-    return {ODOMETRY: by_odometry} | {name: one.poses for name, one in mapper.backends.solutions.items() if name != ODOMETRY}
+    return {ODOMETRY: by_odometry} | {name: mapper.poses(name) for name in mapper.backends.solutions if name != ODOMETRY}
+
+
+def _lost(mapper: Mapper) -> dict[str, tuple[str, str]]:
+    """Status of every back-end that ended the drive without a map of its own, and why in one line."""
+    reports = [one.report for one in mapper.backends.solutions.values()]
+    found = {one.backend: (str(one.status), one.message) for one in reports if not one.status.has_map}
+    failed = str(SolveStatus.FAILED)
+    return found | {name: (failed, " ".join(why.split())) for name, why in mapper.backends.failures.items()}
 
 
 def _of_trajectory(estimate: Trajectory, truth: Trajectory | None, relations: Relations | None) -> Iterator[tuple[str, float]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from hybridmap.backends.base import ODOMETRY
 from hybridmap.geometry import Array
-from hybridmap.study.cell import MAPPED, CellResult
+from hybridmap.study.cell import CellResult
 from hybridmap.study.cells import Cell, Grid
 from hybridmap.study.measures import ERRORS
 from hybridmap.study.statistics import SAME, Interval, holm, median_of, signed_rank
@@ -84,20 +84,21 @@ def effects_of(grid: Grid, results: Mapping[str, CellResult]) -> list[Effect]:
     first, *others = [setting.name for setting in grid.study.settings]
     groups = grid.groups()
     dead_reckoning = {variant.title for variant in grid.study.backends if variant.backend == ODOMETRY}
+    timed = {variant.title for variant in grid.study.backends if variant.way == "mapped"}
     found: list[Effect] = []
     for setting in others:
         by_mix: dict[tuple[str, str, float], list[_Pairs]] = {}
         for ((source, name, kind, rate), backend), cells in groups.items():
             if name == setting and backend not in dead_reckoning:
                 against = groups[(source, first, kind, rate), backend]
-                by_mix.setdefault((backend, kind, rate), []).append(_paired(cells, against, results))
+                by_mix.setdefault((backend, kind, rate), []).append(_paired(cells, against, results, backend in timed))
         for each in by_mix.values():
             found += [_effect([pairs], grid) for pairs in each]
             found += [_effect(each, grid)] if len(each) > 1 else []
     return _corrected(found)
 
 
-def _paired(cells: Sequence[Cell], against: Sequence[Cell], results: Mapping[str, CellResult]) -> _Pairs:
+def _paired(cells: Sequence[Cell], against: Sequence[Cell], results: Mapping[str, CellResult], timed: bool) -> _Pairs:
     ours, theirs = ({cell.seed: results[cell.key] for cell in side} for side in (cells, against))
     seeds: list[int | None] = [seed for seed in (ours if None in theirs else theirs) if seed is not None] or [None]
     pairs = [(_of_seed(ours, seed), _of_seed(theirs, seed)) for seed in seeds]
@@ -107,7 +108,7 @@ def _paired(cells: Sequence[Cell], against: Sequence[Cell], results: Mapping[str
         cells[0],
         measure,
         _both(pairs, measure),
-        _both([pair for pair in pairs if all(one.status == MAPPED for one in pair)], "cpu_s"),
+        _both(pairs if timed else [], "cpu_s"),
         sum(one.lost or other.lost for one, other in pairs),
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -27,12 +27,14 @@ class Mapped:
         figures: name of a back-end (or `odometry`) -> its figures, named as in `measures.MAPPED`.
         timings: name -> value, for the names in `measures.TIMINGS`.
         poses: name of a back-end (or `odometry`) -> (N, 3) poses of the nodes in its map of the drive, m and rad.
+        lost: name of a back-end that ended without a map of its own -> its status (`SolveStatus`), and why in one line.
     """
 
     primary: str
     figures: Mapping[str, Figures]
     timings: Mapping[str, float]
     poses: Mapping[str, Array]
+    lost: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +63,8 @@ class Frozen:
             given = {name: getattr(self.graph, name) for name in _ARRAYS}
             arrays |= {name: array for name, array in given.items() if array is not None}
         if self.mapped is not None:
-            arrays["mapped"] = json.dumps([self.mapped.primary, self.mapped.figures, self.mapped.timings], allow_nan=False)
+            told = [self.mapped.primary, self.mapped.figures, self.mapped.timings, self.mapped.lost]
+            arrays["mapped"] = json.dumps(told, allow_nan=False)
             arrays |= {_POSES_OF + name: poses for name, poses in self.mapped.poses.items()}
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays)
@@ -79,7 +82,8 @@ class Frozen:
             poses = {name.removeprefix(_POSES_OF): arrays[name] for name in arrays if name.startswith(_POSES_OF)}
             mapped = None
             if "mapped" in arrays:
-                primary, figures, timings = json.loads(str(arrays["mapped"]))
-                mapped = Mapped(primary, figures, timings, poses)
+                primary, figures, timings, lost = json.loads(str(arrays["mapped"]))
+                ends = {name: (status, why) for name, (status, why) in lost.items()}
+                mapped = Mapped(primary, figures, timings, poses, ends)
             graph = PoseGraph(**given) if given else None
             return cls(graph, arrays["reference"], bool(arrays["of_truth"]), str(arrays["failure"]), mapped)

@@ -11,7 +11,7 @@ KEPT = 0.5
 NEAR_M = 0.05
 """A map this close to its reference counts as whole, m."""
 
-OF_ODOMETRY = ("ate_m", "yaw_deg", "within_5_cm", "chi2", "chi2_own")
+OF_ODOMETRY = ("ate_m", "yaw_deg", "within_5_cm", "chi2", "chi2_own", "relation_m", "relation_deg", "relation_loop_m")
 """Figures that are those of odometry where a back-end failed or diverged."""
 
 ERRORS = {"ate_m": "ATE", "relation_m": "relation error"}

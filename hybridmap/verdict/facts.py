@@ -126,8 +126,10 @@ class Facts:
 
     @property
     def poses(self) -> Array | None:
-        """(N, 3) poses of the nodes, m and rad; None if the primary back-end gave none but those that it began with."""
-        return self.solution.poses if self.solution is not None and self.solution.report.status.has_map else None
+        """(N, 3) poses of the nodes, m and rad; None if the primary back-end failed or gave only those that it began with."""
+        if self.solution is None or self.failure or not self.solution.report.status.has_map:
+            return None
+        return self.solution.poses
 
     @property
     def kept(self) -> NDArray[np.bool_]:

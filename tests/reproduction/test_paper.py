@@ -1,18 +1,33 @@
 """The list of what the paper has, its equations, and the figures that its texts name."""
 
+import base64
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hybridmap.config import Config
-from hybridmap.reproduction.cells import ends
+from hybridmap.errors import ConfigError
+from hybridmap.reproduction import equations as table
+from hybridmap.reproduction.cells import End, ends
 from hybridmap.reproduction.equations import equations
-from hybridmap.reproduction.facts import NOT_RUN, Facts
-from hybridmap.reproduction.page import SECTIONS
-from hybridmap.reproduction.paper import CELL_TYPES, OPEN_PARAMETERS, PARAMETERS, PARTS, RESULTS, Status
+from hybridmap.reproduction.facts import NOT_RUN, Facts, facts_of
+from hybridmap.reproduction.figures import errors_figure, maps_figure
+from hybridmap.reproduction.page import SECTIONS, system_cells
+from hybridmap.reproduction.paper import CELL_TYPES, EQUATIONS, OPEN_PARAMETERS, PARAMETERS, PARTS, RESULTS, Status
 from hybridmap.reproduction.reproduction import plan
-from hybridmap.reproduction.systems import BASELINES, SYSTEMS
+from hybridmap.reproduction.systems import BASELINES, SYSTEMS, results_of
+from hybridmap.study import StudyConfig
+from hybridmap.study.drive import MappedDrive
+from hybridmap.study.frozen import Mapped
+from hybridmap.study.model import SyntheticConfig
+from hybridmap.study.pools import ThisProcess
+from hybridmap.study.sources import laps
+from hybridmap.study.study import run_study
+
+MAPPED_BACKENDS = [{"backend": "odometry", "way": "mapped"}, {"name": "map", "backend": "primary", "way": "mapped"}]
+ENDS = {1: End((16.8, 0.0), (16.7, 0.5), (16.7, 0.5))}
 
 
 def test_whatever_is_not_done_says_why_and_where_it_is_shown():
@@ -26,6 +41,39 @@ def test_whatever_is_not_done_says_why_and_where_it_is_shown():
 def test_the_paper_s_sixteen_equations_are_there():
     numbers = {int(number) for equation in equations() for number in equation.number.split(",")}
     assert numbers == set(range(1, 17))
+
+
+def test_a_table_with_other_equations_is_one_clear_error(monkeypatch):
+    monkeypatch.setattr(table, "EQUATIONS", EQUATIONS[:-1])
+    with pytest.raises(ConfigError, match=r"paper\.md: found the equations 1; .* expected those of reproduction/paper\.py"):
+        equations()
+
+
+def test_ends_of_other_settings_are_not_used_again(tmp_path, monkeypatch):
+    before = ends(tmp_path, [1])
+    load = Config.load
+    short = {"simulation.duration_s": 10.0}
+    monkeypatch.setattr(Config, "load", lambda name, changed=None: load(name, (changed or {}) | short))
+    assert ends(tmp_path, [1]) != before
+
+
+def test_a_system_that_diverged_is_said_to_have_no_map(tmp_path, monkeypatch):
+    clean = laps(SyntheticConfig(nodes=40, per_lap=16), 3)
+    figures, poses = {"ate_m": 0.5}, clean.reference
+    both, name = ("odometry", "relaxation-paper"), "relaxation-paper"
+    mapped = Mapped(name, dict.fromkeys(both, figures), {}, dict.fromkeys(both, poses), {name: ("diverged", "away")})
+    drive = replace(clean, mapped=mapped)
+    monkeypatch.setattr(MappedDrive, "make", lambda _: drive)
+    source = {"name": "lab by paper", "simulated": "lab", "config": "paper"}
+    tree = {"name": "mine", "seeds": [1], "sources": [source], "backends": MAPPED_BACKENDS}
+    (one,) = results_of(run_study(StudyConfig.from_tree(tree, "mine.yaml", tmp_path), tmp_path / "study", ThisProcess()))
+    assert (set(one.lost), one.drives, one.ratio.value) == ({1}, 1, 1.0)
+    assert one.without_map
+    assert one.without_map in system_cells(one)[2]
+    assert one.without_map in facts_of([], [one], ENDS)["ate lab paper"]
+    shown = [maps_figure("lab", {"paper": one}) for one in (drive, replace(drive, mapped=replace(mapped, lost={})))]
+    assert ["only odometry" in base64.b64decode(uri.partition(",")[2]).decode() for uri in shown] == [True, False]
+    assert errors_figure([one])
 
 
 def test_its_parameters_are_settings_and_those_of_the_configuration_paper_are_the_paper_s():

@@ -8,14 +8,17 @@ import pytest
 import yaml
 
 from hybridmap import session
+from hybridmap.backends.driver import Driver
 from hybridmap.cli import main
 from hybridmap.config import Config
+from hybridmap.errors import BackendError
 from hybridmap.evaluate.session_errors import evaluate_session
 from hybridmap.geometry import between
 from hybridmap.simulation.writers import write_rosbag2
 from hybridmap.streams import open_stream
 from hybridmap.study.cells import lay_out
 from hybridmap.study.folder import BARS_CSV, TIMINGS_CSV
+from hybridmap.study.frozen import Frozen
 from hybridmap.study.model import StudyConfig
 from hybridmap.study.pools import ThisProcess
 from hybridmap.study.study import run_study
@@ -118,6 +121,41 @@ def test_other_words_files_or_numbers_make_other_drives(recording, source):
         keys(disturb={"scan_range_m": 4.0}),
     ]
     assert len(set.union(base, *others)) == 1 + len(others)
+
+
+def test_a_drive_whose_back_end_diverges_is_lost_and_has_the_errors_of_odometry(tmp_path):
+    backends = {"backends.names": ["relaxation-paper", "gtsam-gnc"], "backends.relaxation.theta": 1.0}
+    ways = [*MAPPED_BACKENDS, {"name": "other", "backend": "gtsam-gnc", "way": "mapped"}]
+    source = {"simulated": "lab", "config": "laser", "end_s": 60.0, "overrides": {**LASER, **backends}}
+    done = run_study(study_of(source, backends=ways, bars=[{"figure": "ate_m", "at_most": 9.0}]), tmp_path, ThisProcess())
+    results = {cell.backend: result for cell, result in done.rows}
+    lost = results["map"]
+    assert (lost.status, lost.lost, lost.figures["verdict"]) == ("diverged", True, 2.0)
+    assert lost.message
+    assert lost.timings["cpu_s"] > 0.0
+    assert lost.figures["ate_m"] == results["odometry"].figures["ate_m"]
+    assert known(lost.figures["ate_m"]) > known(results["other"].figures["ate_m"])
+    assert (results["other"].status, results["other"].lost) == ("mapped", False)
+    assert {verdict.cell.backend for verdict in done.missed} == {"map"}  # who has no map misses every bar
+
+
+def test_a_back_end_that_fails_on_the_way_ends_no_study(source, tmp_path, monkeypatch):
+    update = Driver.update
+
+    def tire(self, graph):
+        if graph.n_nodes > 5:
+            raise BackendError("a bad\nday")
+        return update(self, graph)
+
+    monkeypatch.setattr(Driver, "update", tire)
+    monkeypatch.setattr(Driver, "finish", tire)
+    done = run_study(study_of(source), tmp_path, ThisProcess())
+    results = {cell.backend: result for cell, result in done.rows}
+    assert (results["map"].status, results["map"].message, results["map"].lost) == ("failed", "a bad day", True)
+    assert results["map"].figures["relation_m"] == results["odometry"].figures["relation_m"]
+    packed = known(done.folder.frozen(done.grid.cells[0].source_key))
+    frozen = Frozen.unpack(packed)
+    assert known(frozen.mapped).poses["gtsam-gnc"].shape == (known(frozen.graph).n_nodes, 3)
 
 
 def test_a_kidnapped_robot_is_watched_until_it_is_found(tmp_path):
