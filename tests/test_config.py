@@ -70,11 +70,11 @@ def test_extending_in_a_circle_is_refused(tmp_path):
         ),
         (
             "vision: {closing: {by: proximity}, rgbd: {verify: none}}\n",
-            r"vision.rgbd.verify: expected pnp where vision.closing.by is proximity",
+            r"yaml: vision: expected vision.rgbd.verify pnp where vision.closing.by is proximity",
         ),
         (
             "extends: ratslam\nvision: {matching: {c_t: 0}}\n",
-            r"vision.matching.c_t: expected more than 0 where vision.closing.by is ratslam, found 0",
+            r"yaml: vision: expected vision.matching.c_t above 0 where vision.closing.by is ratslam, found 0",
         ),
         ("backends: {names: []}\n", r"backends.names: expected at least 1 of them, found \[\]"),
         ("backends: {names: x}\n", r"backends.names: expected a list, found 'x'"),

@@ -244,9 +244,9 @@ class VisionConfig(Section):
     def _consistent(self) -> Self:
         if self.closing.by == "proximity" and self.rgbd.verify == "none":
             raise ValueError(
-                "vision.rgbd.verify: expected pnp where vision.closing.by is proximity (no profile gives an edge), found none"
+                "expected vision.rgbd.verify pnp where vision.closing.by is proximity (no profile gives an edge), found none"
             )
         c_t = self.matching.c_t
         if self.closing.by == "ratslam" and c_t is not None and c_t <= 0.0:
-            raise ValueError(f"vision.matching.c_t: expected more than 0 where vision.closing.by is ratslam, found {c_t:g}")
+            raise ValueError(f"expected vision.matching.c_t above 0 where vision.closing.by is ratslam, found {c_t:g}")
         return self

@@ -142,7 +142,7 @@ def test_without_profiles_the_nearest_on_the_map_are_tried_first(poses, frames):
 
 
 def test_profiles_must_rank_where_the_match_alone_is_the_closure():
-    with pytest.raises(ValidationError, match=r"vision\.rgbd\.verify: expected pnp where vision\.closing\.by is proximity"):
+    with pytest.raises(ValidationError, match=r"expected vision\.rgbd\.verify pnp where vision\.closing\.by is proximity"):
         VisionConfig(closing=ClosingConfig(by="proximity"), rgbd=RgbdConfig(verify="none"))
 
 
