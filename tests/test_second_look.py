@@ -67,6 +67,20 @@ def test_a_carry_to_a_place_that_looks_alike_is_found_by_the_place_that_fits_bet
     assert error_m(stream, mapper) < 0.02
 
 
+@pytest.mark.parametrize(
+    ("named", "world", "carried_m", "seed"),
+    [
+        pytest.param("laser", "lab", 1.5, 6, id="the loops across it are measured by scans of both sides"),
+        pytest.param("rgbd", "office", 1.5, 3, marks=pytest.mark.slow, id="other places show more signs of a carry"),
+        pytest.param("rgbd", "office", 2.0, 2, marks=pytest.mark.slow, id="false loops cost the trial a hundred true ones"),
+    ],
+)
+def test_a_carry_is_found_against_the_odds(named, world, carried_m, seed):
+    stream, mapper = drive(named, world, carried_m, seed)
+    assert [one.after for one in kidnappings(mapper.map)] == [put_down(stream, mapper)]
+    assert error_m(stream, mapper) < 0.04
+
+
 def test_loops_outside_the_gate_tell_of_a_carry_of_some_metres():
     stream, mapper = drive("laser", "lab", 3.0)
     down = put_down(stream, mapper)
