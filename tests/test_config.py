@@ -62,7 +62,7 @@ def test_extending_in_a_circle_is_refused(tmp_path):
         ),
         (
             "extends: laser\nnodes: {rule: views}\n",
-            r"yaml: nodes.rule is views: expected vision.laser.scan.templates true, or no laser, found false",
+            r"yaml: nodes.rule is views: of a laser it needs vision.laser.scan.templates true, found false",
         ),
         (
             "neural: {modules: 0}\nnodes: {rule: novelty}\n",

@@ -61,7 +61,7 @@ class Config(Section):
             raise ValueError("nodes.rule is views: expected a vision.sensor, which makes the nodes, found none")
         by_laser = vision.sensor in ("laser", "auto") and vision.closing.by not in ("ratslam", "scanline")
         if by_laser and not vision.laser.scan.templates:
-            raise ValueError("nodes.rule is views: expected vision.laser.scan.templates true, or no laser, found false")
+            raise ValueError("nodes.rule is views: of a laser it needs vision.laser.scan.templates true, found false")
 
     @classmethod
     def load(
