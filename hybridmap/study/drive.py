@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.base import ODOMETRY, Solution, SolveStatus
+from hybridmap.conclusion import facts_of
 from hybridmap.config import Config
 from hybridmap.edge_book import Update
 from hybridmap.errors import StudyError, counted
@@ -23,7 +24,6 @@ from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.gaps import grounded
 from hybridmap.mapper import Mapper
 from hybridmap.metrics import StageClock
-from hybridmap.session import facts_of
 from hybridmap.simulation import SimulatedStream
 from hybridmap.store.track import Track, trajectory_of
 from hybridmap.streams import open_stream
