@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from hybridmap.config.inputs import SensorsConfig
 from hybridmap.errors import StreamError, counted
 from hybridmap.geometry import Array, compose, yaw_from_quaternion
-from hybridmap.streams.bagfile import TRANSFORM, BagFile, RawMessage, Topic
+from hybridmap.streams.bagfile import BagFile
 from hybridmap.streams.base import Rig, SensorKind
+from hybridmap.streams.messages import TRANSFORM, Messages, RawMessage, Topic
 from hybridmap.streams.mounting import TransformTree, clean_frame, matrix
 from hybridmap.streams.order import sorted_order
 from hybridmap.trajectory import FARTHEST_M, NS_PER_S, Trajectory, format_stamp
@@ -31,6 +32,31 @@ TRANSPORT = re.compile(r"/(compressed|compressedDepth)$")
 
 _ODOMETRY_NAMES = (r"^/odom$", r"^/(odometry|wheel_odom|wheel_odometry)$", r"wheel", r"/odom$", r"odom")
 """The first pattern that fits counts; what fits none comes last."""
+
+
+def planar_pose(stamp_ns: int, position: Any, orientation: Any, what: str) -> tuple[float, float, float]:
+    """The planar part (x m, y m, yaw rad) of a pose with a ROS position and orientation.
+
+    Args:
+        stamp_ns: its stamp, ns, for errors.
+        position, orientation: with x, y, z and x, y, z, w.
+        what: file and topic, for errors.
+
+    Raises:
+        StreamError: NaN or Inf, a position too far away, or a quaternion of length 0 or infinity.
+    """
+    q = (orientation.x, orientation.y, orientation.z, orientation.w)
+    pose = (float(position.x), float(position.y), float(yaw_from_quaternion(*q)))
+    if not np.isfinite((*pose[:2], *q)).all():
+        raise StreamError(f"{what}: found NaN or Inf in the pose at stamp {format_stamp(stamp_ns)} s; expected finite numbers")
+    if max(abs(pose[0]), abs(pose[1])) > FARTHEST_M:
+        at = f"({pose[0]:g}, {pose[1]:g}) m at stamp {format_stamp(stamp_ns)} s"
+        raise StreamError(f"{what}: found the position {at}; expected at most {FARTHEST_M:g} m")
+    if np.isnan(pose[2]):
+        raise StreamError(
+            f"{what}: found a quaternion of length 0 or infinity at stamp {format_stamp(stamp_ns)} s; expected a rotation"
+        )
+    return pose
 
 
 @dataclass(slots=True)
@@ -49,26 +75,9 @@ class PoseTrack:
     poses: list[tuple[float, float, float]] = field(default_factory=list)
 
     def add(self, stamp_ns: int, position: Any, orientation: Any, what: str) -> None:
-        """Append the planar part of a pose, given by ROS position and orientation; `what` (file, topic) names it in errors.
-
-        Raises:
-            StreamError: NaN or Inf, a position too far away, or a quaternion of length 0 or infinity.
-        """
-        q = (orientation.x, orientation.y, orientation.z, orientation.w)
-        pose = (float(position.x), float(position.y), float(yaw_from_quaternion(*q)))
-        if not np.isfinite((*pose[:2], *q)).all():
-            raise StreamError(
-                f"{what}: found NaN or Inf in the pose at stamp {format_stamp(stamp_ns)} s; expected finite numbers"
-            )
-        if max(abs(pose[0]), abs(pose[1])) > FARTHEST_M:
-            at = f"({pose[0]:g}, {pose[1]:g}) m at stamp {format_stamp(stamp_ns)} s"
-            raise StreamError(f"{what}: found the position {at}; expected at most {FARTHEST_M:g} m")
-        if np.isnan(pose[2]):
-            raise StreamError(
-                f"{what}: found a quaternion of length 0 or infinity at stamp {format_stamp(stamp_ns)} s; expected a rotation"
-            )
+        """Append a pose, given and refused as by `planar_pose`."""
+        self.poses.append(planar_pose(stamp_ns, position, orientation, what))
         self.stamps_ns.append(stamp_ns)
-        self.poses.append(pose)
 
     def sorted(self, what: str, pose_child_base: Array | None = None) -> tuple[NDArray[np.int64], Array]:
         """Stamps (N,) ns and poses (N, 3), m and rad, in order of time.
@@ -135,55 +144,75 @@ def build_index(bag: BagFile, names: Iterable[str], odom_frame: str, *, skip_dam
     Raises:
         StreamError: the bag is damaged, or a pose has invalid numbers.
     """
-    index = BagIndex()
-    types = {topic.name: topic.msgtype for topic in bag.topics}
-    wanted = sorted(set(names))
-    for message in bag.raw(wanted):
-        index.counts[message.topic] = message.number + 1
-        if types[message.topic] in TRANSFORM:
-            _take_transforms(index, bag, message, clean_frame(odom_frame))
-            continue
-        stamp_ns = bag.stamp_ns(message)
-        index.stamps_ns.setdefault(message.topic, []).append(stamp_ns)
-        is_odometry = types[message.topic] in ODOMETRY
-        if is_odometry or message.topic not in index.first:
-            try:
-                decoded = bag.decode(message)
-            except StreamError:
-                if is_odometry or not skip_damaged:
-                    raise
-                continue
-            index.first.setdefault(message.topic, decoded)
-            if is_odometry:
-                _take_odometry(index, bag, message.topic, decoded, stamp_ns)
+    indexer = Indexer(bag, odom_frame, skip_damaged=skip_damaged)
+    for message in bag.raw(sorted(set(names))):
+        indexer.take(message)
+    index = indexer.index
     index.counts |= dict.fromkeys(index.stamps_ns.keys() - index.first.keys(), 0)  # none of their messages can be decoded
     return index
 
 
-def _take_odometry(index: BagIndex, bag: BagFile, topic: str, message: Any, stamp_ns: int) -> None:
-    if topic not in index.odometry:
-        index.odometry[topic] = PoseTrack(clean_frame(message.header.frame_id), clean_frame(message.child_frame_id))
-    pose = message.pose.pose
-    index.odometry[topic].add(stamp_ns, pose.position, pose.orientation, f"{bag.path}: {topic}")
+class Indexer:
+    """Makes the index, message by message; of a bag, or of a robot whose messages come in.
 
+    Attributes:
+        index: what was taken in so far.
+    """
 
-def _take_transforms(index: BagIndex, bag: BagFile, message: RawMessage, odom_frame: str) -> None:
-    for transform in bag.decode(message).transforms:
-        parent, child = clean_frame(transform.header.frame_id), clean_frame(transform.child_frame_id)
-        p, q = transform.transform.translation, transform.transform.rotation
-        what = f"{bag.path}: {message.topic}: {parent} -> {child}"
-        stamp = transform.header.stamp
-        stamp_ns = int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
-        if parent == odom_frame and not is_static(message.topic):
-            track = index.tf_tracks.setdefault((parent, child), PoseTrack(parent, child))
-            if not track.stamps_ns or track.stamps_ns[-1] != stamp_ns:  # tf is published again and again
-                track.add(stamp_ns, p, q, what)
-        values = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-        if not (np.abs(values) <= FARTHEST_M).all() or np.isnan(yaw_from_quaternion(*values[3:])):
-            index.unusable_transforms[f"{parent} -> {child}"] = None
-            continue
-        T = matrix((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
-        index.transforms.add(parent, child, T, static=is_static(message.topic))
+    def __init__(self, messages: Messages, odom_frame: str, *, skip_damaged: bool = False) -> None:
+        """Start with an empty index; `odom_frame` and `skip_damaged` are those of `build_index`."""
+        self.index = BagIndex()
+        self._messages, self._odom_frame, self._skip_damaged = messages, clean_frame(odom_frame), skip_damaged
+
+    def take(self, message: RawMessage) -> None:
+        """Take in the next message of a topic, which has a header or holds transforms.
+
+        Raises:
+            StreamError: it is damaged, or a pose has invalid numbers.
+        """
+        index, topic = self.index, message.topic
+        index.counts[topic] = message.number + 1
+        if self._messages.types[topic] in TRANSFORM:
+            self._take_transforms(message)
+            return
+        stamp_ns = self._messages.stamp_ns(message)
+        index.stamps_ns.setdefault(topic, []).append(stamp_ns)
+        is_odometry = self._messages.types[topic] in ODOMETRY
+        if is_odometry or topic not in index.first:
+            try:
+                decoded = self._messages.decode(message)
+            except StreamError:
+                if is_odometry or not self._skip_damaged:
+                    raise
+                return
+            index.first.setdefault(topic, decoded)
+            if is_odometry:
+                self._take_odometry(topic, decoded, stamp_ns)
+
+    def _take_odometry(self, topic: str, message: Any, stamp_ns: int) -> None:
+        if topic not in self.index.odometry:
+            self.index.odometry[topic] = PoseTrack(clean_frame(message.header.frame_id), clean_frame(message.child_frame_id))
+        pose = message.pose.pose
+        self.index.odometry[topic].add(stamp_ns, pose.position, pose.orientation, f"{self._messages.source}: {topic}")
+
+    def _take_transforms(self, message: RawMessage) -> None:
+        index = self.index
+        for transform in self._messages.decode(message).transforms:
+            parent, child = clean_frame(transform.header.frame_id), clean_frame(transform.child_frame_id)
+            p, q = transform.transform.translation, transform.transform.rotation
+            what = f"{self._messages.source}: {message.topic}: {parent} -> {child}"
+            stamp = transform.header.stamp
+            stamp_ns = int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+            if parent == self._odom_frame and not is_static(message.topic):
+                track = index.tf_tracks.setdefault((parent, child), PoseTrack(parent, child))
+                if not track.stamps_ns or track.stamps_ns[-1] != stamp_ns:  # tf is published again and again
+                    track.add(stamp_ns, p, q, what)
+            values = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+            if not (np.abs(values) <= FARTHEST_M).all() or np.isnan(yaw_from_quaternion(*values[3:])):
+                index.unusable_transforms[f"{parent} -> {child}"] = None
+                continue
+            T = matrix((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+            index.transforms.add(parent, child, T, static=is_static(message.topic))
 
 
 @dataclass(slots=True)

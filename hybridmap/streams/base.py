@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from numpy.typing import NDArray
@@ -148,6 +149,42 @@ class SensorPlan:
     remarks: list[str] = field(default_factory=list)
 
 
+class Gatherer(Protocol):
+    """Tells while messages come in which of them make an observation: the same ones as the plan of a whole recording."""
+
+    def push(self, topic: str, number: int, stamp_ns: int) -> list[Planned]:
+        """Take in a message by its header stamp, ns; returns the observations that are sure now, in order of stamp."""
+
+    def flush(self) -> list[Planned]:
+        """The end: returns what the messages that wait give."""
+
+    @property
+    def waiting(self) -> frozenset[MessageKey]:
+        """The messages that may still make an observation."""
+
+    @property
+    def losses(self) -> Mapping[str, int]:
+        """Name -> number of messages so far that no observation uses."""
+
+
+class EachMessage:
+    """Gathers an observation from every message, for a sensor with one topic."""
+
+    waiting: frozenset[MessageKey] = frozenset()
+    losses: Mapping[str, int] = MappingProxyType({})
+
+    def __init__(self, topics: Mapping[str, str], config: SensorsConfig) -> None:
+        del topics, config  # every message is one of the topic
+
+    def push(self, topic: str, number: int, stamp_ns: int) -> list[Planned]:
+        """The observation of this message."""
+        return [Planned(stamp_ns, ((topic, number),))]
+
+    def flush(self) -> list[Planned]:
+        """Nothing waits."""
+        return []
+
+
 @dataclass(frozen=True, slots=True)
 class InBag:
     """How a kind of sensor is found in a bag, and how its messages become observations.
@@ -157,11 +194,13 @@ class InBag:
         find: chooses topics: role (such as `color`) -> topic, empty if the bag has none.
         plan: (topics by role, index of the bag, base frame, settings, path of the bag) -> all observations. Raises a
             StreamError if something is missing, also for no topics at all, as the user may have asked for this kind.
+        gather: (topics by role, settings) -> what finds the same observations as `plan` while messages come in from a robot.
     """
 
     types: tuple[str, ...]
     find: Callable[[TopicChooser], dict[str, str]]
     plan: Callable[[Mapping[str, str], BagIndex, str, SensorsConfig, str], SensorPlan]
+    gather: Callable[[Mapping[str, str], SensorsConfig], Gatherer] = EachMessage
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Order in time: stamps within a topic, pairs across topics, and merging of streams."""
+"""Order in time: stamps within a topic, and merging of streams."""
 
 from __future__ import annotations
 
@@ -41,48 +41,6 @@ def sorted_order(stamps_ns: Stamps, what: str) -> NDArray[np.intp]:
                 f"{format_stamp(int(newest[at]))} s; expected stamps in order, at most one message out of place"
             )
     return np.argsort(stamps_ns, kind="stable")
-
-
-@dataclass(frozen=True, slots=True)
-class Pairs:
-    """Pairs of colour and depth images.
-
-    Attributes:
-        color, depth: (P,) indices of the paired images in the lists of colour and depth images; each is used once.
-        unmatched_color, unmatched_depth: number of images without a partner.
-    """
-
-    color: NDArray[np.intp]
-    depth: NDArray[np.intp]
-    unmatched_color: int
-    unmatched_depth: int
-
-
-def pair_nearest(color_ns: Stamps, depth_ns: Stamps, tolerance_s: float) -> Pairs:
-    """Pair images by stamp, nearest first, each used once, none further apart than the tolerance.
-
-    Args:
-        color_ns: (C,) sorted stamps, ns.
-        depth_ns: (D,) sorted stamps, ns.
-        tolerance_s: largest difference, s.
-
-    Returns:
-        Indices into both lists, row by row of one pair, in the order of `color_ns`; and the numbers of images left over.
-    """
-    tolerance_ns = round(tolerance_s * NS_PER_S)
-    candidates: list[tuple[int, int, int]] = []
-    first = np.searchsorted(depth_ns, color_ns - tolerance_ns, side="left")
-    last = np.searchsorted(depth_ns, color_ns + tolerance_ns, side="right")
-    for i, (low, high) in enumerate(zip(first, last, strict=True)):
-        candidates += [(abs(int(color_ns[i]) - int(depth_ns[j])), i, j) for j in range(int(low), int(high))]
-    free_color, free_depth = np.ones(len(color_ns), dtype=bool), np.ones(len(depth_ns), dtype=bool)
-    pairs: list[tuple[int, int]] = []
-    for _, i, j in sorted(candidates):
-        if free_color[i] and free_depth[j]:
-            free_color[i] = free_depth[j] = False
-            pairs.append((i, j))
-    table = np.array(sorted(pairs), dtype=np.intp).reshape(-1, 2)
-    return Pairs(table[:, 0], table[:, 1], int(free_color.sum()), int(free_depth.sum()))
 
 
 _LONGEST_S = 1e9

@@ -26,7 +26,8 @@ from hybridmap.streams.cameras import (
     from_intrinsics,
     mounted,
 )
-from hybridmap.streams.order import pair_nearest, sorted_order
+from hybridmap.streams.order import sorted_order
+from hybridmap.streams.pairing import PairGatherer, pair_nearest
 
 if TYPE_CHECKING:
     from hybridmap.streams.bagindex import BagIndex, TopicChooser
@@ -341,6 +342,6 @@ RGBD = SensorKind(
     compact=_compact,
     restore=_restore,
     see=_see,
-    in_bag=InBag(_IMAGE + _CAMERA_INFO, _find, _plan),
+    in_bag=InBag(_IMAGE + _CAMERA_INFO, _find, _plan, PairGatherer),
     configured=_configured,
 )

@@ -12,9 +12,8 @@ import numpy as np
 
 from hybridmap.config.root import Config
 from hybridmap.errors import StreamError
-from hybridmap.geometry import Array
-from hybridmap.streams.bagfile import TRANSFORM, BagFile, RawMessage
-from hybridmap.streams.bagindex import ODOMETRY, PoseTrack, build_index, select
+from hybridmap.streams.bagfile import BagFile
+from hybridmap.streams.bagindex import ODOMETRY, build_index, select
 from hybridmap.streams.base import (
     Decoder,
     InBag,
@@ -26,9 +25,10 @@ from hybridmap.streams.base import (
     SensorPlan,
     StreamReport,
 )
-from hybridmap.streams.mounting import clean_frame, planar
+from hybridmap.streams.layout import plan_sensor, self_motion
+from hybridmap.streams.messages import TRANSFORM, RawMessage
 from hybridmap.streams.order import Window, check_overlap, merge
-from hybridmap.streams.sensors import kind_of, kinds, message_types, wanted
+from hybridmap.streams.sensors import kind_of, kinds, message_types
 from hybridmap.trajectory import Trajectory
 
 _MOST_DAMAGED_FIRST = 10
@@ -70,11 +70,11 @@ class BagStream:
         self.selection = select(topics, self._sensors, kinds(), self._index.frame_of, str(path))
         self.remarks = list(self.selection.remarks)
         self.remarks += [f"transform {name} holds NaN or no rotation: ignored" for name in self._index.unusable_transforms]
-        track, what = self._self_motion()
-        self._base_frame = self._choose_base(track)
-        carry = self._carry(track, what)
-        self._motion_ns, self._motion_poses = track.sorted(what, carry)
-        self._plan_made = self._plan()
+        motion = self_motion(self._index, self.selection, self._sensors, self._bag)
+        self.remarks += motion.remarks
+        self._base_frame = motion.base_frame
+        self._motion_ns, self._motion_poses = motion.track.sorted(motion.what, motion.pose_child_base)
+        self._plan_made = plan_sensor(self._config.vision.sensor, self.selection, self._planned_by)
         self._planned, self.rig, self.losses = self._plan_made.planned, self._plan_made.rig, self._plan_made.losses
         self.remarks += self._plan_made.remarks
         self.lost = self._lost_messages()
@@ -156,53 +156,12 @@ class BagStream:
         if self._bag.stamp_ns(message) != self._index.stamps_ns[message.topic][message.number]:
             raise StreamError(f"{self._bag.path}: {message.topic}: other messages than at the first reading; was it changed?")
 
-    def _self_motion(self) -> tuple[PoseTrack, str]:
-        chosen = self.selection
-        if chosen.odometry is not None:
-            return self._index.odometry[chosen.odometry], f"{self._bag.path}: {chosen.odometry}"
-        odom = clean_frame(self._sensors.odom_frame)
-        known = self._index.tf_tracks.values() if chosen.odometry_tf else ()
-        base = clean_frame(self._sensors.base_frame or "")
-        tracks = sorted(known, key=lambda track: (track.child != base, -len(track.stamps_ns), track.child))
-        if not tracks:
-            types = ", ".join(f"{topic.name} ({topic.msgtype.replace('/msg/', '/')})" for topic in self._bag.topics) or "none"
-            raise StreamError(
-                f"{self._bag.path}: no odometry: expected a topic of type nav_msgs/Odometry or the transform "
-                f"{odom!r} -> base on /tf; topics found: {types}"
-            )
-        self.remarks.append(f"no Odometry topic: self-motion from the transform {tracks[0].parent} -> {tracks[0].child}")
-        return tracks[0], f"{self._bag.path}: transform {tracks[0].parent} -> {tracks[0].child}"
-
     def _lost_messages(self) -> dict[str, tuple[int, int]]:
         """Topic -> (messages that cannot be read, messages that the bag states), for topics that are used or wholly lost."""
         read, used = self._index.counts, frozenset(self.uses.values())
         known = [topic for topic in self._bag.topics if topic.name in self._known]
         lacking = {topic.name: (topic.count - read.get(topic.name, 0), topic.count) for topic in known}
         return {name: (gone, all_) for name, (gone, all_) in lacking.items() if gone > 0 and (name in used or gone == all_)}
-
-    def _choose_base(self, track: PoseTrack) -> str:
-        """The frame to map: the configured one, else the child frame of the odometry, else a usual name."""
-        named = clean_frame(self._sensors.base_frame or "") or track.child
-        usual = (frame for frame in ("base_link", "base_footprint") if frame in self._index.transforms.frames)
-        return named or next(usual, "base_link")
-
-    def _carry(self, track: PoseTrack, what: str) -> Array | None:
-        """(3,) pose of the base in the child frame of the odometry; None if they are the same."""
-        if track.child in ("", self._base_frame):
-            return None
-        T = self._index.transforms.require(track.child, self._base_frame, what, "another sensors.base_frame")
-        return planar(T)
-
-    def _plan(self) -> SensorPlan:
-        looked_for = wanted(self._config.vision.sensor)
-        for kind in looked_for:
-            topics = self.selection.sensors.get(kind.sensor_name, {})
-            if kind.in_bag is not None and (topics or len(looked_for) == 1):
-                return self._planned_by(kind.in_bag, topics)
-        if not looked_for:
-            return SensorPlan()
-        lacking = " and no ".join(kind.needs for kind in looked_for if kind.in_bag is not None)
-        return SensorPlan(remarks=[f"no {lacking}: self-motion alone"])
 
     def _planned_by(self, kind: InBag, topics: Mapping[str, str]) -> SensorPlan:
         """Plan the observations. Where damaged ones are skipped, the layout is that of the first messages that are sound."""

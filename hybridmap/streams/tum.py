@@ -27,7 +27,8 @@ from hybridmap.streams.cameras import (
     mounted,
 )
 from hybridmap.streams.mounting import invert, matrix, planar
-from hybridmap.streams.order import Window, check_overlap, merge, pair_nearest, sorted_order
+from hybridmap.streams.order import Window, check_overlap, merge, sorted_order
+from hybridmap.streams.pairing import pair_nearest
 from hybridmap.streams.rgbd import RGBD, RgbdFrame, pinhole
 from hybridmap.streams.sensors import wanted
 from hybridmap.trajectory import Trajectory, read_stamp_ns, read_tum
