@@ -92,7 +92,8 @@ class Incoming:
         self._held: list[RawMessage] = []
         self._whole_since_s: float | None = None
         self._missing = [f"{source}: no message yet"]
-        self._begin, self._give = begin, _nowhere
+        self._begin = begin
+        self._give: Callable[[Sample], None] = _nowhere
         self._motion: MotionSource | None = None
         self._last_tf_ns: int | None = None
         self._decode: Decoder | None = None
