@@ -61,3 +61,7 @@ class EvaluationError(HybridMapError):
 
 class StudyError(HybridMapError):
     """A study that cannot continue: its sources, its workers or its cluster."""
+
+
+class LiveError(HybridMapError):
+    """A live mapper that cannot go on: its process ended, or it does not answer."""

@@ -158,6 +158,11 @@ class Mapper:
         return dict(self._synchroniser.report.counts)
 
     @property
+    def stamp_ns(self) -> int:
+        """Stamp of the newest step, ns; 0 before the first."""
+        return self._position.stamp_ns
+
+    @property
     def lost_since(self) -> int | None:
         """First node after the robot was kidnapped or lost track of its motion; None while it is localised on the map."""
         return self.vision.lost_since if self.vision is not None else None

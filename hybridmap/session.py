@@ -28,6 +28,7 @@ LOOK_M = 40.0
 """Path length after which a first look ends, m: most drives have told the offset of their clocks by then."""
 
 Progress = Callable[[int, int | None], None]
+Opened = Callable[[Mapper, MapStore], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +46,15 @@ class Session:
     metrics: list[Metric]
 
 
-def run(stream: Stream, config: Config, out: Path, *, overwrite: bool = False, progress: Progress | None = None) -> Session:
+def run(
+    stream: Stream,
+    config: Config,
+    out: Path,
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    opened: Opened | None = None,
+) -> Session:
     """Map a stream into a session folder.
 
     The map file is written as the run proceeds: a run that is killed leaves a readable map up to its last node. On any
@@ -58,6 +67,7 @@ def run(stream: Stream, config: Config, out: Path, *, overwrite: bool = False, p
         out: the session folder itself.
         overwrite: replace a session that exists.
         progress: called with (observations done, observations expected; None if unknown).
+        opened: called with the mapper and the map file before the first sample, for a stream that shows what is mapped.
 
     Raises:
         StreamError: the stream is damaged or unordered, or has no odometry and views to map.
@@ -72,6 +82,8 @@ def run(stream: Stream, config: Config, out: Path, *, overwrite: bool = False, p
             folder.write_groundtruth(stream.groundtruth)  # before the drive, so that a killed run can be evaluated
         with MapStore.create(folder.path, config.to_yaml(), stream.rig, stream.name) as store:
             recorder = Recorder(mapper, store)
+            if opened is not None:
+                opened(mapper, store)
             _drive(stream, mapper, recorder, progress)
             return _conclude(stream, mapper, recorder, folder)
 

@@ -87,6 +87,15 @@ def test_readme_example_runs(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_the_example_of_a_robots_own_loop_runs(tmp_path: Path) -> None:
+    (example,) = [text for language, text in blocks(ROOT / "docs" / "live.md") if language == "python"]
+    (said,) = [text for language, text in blocks(ROOT / "docs" / "live.md") if language == "text"]
+    done = run(sys.executable, "-c", example, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    check(done.stdout, said, "docs/live.md")
+    assert (tmp_path / "drive" / "metrics.json").is_file()
+
+
 def test_readme_names_every_back_end() -> None:
     from hybridmap.backends import names
 

@@ -1,0 +1,11 @@
+"""Mapping on a robot while it drives: a mapper in a process of its own, which takes samples at once and in any order.
+
+`LiveMapper` is what a robot's program uses.
+"""
+
+from hybridmap.live.inbox import LiveLimits
+from hybridmap.live.mapper import LiveMapper, LiveReport
+from hybridmap.live.messages import Snapshot
+from hybridmap.live.odometry import SmoothedCorrection
+
+__all__ = ["LiveLimits", "LiveMapper", "LiveReport", "SmoothedCorrection", "Snapshot"]

@@ -1,0 +1,378 @@
+"""The live mapper: what a robot's own program calls while it drives."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hybridmap.config import Config
+from hybridmap.errors import HybridMapError, LiveError
+from hybridmap.export.keyframes import OccupancyGrid
+from hybridmap.geometry import Array, compose, inverse
+from hybridmap.live import doctor
+from hybridmap.live.child import Child
+from hybridmap.live.inbox import Inbox, LiveLimits
+from hybridmap.live.messages import Answer, Ask, Begin, Done, Dropped, End, Ready, Reset, Snapshot, empty_snapshot
+from hybridmap.live.odometry import ReceivedOdometry, SmoothedCorrection, Smoother
+from hybridmap.live.samples import check
+from hybridmap.session import Session
+from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion, Velocity
+from hybridmap.streams.laser import LaserScan
+from hybridmap.streams.rgbd import RgbdFrame
+from hybridmap.streams.sensors import carried
+from hybridmap.trajectory import stamp_ns_from_s
+
+log = logging.getLogger(__name__)
+
+_LOOK_S = 0.05
+"""How often samples that wait are looked at again, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class LiveReport:
+    """How a live mapper is doing.
+
+    Attributes:
+        state: `mapping`, `paused`, `finished` or `failed`.
+        samples: source -> number of samples that came.
+        dropped: source -> reason -> number of them that the mapper did not get.
+        lag_s, largest_lag_s: time from the turn of the oldest view that is not on the map until now, and the largest so far.
+        nodes: nodes of the newest snapshot.
+    """
+
+    state: str
+    samples: Mapping[str, int]
+    dropped: Mapping[str, Mapping[str, int]]
+    lag_s: float
+    largest_lag_s: float
+    nodes: int
+
+
+class LiveMapper:
+    """Maps while a robot drives. Every call returns at once, whatever the mapper is at, unless its description says otherwise.
+
+    ```python
+    with LiveMapper(Config.load("laser"), rig, Path("session")) as mapper:
+        mapper.add_odometry(stamp_s, pose_odom_robot)
+        mapper.add_scan(stamp_s, ranges_m)
+        pose = mapper.pose_map_robot()
+    ```
+
+    The map is made in a process of its own, by the code that maps a recording, and written into a session folder as the robot
+    drives. Samples may come in any order across sources: the map is the same as that of a recording of them, bit for bit,
+    unless samples are left out; `report` counts those. If this process dies, the other one concludes the session.
+
+    Leaving the `with` block finishes the session. Methods may be called from any thread.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        rig: Rig,
+        out: Path,
+        *,
+        name: str = "live",
+        limits: LiveLimits | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        """Start the mapping process and wait until it is set up, some seconds.
+
+        Args:
+            config: every setting; saved resolved.
+            rig: the sensors, as `streams.sensors.rig_of` makes them from a configuration.
+            out: the session folder.
+            name: name of the source in the session, for people.
+            limits: of lag and correction.
+            overwrite: replace a session that exists.
+
+        Raises:
+            ConfigError, BackendError, StreamError: the configuration names something that does not exist.
+            OutputError: the folder cannot be used, or another run is writing there.
+            LiveError: the mapping process cannot be started.
+        """
+        self._limits, self._rig = limits or LiveLimits(), rig
+        self._changed = threading.Condition()
+        self._outgoing: list[Any] = []  # messages that go before any sample
+        self._told: Counter[tuple[str, str]] = Counter()  # what the child knows of samples that were left out
+        self._asked: dict[int, Future[Any]] = {}
+        self._numbers = 0
+        self._ready: Future[None] = Future()
+        self._result: Future[Session] = Future()
+        self._begin()
+        self._child = Child(Begin(config, rig, out, name, overwrite), self._receive, self._fail)
+        try:
+            self._ready.result()
+        except BaseException:
+            self._child.close()
+            raise
+        threading.Thread(target=self._feed, name="hybridmap-feed", daemon=True).start()
+
+    def _begin(self) -> None:
+        """Forget everything that belongs to one map."""
+        self._inbox = Inbox((kind.counted for kind, _ in carried(self._rig)), self._limits, time.monotonic())
+        self._odometry = ReceivedOdometry()
+        self._smoother = Smoother(self._limits.correction_m_s, np.deg2rad(self._limits.correction_deg_s))
+        self._correction: Array | None = None
+        self._snapshot = empty_snapshot()
+        self._ending = False
+
+    # ------------------------------------------------------------------ samples
+
+    def add_odometry(self, stamp_s: float, pose_odom_robot: ArrayLike) -> None:
+        """Take in a pose (3,) of `base_link` in `odom`, m and rad. Errors are those of `add`."""
+        self.add(SelfMotion(stamp_ns_from_s(stamp_s), np.array(pose_odom_robot, dtype=np.float64)))
+
+    def add_velocity(self, stamp_s: float, v_m_s: float, omega_rad_s: float) -> None:
+        """Take in a forward speed and a turn rate that hold until the next call. Errors are those of `add`."""
+        self.add(Velocity(stamp_ns_from_s(stamp_s), float(v_m_s), float(omega_rad_s)))
+
+    def add_rgbd(self, stamp_s: float, color: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> None:
+        """Take in a frame: color (H, W, 3) uint8 RGB, depth (H, W) float32 in m, 0 where invalid. Errors are those of `add`.
+
+        The arrays must not be changed afterwards.
+        """
+        self.add(RgbdFrame(stamp_ns_from_s(stamp_s), color, depth_m))
+
+    def add_scan(self, stamp_s: float, ranges_m: ArrayLike) -> None:
+        """Take in a scan (B,), m, NaN or Inf where there is no return. Errors are those of `add`."""
+        ranges = np.array(ranges_m, dtype=np.float32)
+        ranges[~np.isfinite(ranges)] = np.nan
+        self.add(LaserScan(stamp_ns_from_s(stamp_s), ranges))
+
+    def add(self, sample: Sample) -> None:
+        """Take in any sample, in any order across the sources; those of one source should come in order of stamp.
+
+        Raises:
+            StreamError: the sample is not finite or has another shape than its sensor, the rig has no such sensor, or
+                odometry is mixed with velocities. The sample is left out, and mapping goes on.
+            LiveError, or the mapper's own error: the mapping process has ended.
+        """
+        self._require_running()
+        check(sample, self._rig, self._odometry.kind)
+        now_s = time.monotonic()
+        with self._changed:
+            if not isinstance(sample, Observation):
+                self._odometry.add(sample)
+                if self._correction is None:  # the map begins where the robot is
+                    self._correction = inverse(self._odometry.newest)
+            self._inbox.add(sample, now_s)
+            self._changed.notify()
+
+    # ------------------------------------------------------------------ poses
+
+    @property
+    def pose_map_odom(self) -> Array:
+        """(3,) the newest correction `map -> odom` (REP-105), m and rad; a loop closure makes it jump."""
+        return np.zeros(3) if self._correction is None else self._correction
+
+    def smoothed_map_odom(self, now_s: float) -> SmoothedCorrection:
+        """The correction, slowed to `LiveLimits.correction_m_s` and `correction_deg_s`, at a time of any steady clock, s."""
+        with self._changed:
+            return self._smoother.step(now_s, self.pose_map_odom, self._odometry.newest)
+
+    def pose_map_robot(self, stamp_s: float | None = None) -> Array:
+        """(3,) the robot on the map: its newest odometry, or that at a stamp, by the newest correction; m and rad.
+
+        Raises:
+            StreamError: the stamp lies before the odometry that is kept, some 4000 messages.
+        """
+        odometry = self._odometry
+        pose = odometry.newest if stamp_s is None else odometry.at(stamp_ns_from_s(stamp_s))
+        return compose(self.pose_map_odom, pose)
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """The newest map that the mapping process has sent, after about every node."""
+        return self._snapshot
+
+    # ------------------------------------------------------------------ how it is doing
+
+    @property
+    def report(self) -> LiveReport:
+        """Numbers of samples, what was left out, and the lag."""
+        with self._changed:
+            inbox, now_s = self._inbox, time.monotonic()
+            lag_s = inbox.lag_s(now_s)
+            return LiveReport(
+                self._state,
+                {name: source.count for name, source in inbox.sources.items()},
+                {name: dict(source.left_out) for name, source in inbox.sources.items() if source.left_out},
+                lag_s,
+                max(lag_s, inbox.largest_lag_s),
+                len(self._snapshot.poses),
+            )
+
+    @property
+    def pid(self) -> int:
+        """Number of the mapping process."""
+        return self._child.pid
+
+    def doctor(self) -> list[str]:
+        """What is wrong with the input, in sentences: sources that are missing, late, or on another clock; empty if nothing."""
+        with self._changed:
+            return doctor.sentences(self._inbox, time.monotonic())
+
+    # ------------------------------------------------------------------ services
+
+    def pause(self) -> None:
+        """Leave views out until `resume`. Odometry is taken in all the same, as the robot may be moved meanwhile."""
+        self._inbox.paused = True
+
+    def resume(self) -> None:
+        """Take in views again."""
+        self._inbox.paused = False
+
+    def save(self, timeout_s: float | None = None) -> None:
+        """Write everything so far into the session folder, and wait until it is there; others may read it meanwhile.
+
+        Raises:
+            LiveError: no answer in this time, or the mapping process has ended.
+        """
+        self._ask("save", timeout_s=timeout_s)
+
+    def grid(self, resolution_m: float = 0.05, timeout_s: float | None = None) -> OccupancyGrid:
+        """Wait for the occupancy grid of the map so far.
+
+        Raises:
+            ExportError: the map shows no obstacle yet.
+            LiveError: no answer in this time, or the mapping process has ended.
+        """
+        grid: OccupancyGrid = self._ask("grid", resolution_m, timeout_s=timeout_s)
+        return grid
+
+    def reset(self) -> None:
+        """Leave the map and begin a new one in its place; waits until the step that is being done has ended."""
+        self._require_running()
+        with self._changed:
+            self._ready = Future()
+            self._begin()
+            self._told.clear()
+            self._outgoing.append(Reset())
+            self._changed.notify()
+        self._ready.result()
+
+    def finish(self, timeout_s: float | None = None) -> Session:
+        """End of the drive: map what still waits, conclude the session as at the end of a recording, and wait for it.
+
+        Raises:
+            StreamError: nothing was mapped.
+            LiveError: no answer in this time, or the mapping process has ended.
+        """
+        with self._changed:
+            self._ending = True
+            self._changed.notify()
+        session: Session = _waited(self._result, timeout_s)
+        return session
+
+    def close(self) -> None:
+        """Let go of the mapping process without waiting; what was not finished it concludes by itself."""
+        self._fail(LiveError("the live mapper was closed"))
+        self._child.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        try:
+            if kind is None and not self._result.done():
+                self.finish()
+        finally:
+            self.close()
+
+    # ------------------------------------------------------------------ the mapping process
+
+    @property
+    def _state(self) -> str:
+        if self._result.done():
+            return "failed" if self._result.exception() is not None else "finished"
+        return "paused" if self._inbox.paused else "mapping"
+
+    def _require_running(self) -> None:
+        if self._result.done():
+            self._result.result()
+            raise LiveError("the session is finished; make a new LiveMapper")
+
+    def _ask(self, what: str, *arguments: Any, timeout_s: float | None) -> Any:
+        self._require_running()
+        answer: Future[Any] = Future()
+        with self._changed:
+            number = self._numbers = self._numbers + 1
+            self._asked[number] = answer
+            self._outgoing.append(Ask(number, what, arguments))
+            self._changed.notify()
+        return _waited(answer, timeout_s)
+
+    def _feed(self) -> None:
+        """Send what has to be sent, in a thread of its own, until the end."""
+        while not self._result.done():
+            with self._changed:
+                messages = self._next()
+                if not messages:
+                    self._changed.wait(_LOOK_S if self._inbox.waits else None)
+            self._child.send(messages)
+            if messages and isinstance(messages[-1], End):
+                return
+
+    def _next(self) -> list[Any]:
+        """The messages to send now."""
+        now_s, asked = time.monotonic(), self._outgoing
+        self._outgoing = []
+        samples = self._inbox.flush(now_s) if self._ending else self._inbox.take(now_s)
+        left_out = Counter(
+            {(name, why): number for name, source in self._inbox.sources.items() for why, number in source.left_out.items()}
+        )
+        news = [Dropped(*key, number) for key, number in (left_out - self._told).items()]
+        self._told = left_out
+        return [*asked, *news, *samples, *([End()] if self._ending else [])]
+
+    def _receive(self, message: Any) -> None:
+        """Take in a message of the mapping process."""
+        with self._changed:
+            if isinstance(message, Ready):
+                self._ready.set_result(None)
+            elif isinstance(message, Answer):
+                _settle(self._asked.pop(message.number), message.value)
+            elif not self._ready.done():
+                return  # of the map that was left
+            elif isinstance(message, Done):
+                self._inbox.done(message.taken, message.mapped, message.busy_s, time.monotonic())
+                self._correction = message.pose_map_odom
+            elif isinstance(message, Snapshot):
+                self._snapshot, self._correction = message, message.pose_map_odom
+            elif isinstance(message, Session):
+                self._result.set_result(message)
+            self._changed.notify()
+
+    def _fail(self, error: HybridMapError) -> None:
+        """End everything that waits for the mapping process, by an error."""
+        with self._changed:
+            waiting: list[Future[Any]] = [self._ready, self._result, *self._asked.values()]
+            for future in waiting:
+                if not future.done():
+                    future.set_exception(error)
+            self._changed.notify()
+
+
+def _settle(future: Future[Any], value: Any) -> None:
+    if isinstance(value, HybridMapError):
+        future.set_exception(value)
+    else:
+        future.set_result(value)
+
+
+def _waited(future: Future[Any], timeout_s: float | None) -> Any:
+    try:
+        return future.result(timeout_s)
+    except TimeoutError:
+        raise LiveError(f"the mapping process gave no answer in {timeout_s} s") from None
