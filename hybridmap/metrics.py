@@ -47,7 +47,10 @@ class Metric:
 
 FIGURES: dict[str, tuple[str, str]] = {
     "nodes": ("1", "nodes of the map"),
+    "sessions": ("1", "drives that the map was made of"),
+    "pieces": ("1", "pieces of the map that are not joined, each in a frame of its own; 1 if all is one map"),
     "loops_accepted": ("1", "loop closures in the graph"),
+    "loops_between_sessions": ("1", "of those, the ones between two sessions"),
     "loops_pending": ("1", "loop closures still waiting at the end"),
     "loops_rejected": ("1", "loop closures refused, each with its reason"),
     "loops_retracted": ("1", "loop closures that were removed from the graph again"),

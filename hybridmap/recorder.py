@@ -11,6 +11,7 @@ from hybridmap.edge_book import Update
 from hybridmap.geometry import Array, between, compose
 from hybridmap.mapper import Mapper
 from hybridmap.store import MapStore
+from hybridmap.vision.base import MeetingFrontEnd
 
 
 class Recorder:
@@ -64,8 +65,9 @@ class Recorder:
     def _write_node(self, number: int) -> None:
         mapper = self._mapper
         keyframe = mapper.vision.keyframe(number) if mapper.vision is not None else {}
+        state = mapper.vision.state(number) if isinstance(mapper.vision, MeetingFrontEnd) else {}
         initial = mapper.map.initial[number]
-        self.store.add_node(number, mapper.map.node(number), initial, keyframe, mapper.cells.activity_at(number))
+        self.store.add_node(number, mapper.map.node(number), initial, keyframe, mapper.cells.activity_at(number), state)
 
     def _write_put_back(self) -> None:
         """Write the cells' state again at nodes that were made while the robot was lost, once it is found."""

@@ -238,7 +238,7 @@ def table(path: Path, rng: np.random.Generator) -> None:
         elif how < 0.1:
             connection.execute(f"DELETE FROM {name}")
         elif how < 0.14:
-            connection.execute(f"PRAGMA user_version = {int(rng.choice((0, 1, 2, 4, 1000)))}")
+            connection.execute(f"PRAGMA user_version = {int(rng.choice((0, 1, 2, 5, 1000)))}")
         elif how < 0.3:
             _rows(connection, name, rng)
         else:

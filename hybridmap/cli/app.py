@@ -21,6 +21,7 @@ from hybridmap.cli.explain import explain
 from hybridmap.cli.export import export
 from hybridmap.cli.inspect import inspect
 from hybridmap.cli.map import map_source
+from hybridmap.cli.merge import merge
 from hybridmap.cli.optimize import optimize
 from hybridmap.cli.reproduce import reproduce
 from hybridmap.cli.simulate import simulate
@@ -71,6 +72,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], dict[int, str]]] = {
         map_source,
         {0: "the session is written, whatever its verdict", 3: "it is written, but --strict found lost or skipped messages"},
     ),
+    "merge": (merge, {0: "the map of both is written, whether or not they could be joined"}),
     "evaluate": (evaluate, {0: "evaluated, even if metrics.json or the page cannot be written, which is only warned of"}),
     "explain": (explain, {0: "explained"}),
     "export": (export, {0: "written"}),

@@ -39,6 +39,13 @@ _SkipDamaged = Annotated[
         " written.",
     ),
 ]
+_Onto = Annotated[
+    Path | None,
+    typer.Option(
+        help="Session folder of a map that the drive continues: the new map holds both. Nothing is assumed of where the drive"
+        " begins; if it is not found on that map, both stay apart and the verdict says `not joined`."
+    ),
+]
 _Strict = Annotated[
     bool,
     typer.Option(
@@ -65,6 +72,7 @@ def map_source(
     setting: SensorSetting = None,
     skip_damaged: _SkipDamaged = False,
     strict: _Strict = False,
+    onto: _Onto = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -90,9 +98,16 @@ def map_source(
     chosen_here = {key: value for key, value in named.items() if value is not None}
     overrides = {**topics, **chosen_here, **parse_settings(setting)}
     chosen = choose(source, config, overrides, start_s=start, end_s=end, skip_damaged=skip_damaged)
-    head, metrics = map_and_report(chosen.stream, chosen.config, out, overwrite=overwrite)
+    if onto is not None:
+        from hybridmap.sessions.joining import map_onto
+
+        with progress(f"mapping {chosen.stream.name}") as advance:
+            joined = map_onto(chosen.stream, chosen.config, onto, out, overwrite=overwrite, progress=advance)
+        head, metrics = joined.head, joined.metrics
+    else:
+        head, metrics = map_and_report(chosen.stream, chosen.config, out, overwrite=overwrite)
     emit(head, metrics, as_json=as_json, title=f"{out}: {chosen.stream.name}")
-    if not as_json:
+    if not as_json and onto is None:
         typer.echo(f"page: {out / 'report.html'}")
     if strict and chosen.stream.report.lost:
         raise typer.Exit(LOST)

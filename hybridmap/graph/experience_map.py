@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,11 @@ class Node:
 
 
 class ExperienceMap:
-    """Append-only log of nodes and edges; an edge's status may change, nothing is ever deleted."""
+    """Append-only log of nodes and edges; an edge's status may change, nothing is ever deleted.
+
+    Nodes belong to sessions, one drive each. No edge of motion joins two sessions. `Node.pose_odom` and `Node.travel_m` are
+    those of the node's own session.
+    """
 
     def __init__(self) -> None:
         self._nodes: list[Node] = []
@@ -51,6 +56,17 @@ class ExperienceMap:
         self._accepted = _Rows((), np.bool_)
         self._since = _Rows((), np.int64)
         self._edges_into: dict[int, list[int]] = {}
+        self._sessions = [0]
+
+    @property
+    def sessions(self) -> tuple[range, ...]:
+        """The node numbers of each session, in order; one session unless `begin_session` was called."""
+        return tuple(range(a, b) for a, b in pairwise([*self._sessions, len(self)]))
+
+    def begin_session(self) -> None:
+        """Let the next node be the first of a new session; nothing happens before the first node."""
+        if len(self) > self._sessions[-1]:
+            self._sessions.append(len(self))
 
     @property
     def nodes(self) -> tuple[Node, ...]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import sqlite3
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import update_wrapper
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
@@ -16,19 +15,44 @@ from numpy.typing import NDArray
 from hybridmap.backends.base import ODOMETRY, Solution, SolveReport
 from hybridmap.config.section import mapping_of
 from hybridmap.errors import GeometryError, GraphError, StoreError, quoted
-from hybridmap.geometry import Array, RelativePose
+from hybridmap.geometry import Array, RelativePose, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.store import schema
+from hybridmap.store.tables import Tables, floats, marks
 from hybridmap.store.track import Track
 from hybridmap.streams.base import Rig
-from hybridmap.trajectory import NO_ANCHORS, Anchors, Trajectory
+from hybridmap.trajectory import Anchors, Trajectory
 
-_KEYFRAME, _SNAPSHOT, _CODE = "keyframe", "snapshot", "code"
+_KEYFRAME, _SNAPSHOT, _CODE, _STATE = "keyframe", "snapshot", "code", "state"
 _DAMAGE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError, GeometryError, GraphError)
 """What making something of the values of a damaged file raises."""
+NOTHING: Mapping[str, NDArray[Any]] = {}
 _Given = ParamSpec("_Given")
 _Found = TypeVar("_Found")
+
+
+NEWEST = -1
+"""Stands for the session that was added last."""
+
+
+@dataclass(frozen=True, slots=True)
+class StoredSession:
+    """A session of a map file.
+
+    Attributes:
+        number: from 0.
+        first_node: its first node; it ends before the first node of the next session.
+        name, source: what it is called, and what was mapped, for people.
+        pose_map_session: (3,) its frame, in which its poses by odometry are kept, on the map, m and rad. The frame of a session
+            that is not joined to the first one is a frame of its own.
+    """
+
+    number: int
+    first_node: int
+    name: str
+    source: str
+    pose_map_session: Array
 
 
 def _reading(
@@ -47,17 +71,12 @@ def _reading(
     return update_wrapper(guarded, method)
 
 
-class MapStore:
+class MapStore(Tables):
     """A map file, open either for writing (`create`) or for reading (`open`).
 
     Everything up to the last `commit` survives a killed process; call it once for each node. Usable as a context manager.
     `close` merges SQLite's log into the file, so that one file is left. Reading a damaged file raises a StoreError.
     """
-
-    def __init__(self, path: Path, connection: sqlite3.Connection, *, writable: bool) -> None:
-        self._path = path
-        self._connection = connection
-        self._writable = writable
 
     @classmethod
     def create(cls, folder: Path, config_yaml: str, rig: Rig, source: str) -> Self:
@@ -74,6 +93,7 @@ class MapStore:
         """
         path = _file_of(folder)
         store = cls(path, schema.create(path), writable=True)
+        store.write_rows("sessions", [(0, 0, source, source, 0.0, 0.0, 0.0)])
         for key, value in (("config_yaml", config_yaml), ("rig", schema.rig_to_json(rig)), ("source", source)):
             store.put_info(key, value)
         store.commit()
@@ -103,7 +123,7 @@ class MapStore:
         """
         if self._writable:
             self._writable = False
-            with self._named_errors("write"):
+            with self.named_errors("write"):
                 schema.finish(self._connection)
         else:
             self._connection.close()
@@ -117,6 +137,7 @@ class MapStore:
         initial: Array,
         keyframe: Mapping[str, NDArray[Any]],
         snapshot: Mapping[str, NDArray[Any]],
+        state: Mapping[str, NDArray[Any]] = NOTHING,
     ) -> None:
         """Write a node.
 
@@ -126,32 +147,38 @@ class MapStore:
             initial: (3,) pose in `map` composed along odometry edges, m and rad.
             keyframe: arrays that the front-end keeps of the node's frame, by name.
             snapshot: arrays of the state of the path integrator, by name, for re-anchoring.
+            state: what the front-end needs beside the keyframe to take the node up again, by name.
         """
         row = (
             number,
             int(node.stamp_ns),
-            *_floats(node.pose_odom),
-            *_floats(initial),
+            *floats(node.pose_odom),
+            *floats(initial),
             int(node.template),
             float(node.travel_m),
         )
-        self._write(f"INSERT INTO nodes VALUES ({_marks(len(row))})", row)
-        for part, arrays in ((_CODE, {"place": node.place_code}), (_KEYFRAME, keyframe), (_SNAPSHOT, snapshot)):
-            self._put_arrays(number, part, arrays)
+        self.write(f"INSERT INTO nodes VALUES ({marks(len(row))})", row)
+        for part, arrays in (
+            (_CODE, {"place": node.place_code}),
+            (_KEYFRAME, keyframe),
+            (_SNAPSHOT, snapshot),
+            (_STATE, state),
+        ):
+            self.put_arrays(number, part, arrays)
 
     def put_snapshot(self, number: int, snapshot: Mapping[str, NDArray[Any]]) -> None:
         """Write the state of the path integrator at a node again, over that which `add_node` wrote."""
-        self._put_arrays(number, _SNAPSHOT, snapshot)
+        self.put_arrays(number, _SNAPSHOT, snapshot)
 
     def put_edge(self, number: int, edge: Edge) -> None:
         """Write an edge, whatever its status; replaces what was written under the same number (from 0, without gaps)."""
         measured: tuple[Any, ...] = (None,) * 4
         if edge.relative is not None:
-            measured = (*_floats(edge.relative.delta), schema.pack_floats(edge.relative.covariance))
+            measured = (*floats(edge.relative.delta), schema.pack_floats(edge.relative.covariance))
         ends, kind = (int(edge.source), int(edge.target)), EdgeKind(edge.kind).name.lower()
         record = schema.record_to_json(edge)
         row = (number, *ends, kind, str(edge.status), edge.reason, *measured, record, int(edge.since_node))
-        self._write(f"INSERT OR REPLACE INTO edges VALUES ({_marks(len(row))})", row)
+        self.write(f"INSERT OR REPLACE INTO edges VALUES ({marks(len(row))})", row)
 
     def add_track(self, stamp_ns: int, node: int, delta_node_robot: Array, pose_odom: Array) -> None:
         """Write where the robot was at a stamp; replaces what was written for the same stamp.
@@ -162,8 +189,8 @@ class MapStore:
             delta_node_robot: (3,) pose of the robot in the node's frame, m and rad.
             pose_odom: (3,) pose of the robot in `odom`, m and rad.
         """
-        row = (int(stamp_ns), int(node), *_floats(delta_node_robot), *_floats(pose_odom))
-        self._write(f"INSERT OR REPLACE INTO track VALUES ({_marks(len(row))})", row)
+        row = (int(stamp_ns), int(node), *floats(delta_node_robot), *floats(pose_odom))
+        self.write(f"INSERT OR REPLACE INTO track VALUES (0, {marks(len(row))})", row)
 
     def replace_odometry(self, track: Track, experiences: ExperienceMap) -> None:
         """Write new poses of the whole track, and of all nodes in `odom` and along odometry edges, over the earlier ones.
@@ -175,33 +202,33 @@ class MapStore:
         moved = np.column_stack([track.deltas, track.poses_odom]).tolist()
         columns = "x_m = ?, y_m = ?, yaw_rad = ?, odom_x_m = ?, odom_y_m = ?, odom_yaw_rad = ?"
         for stamp_ns, row in zip(track.stamps_ns.tolist(), moved, strict=True):
-            self._write(f"UPDATE track SET {columns} WHERE stamp_ns = ?", (*row, stamp_ns))
+            self.write(f"UPDATE track SET {columns} WHERE stamp_ns = ?", (*row, stamp_ns))
         columns = "odom_x_m = ?, odom_y_m = ?, odom_yaw_rad = ?, initial_x_m = ?, initial_y_m = ?, initial_yaw_rad = ?"
         for number, (node, initial) in enumerate(zip(experiences.nodes, experiences.initial, strict=True)):
-            self._write(f"UPDATE nodes SET {columns} WHERE number = ?", (*_floats(node.pose_odom), *_floats(initial), number))
+            self.write(f"UPDATE nodes SET {columns} WHERE number = ?", (*floats(node.pose_odom), *floats(initial), number))
 
     def add_online(self, backend: str, stamp_ns: int, pose_map: Array) -> None:
         """Write the pose (3,) in `map` (m, rad) that a back-end gave at that time; replaces one of the same stamp."""
-        self._write("INSERT OR REPLACE INTO online VALUES (?, ?, ?, ?, ?)", (backend, int(stamp_ns), *_floats(pose_map)))
+        self.write("INSERT OR REPLACE INTO online VALUES (0, ?, ?, ?, ?, ?)", (backend, int(stamp_ns), *floats(pose_map)))
 
     def put_anchors(self, anchors: Anchors) -> None:
         """Write the poses of frames between nodes that were registered to the final map; replaces earlier ones."""
-        self._write("DELETE FROM anchors", ())
+        self.write("DELETE FROM anchors", ())
         ends = zip(anchors.stamps_ns.tolist(), anchors.nodes.tolist(), anchors.next_nodes.tolist(), strict=True)
         for end, delta, next_delta in zip(ends, anchors.deltas, anchors.next_deltas, strict=True):
-            self._write(f"INSERT INTO anchors VALUES ({_marks(9)})", (*end, *_floats(delta), *_floats(next_delta)))
+            self.write(f"INSERT INTO anchors VALUES (0, {marks(9)})", (*end, *floats(delta), *floats(next_delta)))
 
     def put_solution(self, backend: str, poses: Array, report: SolveReport) -> None:
         """Write a back-end's poses (N, 3) and report; replaces an earlier one of the same name."""
-        position = self._one("SELECT position FROM solutions WHERE backend = ?", (backend,))
+        position = self.one("SELECT position FROM solutions WHERE session = ? AND backend = ?", (schema.WHOLE, backend))
         if position is None:
-            position = self._one("SELECT COUNT(*) FROM solutions", ())
-        row = (backend, position, schema.pack_floats(poses), schema.report_to_json(report))
-        self._write("INSERT OR REPLACE INTO solutions VALUES (?, ?, ?, ?)", row)
+            position = self.one("SELECT COUNT(*) FROM solutions WHERE session = ?", (schema.WHOLE,))
+        row = (schema.WHOLE, backend, position, schema.pack_floats(poses), schema.report_to_json(report))
+        self.write("INSERT OR REPLACE INTO solutions VALUES (?, ?, ?, ?, ?)", row)
 
     def put_info(self, key: str, value: Any) -> None:
         """Write a value that JSON can hold under a key; `primary_backend` is the key of the primary back-end's name."""
-        self._write("INSERT OR REPLACE INTO info VALUES (?, ?)", (key, json.dumps(value)))
+        self.write("INSERT OR REPLACE INTO info VALUES (?, ?, ?)", (schema.WHOLE, key, json.dumps(value)))
 
     def commit(self) -> None:
         """Make everything written so far survive a killed process.
@@ -209,15 +236,10 @@ class MapStore:
         Raises:
             StoreError: the file cannot be written.
         """
-        with self._named_errors("write"):
+        with self.named_errors("write"):
             self._connection.commit()
 
     # ------------------------------------------------------------------ reading
-
-    @property
-    def path(self) -> Path:
-        """Path of the map file."""
-        return self._path
 
     @property
     def config_yaml(self) -> str:
@@ -262,19 +284,22 @@ class MapStore:
     @_reading
     def info(self, key: str) -> Any:
         """The value that was written under a key; None if the key is not there."""
-        text = self._one("SELECT value FROM info WHERE key = ?", (key,))
+        text = self.one("SELECT value FROM info WHERE session = ? AND key = ?", (schema.WHOLE, key))
         return None if text is None else json.loads(text)
 
     @_reading
     def map(self) -> ExperienceMap:
         """A new experience map with the nodes and edges of the file, in the order in which they were made."""
-        experiences, version = ExperienceMap(), int(self._one("PRAGMA user_version", ()))
-        codes = self._of_nodes(_CODE, "place")
-        for number, row in enumerate(self._rows("SELECT * FROM nodes ORDER BY number")):
+        experiences, version = ExperienceMap(), int(self.one("PRAGMA user_version", ()))
+        codes, frames = self.arrays_of_nodes(_CODE, "place"), {one.first_node: one.pose_map_session for one in self.sessions()}
+        for number, row in enumerate(self.rows("SELECT * FROM nodes ORDER BY number")):
             node = Node(int(row[1]), _pose(row[2:5]), codes[number], int(row[8]), float(row[9]))
-            if experiences.add_node(node, _pose(row[5:8])) != row[0]:
+            if number in frames:
+                experiences.begin_session()
+                frame = frames[number]
+            if experiences.add_node(node, compose(frame, _pose(row[5:8])) if frame.any() else _pose(row[5:8])) != row[0]:
                 raise ValueError(f"node {number} is missing")
-        for number, row in enumerate(self._rows("SELECT * FROM edges ORDER BY number")):
+        for number, row in enumerate(self.rows("SELECT * FROM edges ORDER BY number")):
             relative = None if row[9] is None else RelativePose(_pose(row[6:9]), schema.covariance_from_bytes(row[9]))
             kind, status, record = EdgeKind[row[3].upper()], Status(row[4]), schema.record_from_json(row[10], row[5], version)
             edge = Edge(int(row[1]), int(row[2]), kind, status, relative, since_node=int(row[11]), **record)
@@ -285,55 +310,76 @@ class MapStore:
     @_reading
     def keyframe(self, node: int) -> dict[str, NDArray[Any]]:
         """The arrays that the front-end kept of a node's frame, by name; empty for an unknown node."""
-        return self._named(node, _KEYFRAME)
+        return self.arrays_of_node(node, _KEYFRAME)
+
+    @_reading
+    def state(self, node: int) -> dict[str, NDArray[Any]]:
+        """The arrays that the front-end needs beside the keyframe to take a node up again; empty in files of before."""
+        return self.arrays_of_node(node, _STATE)
 
     @_reading
     def snapshot(self, node: int) -> dict[str, NDArray[Any]]:
         """The arrays of the state of the path integrator at a node, by name; empty for an unknown node."""
-        return self._named(node, _SNAPSHOT)
+        return self.arrays_of_node(node, _SNAPSHOT)
 
     @_reading
     def grid_phases(self) -> NDArray[np.float64]:
         """(N, M, 2) phases of the M grid sheets at each node, cycles: a displacement for `neural.vector.GridVectors`."""
-        phases = self._of_nodes(_SNAPSHOT, "grid_phases")
-        if list(phases) != list(range(self._one("SELECT COUNT(*) FROM nodes", ()))):
+        phases = self.arrays_of_nodes(_SNAPSHOT, "grid_phases")
+        if list(phases) != list(range(self.one("SELECT COUNT(*) FROM nodes", ()))):
             raise ValueError("not every node has grid phases")
         return np.array(list(phases.values()), dtype=np.float64).reshape(len(phases), -1 if phases else 0, 2)
 
     @_reading
-    def track(self) -> Track:
-        """Where the robot was at each stamp, seen from nodes, and the frames registered to the final map; it may be empty."""
-        rows = self._rows("SELECT * FROM track ORDER BY stamp_ns")
-        values = schema.near(np.array([row[2:] for row in rows], dtype=np.float64).reshape(-1, 6))
-        ends = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2)
-        return Track(ends[:, 0].copy(), ends[:, 1].copy(), values[:, :3].copy(), values[:, 3:].copy(), self._anchors())
+    def sessions(self) -> list[StoredSession]:
+        """The sessions of the map, in the order in which they were added."""
+        return [
+            StoredSession(int(row[0]), int(row[1]), str(row[2]), str(row[3]), _pose(row[4:7]))
+            for row in self.rows("SELECT * FROM sessions ORDER BY number")
+        ]
 
-    def _anchors(self) -> Anchors:
-        if not self._rows("SELECT name FROM sqlite_master WHERE name = 'anchors'"):
-            return NO_ANCHORS
-        rows = self._rows("SELECT * FROM anchors ORDER BY stamp_ns")
+    @_reading
+    def track(self, session: int = NEWEST) -> Track:
+        """Where the robot was at each stamp of a session, seen from nodes, and the frames registered to the final map of it.
+
+        It may be empty.
+        """
+        number = self._number(session)
+        rows = self.rows("SELECT * FROM track WHERE session = ? ORDER BY stamp_ns", (number,))
         values = schema.near(np.array([row[3:] for row in rows], dtype=np.float64).reshape(-1, 6))
-        ends = np.array([row[:3] for row in rows], dtype=np.int64).reshape(-1, 3)
+        ends = np.array([row[1:3] for row in rows], dtype=np.int64).reshape(-1, 2)
+        return Track(ends[:, 0].copy(), ends[:, 1].copy(), values[:, :3].copy(), values[:, 3:].copy(), self._anchors(number))
+
+    def _number(self, session: int) -> int:
+        return int(self.one("SELECT MAX(number) FROM sessions")) if session == NEWEST else session
+
+    def _anchors(self, session: int) -> Anchors:
+        rows = self.rows("SELECT * FROM anchors WHERE session = ? ORDER BY stamp_ns", (session,))
+        values = schema.near(np.array([row[4:] for row in rows], dtype=np.float64).reshape(-1, 6))
+        ends = np.array([row[1:4] for row in rows], dtype=np.int64).reshape(-1, 3)
         stamps, nodes, after = ends.T.copy()
         return Anchors(stamps, nodes, after, values[:, :3].copy(), values[:, 3:].copy())
 
     @_reading
-    def online(self, backend: str) -> Trajectory:
-        """The poses that a back-end gave while driving; an empty trajectory if it gave none."""
-        rows = self._rows("SELECT stamp_ns, x_m, y_m, yaw_rad FROM online WHERE backend = ? ORDER BY stamp_ns", (backend,))
+    def online(self, backend: str, session: int = NEWEST) -> Trajectory:
+        """The poses that a back-end gave while a session was driven, in its own frame; an empty trajectory if it gave none."""
+        rows = self.rows(
+            "SELECT stamp_ns, x_m, y_m, yaw_rad FROM online WHERE session = ? AND backend = ? ORDER BY stamp_ns",
+            (self._number(session), backend),
+        )
         stamps = np.array([row[0] for row in rows], dtype=np.int64)
         return Trajectory(stamps, schema.near(np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 3)))
 
     @_reading
     def online_backends(self) -> list[str]:
         """Names of the back-ends that gave poses while driving, sorted."""
-        return [str(row[0]) for row in self._rows("SELECT DISTINCT backend FROM online ORDER BY backend")]
+        return [str(row[0]) for row in self.rows("SELECT DISTINCT backend FROM online ORDER BY backend")]
 
     @_reading
     def solutions(self) -> dict[str, Solution]:
         """Poses and report of every back-end, by name, in the order in which they were first written."""
-        rows = self._rows("SELECT backend, poses, report FROM solutions ORDER BY position")
-        nodes = self._one("SELECT COUNT(*) FROM nodes", ())
+        rows = self.rows("SELECT backend, poses, report FROM solutions WHERE session = ? ORDER BY position", (schema.WHOLE,))
+        nodes = self.one("SELECT COUNT(*) FROM nodes", ())
         found = {
             str(name): Solution(schema.unpack_floats(poses, 3), schema.report_from_json(report)) for name, poses, report in rows
         }
@@ -342,55 +388,12 @@ class MapStore:
                 raise ValueError(f"{name} has {len(solution.poses)} poses, expected one for each of {nodes} nodes")
         return found
 
-    # ------------------------------------------------------------------ plumbing
-
-    def _write(self, statement: str, row: tuple[Any, ...]) -> None:
-        with self._named_errors("write"):
-            self._connection.execute(statement, row)
-
-    def _put_arrays(self, number: int, part: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-        for name, array in arrays.items():
-            packed = schema.pack(np.asarray(array))
-            fields = (number, part, name, packed.dtype, packed.shape, packed.codec, packed.data)
-            self._write(f"INSERT OR REPLACE INTO arrays VALUES ({_marks(len(fields))})", fields)
-
-    def _rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-        with self._named_errors("read"):
-            return self._connection.execute(statement, values).fetchall()
-
-    @contextmanager
-    def _named_errors(self, what: str) -> Iterator[None]:
-        try:
-            yield
-        except sqlite3.Error as error:
-            raise StoreError(f"{self._path}: cannot {what}: {error}") from None
-
-    def _one(self, statement: str, values: tuple[Any, ...]) -> Any:
-        rows = self._rows(statement, values)
-        return rows[0][0] if rows else None
-
-    def _of_nodes(self, part: str, name: str) -> dict[int, NDArray[Any]]:
-        statement = "SELECT node, dtype, shape, codec, data FROM arrays WHERE part = ? AND name = ? ORDER BY node"
-        return {row[0]: schema.unpack(schema.Packed(*row[1:])) for row in self._rows(statement, (part, name))}
-
-    def _named(self, node: int, part: str) -> dict[str, NDArray[Any]]:
-        statement = "SELECT name, dtype, shape, codec, data FROM arrays WHERE node = ? AND part = ? ORDER BY name"
-        return {row[0]: schema.unpack(schema.Packed(*row[1:])) for row in self._rows(statement, (int(node), part))}
-
 
 def _file_of(folder_or_db: Path) -> Path:
     path = Path(folder_or_db)
     return path if path.suffix == ".db" and not path.is_dir() else path / schema.MAP_NAME
 
 
-def _floats(values: Array) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)
-
-
 def _pose(values: tuple[Any, ...]) -> Array:
     """A pose (3,) from its columns."""
     return schema.near(np.array(values, dtype=np.float64))
-
-
-def _marks(count: int) -> str:
-    return ", ".join("?" * count)

@@ -24,12 +24,17 @@ from hybridmap.streams.cameras import decode_picture
 from hybridmap.streams.sensors import kinds
 from hybridmap.trajectory import FARTHEST_M
 
-VERSION = 3
+VERSION = 4
 """Raised whenever the tables change."""
 
-READABLE = (1, 2, 3)
+READABLE = (1, 2, 3, 4)
 """Versions that can be read; a file of another one is refused. Version 1 has no anchors; before version 3 an edge had figures
-and a reason in words, but no record of its checks."""
+and a reason in words, but no record of its checks; before version 4 a map was one session, and what makes it possible to take
+it up again was not kept."""
+
+WHOLE = -1
+"""Session number of what is said of the map as a whole: its solutions, and its facts (`info`). Under the number of a session
+stand those that it had before it was joined to others."""
 
 APPLICATION_ID = 0x68796D70
 """Marks the SQLite file as a map (`hymp`)."""
@@ -37,7 +42,11 @@ APPLICATION_ID = 0x68796D70
 MAP_NAME = "map.db"
 
 TABLES = """
-CREATE TABLE info (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE sessions (
+    number INTEGER PRIMARY KEY, first_node INTEGER NOT NULL, name TEXT NOT NULL, source TEXT NOT NULL,
+    x_m REAL NOT NULL, y_m REAL NOT NULL, yaw_rad REAL NOT NULL);
+CREATE TABLE info (
+    session INTEGER NOT NULL, key TEXT NOT NULL, value TEXT NOT NULL, PRIMARY KEY (session, key)) WITHOUT ROWID;
 CREATE TABLE nodes (
     number INTEGER PRIMARY KEY, stamp_ns INTEGER NOT NULL,
     odom_x_m REAL NOT NULL, odom_y_m REAL NOT NULL, odom_yaw_rad REAL NOT NULL,
@@ -53,18 +62,22 @@ CREATE TABLE edges (
     x_m REAL, y_m REAL, yaw_rad REAL, covariance BLOB, record TEXT NOT NULL,
     since_node INTEGER NOT NULL);
 CREATE TABLE track (
-    stamp_ns INTEGER PRIMARY KEY, node INTEGER NOT NULL,
+    session INTEGER NOT NULL, stamp_ns INTEGER NOT NULL, node INTEGER NOT NULL,
     x_m REAL NOT NULL, y_m REAL NOT NULL, yaw_rad REAL NOT NULL,
-    odom_x_m REAL NOT NULL, odom_y_m REAL NOT NULL, odom_yaw_rad REAL NOT NULL);
+    odom_x_m REAL NOT NULL, odom_y_m REAL NOT NULL, odom_yaw_rad REAL NOT NULL,
+    PRIMARY KEY (session, stamp_ns)) WITHOUT ROWID;
 CREATE TABLE anchors (
-    stamp_ns INTEGER PRIMARY KEY, node INTEGER NOT NULL, next_node INTEGER NOT NULL,
+    session INTEGER NOT NULL, stamp_ns INTEGER NOT NULL, node INTEGER NOT NULL, next_node INTEGER NOT NULL,
     x_m REAL NOT NULL, y_m REAL NOT NULL, yaw_rad REAL NOT NULL,
-    next_x_m REAL NOT NULL, next_y_m REAL NOT NULL, next_yaw_rad REAL NOT NULL);
+    next_x_m REAL NOT NULL, next_y_m REAL NOT NULL, next_yaw_rad REAL NOT NULL,
+    PRIMARY KEY (session, stamp_ns)) WITHOUT ROWID;
 CREATE TABLE online (
-    backend TEXT NOT NULL, stamp_ns INTEGER NOT NULL,
+    session INTEGER NOT NULL, backend TEXT NOT NULL, stamp_ns INTEGER NOT NULL,
     x_m REAL NOT NULL, y_m REAL NOT NULL, yaw_rad REAL NOT NULL,
-    PRIMARY KEY (backend, stamp_ns)) WITHOUT ROWID;
-CREATE TABLE solutions (backend TEXT PRIMARY KEY, position INTEGER NOT NULL, poses BLOB NOT NULL, report TEXT NOT NULL);
+    PRIMARY KEY (session, backend, stamp_ns)) WITHOUT ROWID;
+CREATE TABLE solutions (
+    session INTEGER NOT NULL, backend TEXT NOT NULL, position INTEGER NOT NULL, poses BLOB NOT NULL, report TEXT NOT NULL,
+    PRIMARY KEY (session, backend));
 """
 
 
@@ -113,7 +126,31 @@ def open_read_only(path: Path) -> sqlite3.Connection:
     if version not in READABLE:
         connection.close()
         raise StoreError(f"{path}: map of version {version}, expected {VERSION}; map the source again with this hybridmap")
+    _see_as_newest(connection)
     return connection
+
+
+def _see_as_newest(connection: sqlite3.Connection) -> None:
+    """Let queries find the tables of a map of an earlier version as this version has them; the file is not changed."""
+    tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    if "sessions" not in tables:
+        connection.executescript(_AS_SESSIONS)
+    if "anchors" not in tables:
+        connection.execute("CREATE TEMP VIEW anchors AS SELECT * FROM track WHERE 0")
+    elif "sessions" not in tables:
+        connection.execute("CREATE TEMP VIEW anchors AS SELECT 0 AS session, * FROM main.anchors")
+
+
+_AS_SESSIONS = f"""
+CREATE TEMP VIEW info AS SELECT {WHOLE} AS session, * FROM main.info;
+CREATE TEMP VIEW sessions AS SELECT 0 AS number, 0 AS first_node,
+    json_extract(value, '$') AS name, json_extract(value, '$') AS source,
+    0.0 AS x_m, 0.0 AS y_m, 0.0 AS yaw_rad FROM main.info WHERE key = 'source';
+CREATE TEMP VIEW track AS SELECT 0 AS session, * FROM main.track;
+CREATE TEMP VIEW online AS SELECT 0 AS session, * FROM main.online;
+CREATE TEMP VIEW solutions AS SELECT {WHOLE} AS session, * FROM main.solutions;
+"""
+"""A map of before version 4, which was one session, as the tables have it now."""
 
 
 def finish(connection: sqlite3.Connection) -> None:

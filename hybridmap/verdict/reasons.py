@@ -123,6 +123,11 @@ KINDS = {
         "nodes that lie where the odometry has them: {value:.0f}; what was seen there does not follow what was seen before, and"
         " no loop says where the robot was",
     ),
+    "not joined": Kind(
+        Verdict.DOUBTFUL,
+        "1",
+        "not joined: the map is {value:.0f} pieces, each in its own frame; where one lies on another is not known",
+    ),
     "messages lost": Kind(Verdict.DOUBTFUL, "%", "{name}: messages that cannot be read: {count} ({value:.2g} %)"),
 }
 """Every kind of reason by its name."""

@@ -5,7 +5,7 @@ A front-end keeps its own templates, keyframes and submaps, by node number. It g
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -202,6 +202,49 @@ class PartingFrontEnd(FrontEnd, Protocol):
 
     def part(self, node: int) -> None:
         """Note that the robot was kidnapped between a node and the one before: from now on nothing joins views across it."""
+
+
+@runtime_checkable
+class MeetingFrontEnd(FrontEnd, Protocol):
+    """A front-end that can take up the nodes of finished sessions, and find loops between one session and earlier ones."""
+
+    def state(self, node: int) -> dict[str, NDArray[np.generic]]:
+        """What `restore` needs of a node beside its keyframe; some numbers, however large the view."""
+
+    def restore(
+        self, node: int, keyframe: Mapping[str, NDArray[np.generic]], state: Mapping[str, NDArray[np.generic]], begins: bool
+    ) -> None:
+        """Take up a node of a finished session, in place of `observe`, `add_node` and `track`.
+
+        Args:
+            node: its number here; nodes are numbered from 0 without gaps, over all sessions.
+            keyframe, state: what `keyframe` and `state` gave of it.
+            begins: whether no motion joins it to the node before: a session begins, or the robot was kidnapped.
+
+        Raises:
+            StreamError: the arrays are not those of this sensor.
+        """
+
+    def arrive(self, first: int) -> None:
+        """From now on, `meet` looks for loops from the nodes from `first` on to those before it, whose place is known."""
+
+    def meet(self, node: int, belief: Belief) -> list[Edge]:
+        """Look for loops of one node of the session that arrived, in the order of its nodes; all of them were restored.
+
+        Until several matches agree, the whole map is searched. Returns new and changed edges. The first accepted ones come with
+        a loose edge to the first node of the session.
+
+        Args:
+            node: the node.
+            belief: the map. Stamps and travel grow from session to session, and those after `node` are left out. The poses of
+                the session are right relative to each other, and relative to the others once loops were accepted.
+        """
+
+    def meet_again(self, belief: Belief) -> list[Edge]:
+        """At the end, decide pending loops, and compare nodes of the session with earlier ones near them on the optimised map.
+
+        Call it again, with the new map, while it returns accepted edges.
+        """
 
 
 @runtime_checkable

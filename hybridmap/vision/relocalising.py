@@ -150,6 +150,9 @@ class Relocaliser:
     motion between them, and those that contradict them weigh less than half. Then all of them enter the map together. After
     a kidnapping an edge derived from them replaces the odometry edge across it, and registrations across it are retracted.
     Matches with larger mismatch need more travel, and weigh less than a better match of the same node.
+
+    The first node of a session comes after a break too (`arrived`). Nothing tells where it is, so there the break never proves
+    to be a bad registration, and its edge comes from a node that was matched.
     """
 
     def __init__(self, whereabouts: Whereabouts, new_key: Callable[[], int], span_m: float) -> None:
@@ -160,6 +163,12 @@ class Relocaliser:
         self._waiting: list[GlobalMatch] = []
         self._agree: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
         self._steps: deque[Edge] = deque(maxlen=KEPT_STEPS)
+        self._arrivals: set[int] = set()
+
+    def arrived(self, node: int) -> None:
+        """Note that a session begins at a node, of which nothing is known but that its place may be on the map."""
+        self._arrivals.add(node)
+        self.whereabouts.tracked(node, ChainState.BROKEN)
 
     def tracked(self, node: int, chain: ChainState, steps: list[Edge]) -> None:
         """Note the registrations (`steps`) of a new node to the ones before it, and how certain the motion is (`chain`)."""
@@ -259,6 +268,8 @@ class Relocaliser:
 
         A break in a sparse scene may be a bad registration. Found again after a long way, the robot is off by the drift.
         """
+        if broken_at in self._arrivals:
+            return True
         poses, first = belief.poses_map_node, min(accepted, key=lambda match: match.source)
         drift = BENDING**2 * belief.covariance_from(first.target)[first.source]
         drift = np.where(np.isfinite(drift), drift, 0.0)  # no motion joins them: the chain says nothing of where it is
@@ -271,22 +282,21 @@ class Relocaliser:
     def _reattached(self, broken_at: int, accepted: tuple[Edge, ...], belief: Belief) -> Edge:
         """The edge to the first node after the break, by way of the matches; it replaces the odometry."""
         poses = belief.poses_map_node
-        middle = placed_by(accepted, broken_at, poses)
-        relative = RelativePose(
-            between(poses[broken_at - 1], middle), np.diag([REATTACHED_M, REATTACHED_M, REATTACHED_RAD]) ** 2
-        )
+        middle, arrival = placed_by(accepted, broken_at, poses), broken_at in self._arrivals
+        before = accepted[0].target if arrival else broken_at - 1
+        relative = RelativePose(between(poses[before], middle), np.diag([REATTACHED_M, REATTACHED_M, REATTACHED_RAD]) ** 2)
         moved_m = float(np.hypot(*(middle - poses[broken_at])[:2]))
         return Edge.decided(
-            broken_at - 1,
+            before,
             broken_at,
             EdgeKind.REGISTRATION,
             relative,
             method=Method.LOOPS,
             search=Search.WHOLE_MAP,
             figures={"agreeing": float(len(accepted))},
-            kidnapped_m=moved_m,
+            kidnapped_m=None if arrival else moved_m,
             key=self._new_key(),
-            contradicts_odometry=True,
+            contradicts_odometry=not arrival,
         )
 
     def _sources(self) -> Indices:

@@ -86,7 +86,7 @@ def test_a_profile_beside_a_measured_loop_is_no_reason_to_refuse(one, tmp_path):
 def test_a_clock_offset_that_is_no_number_is_refused(one, tmp_path, value):
     folder = write_session(tmp_path / "s", one, np.random.default_rng(0))
     with sqlite3.connect(folder / "map.db") as written:
-        written.execute("INSERT OR REPLACE INTO info VALUES ('clock_offset', ?)", (value,))
+        written.execute("INSERT OR REPLACE INTO info VALUES (-1, 'clock_offset', ?)", (value,))
     written.close()
     with pytest.raises(StoreError, match="clock_offset: expected a number of seconds, found"):
         read_drive(folder)

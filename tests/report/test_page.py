@@ -142,7 +142,7 @@ def put_info(folder: SessionFolder, correction: dict) -> None:
     import sqlite3
 
     with sqlite3.connect(folder.map_db) as connection:
-        connection.execute("INSERT INTO info VALUES ('largest_correction', ?)", (json.dumps(correction),))
+        connection.execute("INSERT INTO info VALUES (-1, 'largest_correction', ?)", (json.dumps(correction),))
     connection.close()
 
 

@@ -204,7 +204,7 @@ def test_bad_files_are_refused_with_the_reason(tmp_path):
     with sqlite3.connect(tmp_path / "v" / "map.db") as connection:
         connection.execute("PRAGMA user_version = 99")
     connection.close()
-    with pytest.raises(StoreError, match="version 99, expected 3"):
+    with pytest.raises(StoreError, match="version 99, expected 4"):
         MapStore.open(tmp_path / "v")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,13 @@ from hybridmap.streams.laser import LASER, Laser, LaserScan
 from hybridmap.trajectory import Anchors
 from hybridmap.vision.base import UNEXPECTED, Belief, Division, View
 from hybridmap.vision.laser import checks
-from hybridmap.vision.laser.cloud import Cloud, cloud_of_scan
+from hybridmap.vision.laser.cloud import CELL_M, Cloud, Scale, cloud_of_scan
 from hybridmap.vision.laser.commitment import Commitment
 from hybridmap.vision.laser.dense_trajectory import DenseTrajectory, ObservedScan
 from hybridmap.vision.laser.division import divide
 from hybridmap.vision.laser.hypotheses import LENGTH_M, Prober
 from hybridmap.vision.laser.kidnapping import Continuity, GlobalLocalisation
+from hybridmap.vision.laser.meeting import ScanMeeting
 from hybridmap.vision.laser.panorama import ALIKE, Panoramas
 from hybridmap.vision.laser.revisits import Reviser
 from hybridmap.vision.laser.submap import Atlas, violation_of_step
@@ -40,7 +41,7 @@ MOST_BETWEEN = 30
 
 class LaserFrontEnd:
     """Loop closure by registration of laser submaps; implements `vision.base.DenseFrontEnd`, `VerifyingFrontEnd`,
-    `PartingFrontEnd` and `second_opinion.LocalisingFrontEnd`.
+    `PartingFrontEnd`, `MeetingFrontEnd` and `second_opinion.LocalisingFrontEnd`.
 
     Attributes:
         atlas: the scans of the nodes, from which submaps are made.
@@ -69,6 +70,9 @@ class LaserFrontEnd:
             ScanWitness(self.atlas, self._prober, self._reviser, self.localisation, self._continuity, self._next_key)
             if config.relocalising.enabled
             else None
+        )
+        self._meeting = ScanMeeting(
+            config, self.atlas, self._panoramas, self._prober, self._reviser, self.localisation, self._next_key
         )
         self._dense_trajectory = DenseTrajectory(self.atlas, laser)
         self._scans: list[ObservedScan] = []
@@ -212,6 +216,38 @@ class LaserFrontEnd:
     def keyframe(self, node: int) -> dict[str, NDArray[np.generic]]:
         """`profile` (1, width) and `ranges_m` (B,) of a node's scan, float32."""
         return {"profile": self._profiles[node], **LASER.compact(LaserScan(0, self.atlas.ranges[node]))}
+
+    def state(self, node: int) -> dict[str, NDArray[np.generic]]:
+        """`chain` (3,), `scatter` (3, 3) and `cell_m` () of a node, as the atlas has them."""
+        atlas = self.atlas
+        return {"chain": atlas.chain[node], "scatter": atlas.scatter[node], "cell_m": np.array(atlas.clouds[node].cell_m)}
+
+    def restore(
+        self, node: int, keyframe: Mapping[str, NDArray[np.generic]], state: Mapping[str, NDArray[np.generic]], begins: bool
+    ) -> None:
+        """Take up a node of a finished session; see `MeetingFrontEnd.restore`."""
+        ranges_m = np.asarray(keyframe.get("ranges_m", np.zeros(0)), dtype=np.float32)
+        if ranges_m.shape != self._laser.bearings_rad.shape or not {*state} >= {"chain", "scatter", "cell_m"}:
+            beams, found = len(self._laser.bearings_rad), ", ".join([*keyframe, *state]) or "nothing"
+            raise StreamError(
+                f"laser: node {node} of a stored map: expected a scan of {beams} ranges and its place along the chain, found "
+                f"{found}; map its source again"
+            )
+        cloud = cloud_of_scan(ranges_m, self._laser, Scale(float(state["cell_m"]) / CELL_M))
+        self.atlas.take_up(cloud, ranges_m, np.asarray(state["chain"]), np.asarray(state["scatter"]), begins)
+        self._profiles.append(np.asarray(keyframe["profile"], dtype=np.float32))
+
+    def arrive(self, first: int) -> None:
+        """A session begins whose place on the map is to be found; see `MeetingFrontEnd.arrive`."""
+        self._meeting.arrive(first)
+
+    def meet(self, node: int, belief: Belief) -> list[Edge]:
+        """Look for loops of a node to earlier sessions; see `MeetingFrontEnd.meet`."""
+        return self._meeting.meet(node, belief)
+
+    def meet_again(self, belief: Belief) -> list[Edge]:
+        """Decide pending loops, and register nodes near each other on the map; see `MeetingFrontEnd.meet_again`."""
+        return self._meeting.meet_again(belief)
 
     def _next_key(self) -> int:
         self._keys += 1

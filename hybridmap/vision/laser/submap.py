@@ -20,6 +20,9 @@ from hybridmap.vision.laser.cloud import CELL_M, Cloud, LikelihoodField, Scene, 
 SEARCH_M = 4.5
 """Largest distance of starts from the anchor of a submap, m."""
 
+APART_M = 50.0
+"""Distance along the chain between two sessions, m: more than any search looks back, so that no view counts as recent."""
+
 Span = tuple[int, int, int]
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -102,6 +105,7 @@ class Atlas:
         self.travel_m: list[float] = []
         self.scene = Scene()
         self._pieces = [0]
+        self._moved = IDENTITY  # of the session that is taken up: its chain in this one
 
     def __len__(self) -> int:
         return len(self.clouds)
@@ -120,6 +124,20 @@ class Atlas:
         self.ranges.append(ranges_m)
         self.chain.append(pose)
         self.scatter.append(scatter)
+
+    def take_up(self, cloud: Cloud, ranges_m: NDArray[np.float32], pose: Array, scatter: Array, begins: bool) -> None:
+        """Append a node of a finished session.
+
+        Args:
+            cloud, ranges_m, scatter: as for `add`.
+            pose: (3,) as it was in that session's atlas, m and rad.
+            begins: whether nothing joins it to the node before. Then a new piece begins, so far along the chain that no search
+                looks back beyond it.
+        """
+        if begins and self.chain:
+            self.part(len(self))
+            self._moved = compose(compose(self.chain[-1], np.array([APART_M, 0.0, 0.0])), inverse(pose))
+        self.add(cloud, ranges_m, compose(self._moved, pose), scatter)
 
     def joining(self, target: int, pose: Array, covariance: Array, probe: int | None = None) -> RelativePose:
         """Turn a registration to a submap into a relative pose of two nodes: the probe's node in the frame of the target's.

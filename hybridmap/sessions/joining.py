@@ -1,0 +1,206 @@
+"""Two stored maps become one: `hybridmap merge`, and `hybridmap map SOURCE --onto MAP`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from hybridmap.backends.base import ODOMETRY, Solution
+from hybridmap.config import Config
+from hybridmap.config.gone import without_gone
+from hybridmap.errors import StoreError, counted
+from hybridmap.geometry import IDENTITY, Array, compose, inverse
+from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.graph.io import graph_hash
+from hybridmap.metrics import Metric, figure
+from hybridmap.session import Progress, run
+from hybridmap.sessions.joint_map import JointMap
+from hybridmap.sessions.part import Part
+from hybridmap.store import MapStore
+from hybridmap.store.parts import copy_sessions
+from hybridmap.store.session_folder import SessionFolder
+from hybridmap.store.track import trajectory_of
+from hybridmap.streams.base import Stream
+from hybridmap.trajectory import read_tum
+from hybridmap.verdict import Facts, Reason, reasons_of, said_of
+
+
+@dataclass(frozen=True, slots=True)
+class Joined:
+    """A map of several sessions that was written.
+
+    Attributes:
+        folder: its session folder.
+        joined: whether all of its sessions are on one map.
+        head, metrics: what `metrics.json` holds.
+    """
+
+    folder: SessionFolder
+    joined: bool
+    head: dict[str, Any]
+    metrics: list[Metric]
+
+
+def merge(base: Path, other: Path, out: Path, *, overwrite: bool = False) -> Joined:
+    """Write a map that holds the sessions of two others, and the loops that were found between them.
+
+    Both maps are read and not changed. The first one gives configuration and frame. If the second one is not found on it, the
+    new map holds both, each in a frame of its own.
+
+    Args:
+        base, other: session folders whose runs came to their end.
+        out: the session folder to write.
+        overwrite: replace a session that exists there.
+
+    Raises:
+        StoreError: a map is missing, damaged or not finished, or its sensors are others than those of the first.
+        StreamError: the views of a map cannot be taken up.
+        OutputError: the folder cannot be used.
+    """
+    with MapStore.open(base) as first, MapStore.open(other) as second:
+        config = config_of(first)
+        _require_same_rig(first, second)
+        joint = JointMap(config, first.rig)
+        joint.take_up(Part.of(first))
+        joint.join(joint.take_up(Part.of(second)))
+        folder = SessionFolder(out)
+        with folder.writing(overwrite=overwrite):
+            folder.write_config(config.to_yaml())
+            truth = SessionFolder(other).groundtruth
+            if truth.is_file():
+                folder.write_groundtruth(read_tum(truth))
+            name = f"{first.source} + {second.source}"
+            with MapStore.create(folder.path, first.config_yaml, first.rig, name) as store:
+                for part in (first, second):
+                    copy_sessions(part, store)
+                copied = int(store.one("SELECT COUNT(*) FROM edges", ()))
+                for number in range(copied, len(joint.map.edges)):
+                    store.put_edge(number, joint.map.edge(number))
+                store.put_info("config_yaml", first.config_yaml)
+                store.put_info("rig", first.info("rig"))
+                store.put_info("source", name)
+                return conclude(store, folder, joint.solutions(config.backends.names), config, joint.pieces)
+
+
+def map_onto(
+    stream: Stream, config: Config, base: Path, out: Path, *, overwrite: bool = False, progress: Progress | None = None
+) -> Joined:
+    """Map a drive, and look for its place on a map that exists; the new map holds both.
+
+    The drive is mapped as it would be alone, and then merged (`merge`).
+
+    Args:
+        stream, config, progress: as for `session.run`.
+        base: session folder of the map that exists; it is not changed.
+        out: the session folder to write.
+        overwrite: replace a session that exists there.
+
+    Raises:
+        What `session.run` and `merge` raise. Then nothing is written.
+    """
+    SessionFolder(base).require()
+    out.absolute().parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=out.absolute().parent, prefix=f".{out.name}.") as alone:
+        run(stream, config, Path(alone) / "session", progress=progress)
+        return merge(base, Path(alone) / "session", out, overwrite=overwrite)
+
+
+def conclude(
+    store: MapStore, folder: SessionFolder, solutions: Mapping[str, Solution], config: Config, pieces: list[list[int]]
+) -> Joined:
+    """Write what is known of a map of several sessions once it is solved: frames, solutions, trajectories, figures, verdict.
+
+    Args:
+        store: its nodes, edges and sessions.
+        folder: where it is.
+        solutions: poses of all nodes by each back-end.
+        config: names the back-ends; the first is the primary one.
+        pieces: numbers of the sessions of each piece.
+    """
+    primary = config.backends.names[0]
+    _write_frames(store, solutions[primary].poses)
+    experiences = store.map()
+    for name, solution in solutions.items():
+        store.put_solution(name, solution.poses, solution.report)
+    sessions = store.sessions()
+    for session in sessions:
+        track, newest = store.track(session.number), session is sessions[-1]
+        place = "" if newest else f"session-{session.number}/"
+        folder.write_trajectory(f"{place}{ODOMETRY}", track.odometry)
+        for name, solution in solutions.items():
+            if name != ODOMETRY:
+                folder.write_trajectory(f"{place}{name}", trajectory_of(track, solution.poses))
+    head = {
+        **said_of(_reasons(experiences, solutions[primary], primary, pieces)),
+        "graph_hash": graph_hash(experiences),
+        "primary_backend": primary,
+        "backends": list(solutions),
+        "source": store.source,
+        "sessions": [
+            {"number": one.number, "name": one.name, "source": one.source, "piece": _piece_of(one.number, pieces)}
+            for one in sessions
+        ],
+        "joined": len(pieces) == 1,
+        "remarks": [] if len(pieces) == 1 else [not_joined(store, pieces)],
+    }
+    metrics = _figures(experiences, pieces)
+    folder.write_metrics(head, metrics)
+    for key in ("graph_hash", "primary_backend"):
+        store.put_info(key, head[key])
+    store.commit()
+    return Joined(folder, len(pieces) == 1, head, metrics)
+
+
+def config_of(store: MapStore) -> Config:
+    """The configuration of a map, without settings that this version has no more."""
+    return Config.from_tree(without_gone(store.config_tree), str(store.path))
+
+
+def not_joined(store: MapStore, pieces: list[list[int]]) -> str:
+    """That the sessions of a map are not joined, in words."""
+    names = {one.number: f"{one.number} ({one.name})" for one in store.sessions()}
+    said = "; ".join(", ".join(names[number] for number in piece) for piece in pieces)
+    return f"not joined: {counted(len(pieces), 'piece')}, each in its own frame, of the sessions {said}"
+
+
+def _require_same_rig(first: MapStore, second: MapStore) -> None:
+    here, there = first.info("rig"), second.info("rig")
+    if here != there:
+        raise StoreError(f"{second.path}: was mapped with other sensors than {first.path}; maps of one robot can be joined")
+
+
+def _piece_of(session: int, pieces: list[list[int]]) -> int:
+    return next(number for number, piece in enumerate(pieces) if session in piece)
+
+
+def _write_frames(store: MapStore, poses: Array) -> None:
+    """Write where the frame of each session lies on the map: its first node, as driven, lies where the map has it."""
+    for session in store.sessions():
+        row = store.rows("SELECT initial_x_m, initial_y_m, initial_yaw_rad FROM nodes WHERE number = ?", (session.first_node,))
+        first, there = IDENTITY + row[0], poses[session.first_node]
+        frame = IDENTITY if (first == there).all() else compose(there, inverse(first))
+        store.write("UPDATE sessions SET x_m = ?, y_m = ?, yaw_rad = ? WHERE number = ?", (*frame.tolist(), session.number))
+
+
+def _reasons(experiences: ExperienceMap, solution: Solution, primary: str, pieces: list[list[int]]) -> Sequence[Reason]:
+    if len(pieces) > 1:
+        return [Reason("not joined", float(len(pieces)), 1.0)]
+    return reasons_of(Facts.of_drive(experiences, solution, primary))
+
+
+def _figures(experiences: ExperienceMap, pieces: list[list[int]]) -> list[Metric]:
+    of_node = {node: number for number, session in enumerate(experiences.sessions) for node in session}
+    loops = [edge for edge in experiences.edges if edge.kind is EdgeKind.LOOP]
+    accepted = [edge for edge in loops if edge.status is Status.ACCEPTED]
+    return [
+        figure("sessions", len(experiences.sessions)),
+        figure("pieces", len(pieces)),
+        figure("nodes", len(experiences)),
+        figure("loops_accepted", len(accepted)),
+        figure("loops_between_sessions", sum(of_node[edge.source] != of_node[edge.target] for edge in accepted)),
+        figure("travel", sum(experiences.node(session[-1]).travel_m for session in experiences.sessions)),
+    ]

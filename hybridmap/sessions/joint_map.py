@@ -1,0 +1,191 @@
+"""A map of several sessions: finished maps are taken up, and the place of each later one is looked for on those before it.
+
+Each map keeps its nodes and edges as they are. What is new are loops between sessions. They enter once several of them agree,
+by the rules for a robot that was kidnapped; until then the maps are pieces, each in a frame of its own.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hybridmap.backends.base import Solution
+from hybridmap.backends.pieces import pieces_of, solve_by_piece
+from hybridmap.backends.registry import create
+from hybridmap.config import Config
+from hybridmap.edge_book import EdgeBook
+from hybridmap.errors import ConfigError
+from hybridmap.geometry import Array, between, compose
+from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
+from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.graph.paths import covariances_from
+from hybridmap.metrics import StageClock
+from hybridmap.sessions.part import Part
+from hybridmap.streams.base import Rig
+from hybridmap.trajectory import NS_PER_S
+from hybridmap.vision import create_front_end
+from hybridmap.vision.base import Belief, MeetingFrontEnd
+from hybridmap.vision.relocalising import SUPPORT
+
+log = logging.getLogger(__name__)
+
+APART_S, APART_M = 3600.0, 50.0
+"""Time and travel that are put between two sessions where views are compared: none is too recent to be a loop."""
+SOLVED_EVERY_M = 10.0
+"""Travel after which the pieces are solved together again while loops come in, m; between, motion carries the poses on."""
+
+
+class JointMap:
+    """Several finished maps in one, and the search for the place of one among the others.
+
+    Attributes:
+        map: all nodes and edges; those of each part keep their order, and come after those of the parts before it.
+        poses: (N, 3) of all nodes, m and rad; those of two pieces cannot be compared.
+    """
+
+    def __init__(self, config: Config, rig: Rig) -> None:
+        """Start without a map.
+
+        Args:
+            config: settings of the front-end and of the back-ends; the first of these solves the pieces.
+            rig: the sensors of all parts.
+
+        Raises:
+            ConfigError: no front-end, or one that cannot take up a finished map.
+        """
+        front_end = create_front_end(config.vision, rig, config.seed, StageClock())
+        if not isinstance(front_end, MeetingFrontEnd):
+            found = "none" if front_end is None else type(front_end).__name__
+            raise ConfigError(f"vision: maps can be joined by a laser or an RGB-D camera; found the front-end {found}")
+        self._config, self._vision = config.backends, front_end
+        self.map = ExperienceMap()
+        self.poses: Array = np.zeros((0, 3))
+        self._book = EdgeBook(self.map, config.edges)
+        self._stamps_s: Array = np.zeros(0)
+        self._travel_m: Array = np.zeros(0)
+        self._covariance_from: Callable[[int], Array] | None = None
+        self._solved_m = -np.inf
+
+    def take_up(self, part: Part) -> range:
+        """Add a finished map as a piece, or pieces, of its own; returns its node numbers.
+
+        Raises:
+            StreamError: its views are not those of this sensor.
+        """
+        first, own = len(self.map), part.experiences
+        begins = {session.start for session in own.sessions}
+        broken = {edge.target for edge in own.edges if edge.status is Status.ACCEPTED and edge.kidnapped_m is not None}
+        stamps_s, travel_m = own.stamps_ns / NS_PER_S, own.travel_m
+        for number, node in enumerate(own.nodes):
+            if number in begins:
+                self.map.begin_session()
+                self._stamps_s, self._travel_m = self._apart(stamps_s, travel_m, range(number, _end(own, number)))
+            self.map.add_node(node, own.initial[number])
+            self._vision.restore(first + number, part.keyframe(number), part.state(number), number in begins | broken)
+        for edge in own.edges:
+            self.map.add_edge(_moved(edge, first))
+        self.poses = np.concatenate([self.poses, part.poses])
+        self._covariance_from = None
+        return range(first, len(self.map))
+
+    def join(self, nodes: range) -> bool:
+        """Look for the place of the map that was taken up last, which has these nodes, on those before it.
+
+        Every node is compared, in order. If it is found, all poses are those of the joint map. Returns whether it was found.
+        """
+        self._vision.arrive(nodes.start)
+        joined = False
+        for node in nodes:
+            accepted = self._enter(self._vision.meet(node, self._belief(node)))
+            if accepted and not joined:
+                self._place(nodes, accepted)
+                joined = True
+            if accepted and self._travel_m[node] - self._solved_m > SOLVED_EVERY_M:
+                self._solve()
+                self._solved_m = float(self._travel_m[node])
+        if joined:
+            self._solve()
+        while self._enter(self._vision.meet_again(self._belief(nodes.stop - 1))):
+            self._solve()
+        return joined and self._settled(nodes)
+
+    def solutions(self, names: Sequence[str]) -> dict[str, Solution]:
+        """The map by each back-end of these names; pieces that are not joined are solved by themselves."""
+        graph = replace(self.map.pose_graph(), initial=self.poses)
+        return {name: solve_by_piece(create(name, self._config).solve, graph) for name in names}
+
+    @property
+    def pieces(self) -> list[list[int]]:
+        """The numbers of the sessions of each piece that is joined in itself; pieces in the order of their first session."""
+        of_node = np.repeat(np.arange(len(self.map.sessions)), [len(session) for session in self.map.sessions])
+        return [np.unique(of_node[nodes]).tolist() for nodes in pieces_of(self.map.pose_graph())]
+
+    def _apart(self, stamps_s: Array, travel_m: Array, session: range) -> tuple[Array, Array]:
+        """All stamps and travel so far, and those of a session, which begin well after those before it."""
+        rows = slice(session.start, session.stop)
+        last_s, last_m = (self._stamps_s[-1], self._travel_m[-1]) if len(self._stamps_s) else (-APART_S, -APART_M)
+        return (
+            np.concatenate([self._stamps_s, last_s + APART_S + stamps_s[rows] - stamps_s[session.start]]),
+            np.concatenate([self._travel_m, last_m + APART_M + travel_m[rows] - travel_m[session.start]]),
+        )
+
+    def _belief(self, node: int) -> Belief:
+        if self._covariance_from is None:
+            self._covariance_from = covariances_from(self.map.pose_graph())
+        upto = slice(node + 1)
+        return Belief(self.poses, self._stamps_s[upto], self._travel_m[upto], self._covariance_from)
+
+    def _enter(self, proposals: Sequence[Edge]) -> list[Edge]:
+        """Write proposals into the map; returns those that were accepted."""
+        self._book.enter(proposals)
+        accepted = [edge for edge in proposals if edge.status is Status.ACCEPTED]
+        if accepted:
+            self._covariance_from = None
+        return accepted
+
+    def _place(self, nodes: range, accepted: Sequence[Edge]) -> None:
+        """Move the poses of a map to where the loose edge to its first node has it."""
+        arrival = next(edge for edge in accepted if edge.kind is EdgeKind.REGISTRATION and edge.target == nodes.start)
+        assert arrival.relative is not None
+        first = compose(self.poses[arrival.source], arrival.relative.delta)
+        own = slice(nodes.start, nodes.stop)
+        self.poses = self.poses.copy()
+        self.poses[own] = compose(first, between(self.poses[nodes.start], self.poses[own]))
+
+    def _solve(self) -> Solution:
+        """Solve the pieces by the primary back-end, from the poses that they have."""
+        solution = self.solutions([self._config.names[0]])[self._config.names[0]]
+        self.poses = solution.poses
+        return solution
+
+    def _settled(self, nodes: range) -> bool:
+        """Take back the loops between the sessions that the back-end rejects; if too few are left, all of them.
+
+        Returns whether the map is joined still.
+        """
+        between_parts = [
+            number
+            for number, edge in enumerate(self.map.edges)
+            if edge.status is Status.ACCEPTED and (edge.source in nodes) != (edge.target in nodes)
+        ]
+        rejected = set(self._solve().report.rejected_edge_ids).intersection(between_parts)
+        kept = [self.map.edge(number) for number in between_parts if number not in rejected]
+        joined = len({edge.source for edge in kept if edge.kind is EdgeKind.LOOP}) >= SUPPORT
+        for number in rejected if joined else between_parts:
+            self.map.update_edge(number, replace(self.map.edge(number).settled(lack=Lack.CONTRADICTED), since_node=-1))
+        if rejected or not joined:
+            self._covariance_from = None
+            self._solve()
+        return joined
+
+
+def _end(experiences: ExperienceMap, first: int) -> int:
+    return next(session.stop for session in experiences.sessions if session.start == first)
+
+
+def _moved(edge: Edge, by: int) -> Edge:
+    """An edge of a part with the node numbers of the joint map."""
+    return replace(edge, source=edge.source + by, target=edge.target + by, since_node=edge.since_node + by, key=-1)

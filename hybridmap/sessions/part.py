@@ -1,0 +1,46 @@
+"""A finished map, as it is taken up again from its map file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from hybridmap.errors import StoreError
+from hybridmap.geometry import Array
+from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.store import MapStore
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A map to be joined to others.
+
+    Attributes:
+        name: of the map, for messages.
+        experiences: its nodes and edges.
+        poses: (N, 3) of its nodes by its primary back-end, m and rad.
+        keyframe, state: a node's arrays for the front-end (`vision.base.MeetingFrontEnd.restore`).
+    """
+
+    name: str
+    experiences: ExperienceMap
+    poses: Array
+    keyframe: Callable[[int], Arrays]
+    state: Callable[[int], Arrays]
+
+    @classmethod
+    def of(cls, store: MapStore) -> Part:
+        """The map of a file, which must stay open: keyframes are read as they are asked for.
+
+        Raises:
+            StoreError: the run did not come to its end, its primary back-end has no map, or the file is damaged.
+        """
+        solution = store.solutions().get(store.primary)
+        if not store.ended or solution is None:
+            raise StoreError(f"{store.path}: has no finished map; expected one of a run that came to its end")
+        return cls(str(store.path), store.map(), solution.poses, store.keyframe, store.state)

@@ -1,0 +1,91 @@
+"""Rows and arrays of a map file: what reading and writing its tables needs, whatever is in them."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybridmap.errors import StoreError
+from hybridmap.geometry import Array
+from hybridmap.store import schema
+
+
+class Tables:
+    """The tables of a map file, through one connection. Errors of SQLite become a StoreError that names the file."""
+
+    def __init__(self, path: Path, connection: sqlite3.Connection, *, writable: bool) -> None:
+        self._path = path
+        self._connection = connection
+        self._writable = writable
+
+    @property
+    def path(self) -> Path:
+        """Path of the map file."""
+        return self._path
+
+    def write(self, statement: str, row: tuple[Any, ...]) -> None:
+        """Run a statement that writes one row."""
+        with self.named_errors("write"):
+            self._connection.execute(statement, row)
+
+    def write_rows(self, table: str, rows: Iterable[tuple[Any, ...]]) -> None:
+        """Append whole rows to a table."""
+        with self.named_errors("write"):
+            for row in rows:
+                self._connection.execute(f"INSERT INTO {table} VALUES ({marks(len(row))})", row)
+
+    def put_arrays(self, number: int, part: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Write arrays of a node, by name, over those of the same part and name."""
+        for name, array in arrays.items():
+            packed = schema.pack(np.asarray(array))
+            fields = (number, part, name, packed.dtype, packed.shape, packed.codec, packed.data)
+            self.write(f"INSERT OR REPLACE INTO arrays VALUES ({marks(len(fields))})", fields)
+
+    def rows(self, statement: str, values: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+        """All rows that a query gives."""
+        with self.named_errors("read"):
+            return self._connection.execute(statement, values).fetchall()
+
+    def each_row(self, statement: str, values: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+        """The rows that a query gives, one by one: for those that are many and large."""
+        with self.named_errors("read"):
+            yield from self._connection.execute(statement, values)
+
+    def one(self, statement: str, values: tuple[Any, ...] = ()) -> Any:
+        """The first value that a query gives; None if it gives none."""
+        rows = self.rows(statement, values)
+        return rows[0][0] if rows else None
+
+    def arrays_of_nodes(self, part: str, name: str) -> dict[int, NDArray[Any]]:
+        """Node -> its array of a part and name, for the nodes that have it, ascending."""
+        statement = "SELECT node, dtype, shape, codec, data FROM arrays WHERE part = ? AND name = ? ORDER BY node"
+        return {row[0]: schema.unpack(schema.Packed(*row[1:])) for row in self.rows(statement, (part, name))}
+
+    def arrays_of_node(self, node: int, part: str) -> dict[str, NDArray[Any]]:
+        """Name -> array of a part of one node."""
+        statement = "SELECT name, dtype, shape, codec, data FROM arrays WHERE node = ? AND part = ? ORDER BY name"
+        return {row[0]: schema.unpack(schema.Packed(*row[1:])) for row in self.rows(statement, (int(node), part))}
+
+    @contextmanager
+    def named_errors(self, what: str) -> Iterator[None]:
+        """Context in which an error of SQLite becomes a StoreError: that the file cannot be read, or written (`what`)."""
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise StoreError(f"{self._path}: cannot {what}: {error}") from None
+
+
+def floats(values: Array) -> tuple[float, ...]:
+    """The columns of numbers, such as a pose."""
+    return tuple(float(value) for value in values)
+
+
+def marks(count: int) -> str:
+    """So many placeholders of a statement."""
+    return ", ".join("?" * count)

@@ -1,0 +1,93 @@
+"""Where a session of a laser lies among earlier ones, and the loops between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from hybridmap.config.vision import VisionConfig
+from hybridmap.graph.edges import Edge, Lack, Status
+from hybridmap.vision.base import Belief
+from hybridmap.vision.laser.commitment import Commitment
+from hybridmap.vision.laser.hypotheses import LENGTH_M, Prober
+from hybridmap.vision.laser.kidnapping import FROM_M, OFTEN_M, SPAN_M, GlobalLocalisation
+from hybridmap.vision.laser.panorama import Panoramas
+from hybridmap.vision.laser.revisits import Reviser
+from hybridmap.vision.laser.submap import Atlas
+from hybridmap.vision.relocalising import Relocaliser, Whereabouts
+
+
+class ScanMeeting:
+    """Registers the last metres of a session to the submaps of earlier ones: to all until it is found, then in the gate."""
+
+    def __init__(
+        self,
+        config: VisionConfig,
+        atlas: Atlas,
+        panoramas: Panoramas,
+        prober: Prober,
+        reviser: Reviser,
+        localisation: GlobalLocalisation,
+        new_key: Callable[[], int],
+    ) -> None:
+        self._every_m = config.laser.probes.every_m
+        self._atlas = atlas
+        self._panoramas = panoramas
+        self._prober = prober
+        self._reviser = reviser
+        self._localisation = localisation
+        self._new_key = new_key
+        self._arrive(0)
+
+    def arrive(self, first: int) -> None:
+        """Look for the place of the nodes from `first` on; those before it are the map. All nodes are in the atlas."""
+        self._panoramas.extend(to_the_end=True)
+        self._arrive(first)
+
+    def _arrive(self, first: int) -> None:
+        self._first, self._found = first, False
+        self._relocaliser = Relocaliser(Whereabouts(0), self._new_key, SPAN_M)
+        self._relocaliser.arrived(first)
+        self._commitment = Commitment(self._atlas.travel_m.__getitem__)
+        self._searched_m = float("-inf")
+
+    def meet(self, node: int, belief: Belief) -> list[Edge]:
+        """Look for loops of a node to the nodes before the session, every few metres; see `MeetingFrontEnd.meet`."""
+        travel_m = self._atlas.travel_m[node]
+        driven_m = travel_m - self._atlas.travel_m[self._first]
+        often = not self._found and driven_m <= OFTEN_M
+        if driven_m < FROM_M or (not often and travel_m - self._searched_m < self._every_m):
+            return []
+        self._searched_m = travel_m
+        return self._probe(node, belief) if self._found else self._search(node, belief)
+
+    def _search(self, node: int, belief: Belief) -> list[Edge]:
+        """Register the last metres to the whole map."""
+        recent = self._atlas.along(node, LENGTH_M, 0.0)
+        anchors = self._prober.anchors_before(self._first)
+        if not anchors:
+            return []
+        found = self._prober.probe_anywhere(
+            self._atlas.submap(node, recent[recent <= node]), self._localisation.most_similar(node, anchors)
+        )
+        settlement = self._relocaliser.settle(self._localisation.matches(found), belief)
+        self._found = bool(settlement.accepted)
+        return settlement.proposals
+
+    def _probe(self, node: int, belief: Belief) -> list[Edge]:
+        """Register the last metres to the submaps of earlier sessions that may be near."""
+        out = []
+        for hypothesis in self._prober.probe(node, belief, before=self._first):
+            key = self._new_key()
+            out.append(hypothesis.proposed(key, Lack.WAITING))
+            self._commitment.add(key, hypothesis)
+        return out + [s.proposed() for s in self._commitment.settle(self._atlas.travel_m[node], belief)]
+
+    def meet_again(self, belief: Belief) -> list[Edge]:
+        """Decide what is pending; if nothing is accepted, register nodes near each other; see `MeetingFrontEnd.meet_again`."""
+        if not self._found:
+            return self._relocaliser.dismiss()
+        out = [s.proposed() for s in self._commitment.flush(belief)]
+        if any(edge.status is Status.ACCEPTED for edge in out):
+            return out
+        near = self._reviser.round(belief, self._first, across=True)
+        return out + [hypothesis.proposed(self._new_key()) for hypothesis in near]
