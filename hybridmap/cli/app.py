@@ -19,6 +19,7 @@ from hybridmap.cli.demo import demo
 from hybridmap.cli.evaluate import evaluate
 from hybridmap.cli.explain import explain
 from hybridmap.cli.export import export
+from hybridmap.cli.import_map import import_session
 from hybridmap.cli.inspect import inspect
 from hybridmap.cli.map import map_source
 from hybridmap.cli.merge import merge
@@ -73,6 +74,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], dict[int, str]]] = {
         {0: "the session is written, whatever its verdict", 3: "it is written, but --strict found lost or skipped messages"},
     ),
     "merge": (merge, {0: "the map of both is written, whether or not they could be joined"}),
+    "import": (import_session, {0: "the session is written, whatever its verdict"}),
     "evaluate": (evaluate, {0: "evaluated, even if metrics.json or the page cannot be written, which is only warned of"}),
     "explain": (explain, {0: "explained"}),
     "export": (export, {0: "written"}),

@@ -30,6 +30,9 @@ FORMATS: dict[str, Format] = {
     "g2o": Format("poses:write_g2o_graph", ".g2o", "pose graph: VERTEX_SE2, EDGE_SE2"),
     "lineset": Format("poses:write_lineset", ".ply", "graph as an Open3D LineSet, edges coloured by kind", by_suffix=True),
     "posegraph": Format("poses:write_posegraph", ".json", "graph as an Open3D PoseGraph", by_suffix=True),
+    "ratslam": Format(
+        "ratslam_bag:write_ratslam", ".bag", "graph as OpenRatSLAM's TopologicalMap in a bag (.bag, .mcap, .db3)"
+    ),
     "ply": Format("keyframes:write_cloud", ".ply", "merged point cloud, PLY", by_suffix=True),
     "pcd": Format("keyframes:write_cloud", ".pcd", "merged point cloud, PCD", by_suffix=True),
     "grid": Format("keyframes:write_grid", ".yaml", "occupancy grid for map_server, yaml and pgm", ".pgm"),

@@ -41,6 +41,11 @@ APPLICATION_ID = 0x68796D70
 
 MAP_NAME = "map.db"
 
+RATSLAM_ACTIONS = "ratslam_actions"
+"""Key of the TopologicalActions that an imported map was made of: [sample of the track, stamp ns, action, src, dest, rad]."""
+DURATION_S = "duration_s"
+"""Figure of an edge: the duration that was recorded of an imported link."""
+
 TABLES = """
 CREATE TABLE sessions (
     number INTEGER PRIMARY KEY, first_node INTEGER NOT NULL, name TEXT NOT NULL, source TEXT NOT NULL,

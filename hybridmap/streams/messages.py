@@ -6,11 +6,13 @@ Bags and robots are read by the same code, so a drive gives the same numbers fro
 from __future__ import annotations
 
 import struct
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 from hybridmap.errors import StreamError
+from hybridmap.streams import ratslam_messages
 from hybridmap.trajectory import NS_PER_S
 
 _TF_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
@@ -120,7 +122,7 @@ class Messages:
         if msgtype not in self._stores:
             definition = self._definitions.get(msgtype)
             embedded = None if definition is None else _embedded_store(definition, msgtype, self.is_ros1)
-            self._stores[msgtype] = embedded if embedded is not None else _standard_store(self.is_ros1)
+            self._stores[msgtype] = embedded if embedded is not None else _fallback_store(self.is_ros1)
         return self._stores[msgtype]
 
     def _undecodable(self, message: RawMessage) -> StreamError:
@@ -132,13 +134,21 @@ class Messages:
 
 @cache
 def _standard_store(is_ros1: bool) -> Any:
-    """Type store of the standard messages, for bags without definitions."""
+    """Type store of the standard messages."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     for name in TRANSFORM:
         if name not in store.fielddefs:
             store.register(get_types_from_msg(_TF_DEFINITION, name))
+    return store
+
+
+@cache
+def _fallback_store(is_ros1: bool) -> Any:
+    """Type store for messages without definitions: the standard ones and those of OpenRatSLAM."""
+    store = deepcopy(_standard_store(is_ros1))
+    ratslam_messages.register(store)
     return store
 
 

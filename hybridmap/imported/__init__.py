@@ -1,0 +1,1 @@
+"""Maps of other mappers, made sessions: experience maps of OpenRatSLAM, from bags and tables."""
