@@ -57,6 +57,7 @@ def facts_of(mapper: Mapper, report: StreamReport) -> Facts:
         lost_since=mapper.lost_since,
         clock=mapper.calibration.clock.offset,
         lost=report.lost,
+        dropped={name: (gone, gone + report.counts.get(name, 0)) for name, gone in report.dropped.items()},
     )
 
 

@@ -357,6 +357,12 @@ def test_a_map_against_the_odometry_is_doubted_where_no_loop_decides():
     assert (found.node, found.until) == (0, 39)
 
 
+def test_a_few_views_may_be_left_out_for_want_of_time():
+    assert "views dropped" not in judged(mapped(drive()), dropped={"scans": (5, 100)})
+    reason = judged(mapped(drive()), dropped={"scans": (6, 100)})["views dropped"]
+    assert (reason.name, reason.count, reason.value, reason.limit) == ("scans", 6, 6.0, 5.0)
+
+
 def test_a_robot_that_is_lost_and_messages_that_are_missing():
     found = judged(mapped(drive()), lost_since=70, lost={"/scan": (5, 200)})
     assert (found["not localised"].node, found["not localised"].until) == (70, 79)

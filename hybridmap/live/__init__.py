@@ -7,5 +7,6 @@ from hybridmap.live.inbox import LiveLimits
 from hybridmap.live.mapper import LiveMapper, LiveReport
 from hybridmap.live.messages import Snapshot
 from hybridmap.live.odometry import SmoothedCorrection
+from hybridmap.live.process import MappingProcess
 
-__all__ = ["LiveLimits", "LiveMapper", "LiveReport", "SmoothedCorrection", "Snapshot"]
+__all__ = ["LiveLimits", "LiveMapper", "LiveReport", "MappingProcess", "SmoothedCorrection", "Snapshot"]

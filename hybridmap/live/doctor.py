@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from statistics import median
 
 from hybridmap.errors import counted
-from hybridmap.live.inbox import AHEAD_OF, LATE, ODOMETRY, PAUSED, SLOW, Inbox
+from hybridmap.live.inbox import AHEAD, LATE, ODOMETRY, PAUSED, SLOW, Inbox
 
 QUIET_S = 3.0
 """Time that a source has before it is missed, s."""
@@ -16,7 +16,7 @@ _OF_REASON = {
     LATE: "came after their turn: stamps out of order, or a source that comes and goes",
     SLOW: "left out, as mapping is slower than they come: give the machine more time, or send fewer",
     PAUSED: "left out while paused",
-    AHEAD_OF: "left out, as no odometry came up to their stamps",
+    AHEAD: "left out, as no odometry came up to their stamps",
 }
 
 
@@ -30,8 +30,8 @@ def sentences(inbox: Inbox, now_s: float) -> list[str]:
 
 def _missing(inbox: Inbox, now_s: float) -> Iterator[str]:
     for name, source in inbox.sources.items():
-        silent_s = now_s - (inbox.began_s if source.stamp_ns is None else source.heard_s)
-        if silent_s < max(QUIET_S, source.patience_s if source.count else 0.0):
+        silent_s = now_s - (source.heard_s if source.count else inbox.began_s)
+        if silent_s < QUIET_S or (source.count and silent_s < source.patience_s):
             continue
         if source.stamp_ns is None:
             yield f"{name}: none came in {silent_s:.0f} s; is the sensor running, and is its topic the right one?"

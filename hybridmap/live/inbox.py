@@ -6,6 +6,7 @@ No threads and no clock of its own: the caller says what time it is, so that a t
 from __future__ import annotations
 
 import heapq
+import logging
 from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -14,21 +15,27 @@ from enum import Enum
 from hybridmap.streams.base import Observation, Sample
 from hybridmap.streams.order import sort_key
 from hybridmap.streams.sensors import kind_of
-from hybridmap.trajectory import NS_PER_S
+from hybridmap.trajectory import NS_PER_S, format_stamp
+
+log = logging.getLogger(__name__)
 
 ODOMETRY = "odometry"
-LATE, SLOW, PAUSED, AHEAD_OF = "late", "too slow", "paused", "ahead of odometry"
+LATE, SLOW, PAUSED, AHEAD = "late", "too slow", "paused", "ahead of odometry"
 """Reasons for which a sample is left out: it came after its turn; the machine was too slow, and newer views waited; the mapper
-was paused; no odometry came at its time, or it was stamped later than those of its source that followed."""
-SOURCE_MIN_S = 1.0
+was paused; no odometry came up to its stamp, or it was stamped later than those of its source that followed."""
+SILENT_MIN_S = 1.0
 """A source that is silent for less is always waited for."""
 GAPS_WAITED = 3.0
 """A source is waited for so many times as long as it was ever silent of late."""
+_GAPS_MIN = 3
+"""Until it was heard oftener than this it is waited for as long as possible."""
 LONGEST_WAIT_S = 10.0
-"""No sample waits longer for another source: one that was never heard, or whose clock is another."""
-AHEAD = 1
+"""No sample waits longer for another source: for one that was never heard, or whose clock is another."""
+_TICK_MAX_S = 0.3
+"""A pause of all sources counts as no more than this: then the network, the recording or this process stood still."""
+_IN_PIPE = 1
 """Views in the pipe, besides the one that is being mapped."""
-MOST_WAITING = 90
+_MOST_WAITING = 90
 """Views that may wait for odometry: 3 s of a camera."""
 _RECENT = 10
 
@@ -38,8 +45,9 @@ class LiveLimits:
     """Limits of a live mapper.
 
     Attributes:
-        lag_s: views are left out so that none is mapped later than this after its turn; infinite: none is left out.
-        correction_m_s, correction_deg_s: fastest change of the smoothed correction, as the robot feels it.
+        lag_s: views are left out so that none is mapped later than this after its turn, if two can be mapped in this time;
+            infinite: none is left out.
+        correction_m_s, correction_deg_s: fastest motion of the robot on the map by the smoothed correction.
     """
 
     lag_s: float = 2.0
@@ -54,41 +62,47 @@ class Source:
     Attributes:
         count: samples so far.
         stamp_ns: stamp of the newest one; None before the first.
-        heard_s: when that one came, by the wall clock.
-        gaps_s: the latest times between two of them, by the wall clock.
+        heard_s, tick_s: when that one came, by the wall clock, and by that of the input (`Inbox`).
+        gaps_s: the latest times between two of them, by the clock of the input.
         ahead_s: how far the latest stamps are ahead of the wall clock.
-        back_s: by how much the stamps went back at the last jump; 0 if they never did.
+        back_s: by how much the stamps went back when they last did so by more than a second; 0 if they never did.
         left_out: reason -> number of samples that the mapper did not get.
     """
 
     count: int = 0
     stamp_ns: int | None = None
     heard_s: float = 0.0
+    tick_s: float = 0.0
     gaps_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT))
     ahead_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT))
     back_s: float = 0.0
     left_out: Counter[str] = field(default_factory=Counter)
 
-    def hear(self, stamp_ns: int, now_s: float) -> None:
+    def hear(self, stamp_ns: int, now_s: float, tick_s: float) -> None:
         """Note a sample."""
         if self.stamp_ns is not None:
-            self.gaps_s.append(now_s - self.heard_s)
+            self.gaps_s.append(tick_s - self.tick_s)
             step_s = (stamp_ns - self.stamp_ns) / NS_PER_S
-            if step_s < -SOURCE_MIN_S:
-                self.back_s = -step_s
-        self.count, self.stamp_ns, self.heard_s = self.count + 1, stamp_ns, now_s
+            self.back_s = -step_s if step_s < -SILENT_MIN_S else self.back_s
+        self.count, self.stamp_ns, self.heard_s, self.tick_s = self.count + 1, stamp_ns, now_s, tick_s
         self.ahead_s.append(stamp_ns / NS_PER_S - now_s)
 
     @property
     def patience_s(self) -> float:
         """How long it may be silent before others stop waiting for it."""
-        return min(max(SOURCE_MIN_S, GAPS_WAITED * max(self.gaps_s, default=0.0)), LONGEST_WAIT_S)
+        if len(self.gaps_s) < _GAPS_MIN:
+            return LONGEST_WAIT_S
+        return min(max(SILENT_MIN_S, GAPS_WAITED * max(self.gaps_s, default=0.0)), LONGEST_WAIT_S)
 
 
 @dataclass(slots=True)
 class _Waiting:
     sample: Sample
-    since_s: float
+    since_s: float  # when it came, by the clock of the input; after its turn, when that was, by the wall clock
+
+    @property
+    def is_view(self) -> bool:
+        return isinstance(self.sample, Observation)
 
 
 class _Turn(Enum):
@@ -98,10 +112,12 @@ class _Turn(Enum):
 class Inbox:
     """Sorts the samples of all sources by stamp, and gives them to the mapper one after the other.
 
-    A sample's turn has come when every other source has given one that is as new, or is overdue. A view waits for odometry in
-    any case. So, if all messages come, the order is that of a recording, whatever the order in which they came. Odometry is
-    never left out for want of time. Views are, where the mapper would lag behind by more than `LiveLimits.lag_s`: then only
-    the newest one is kept.
+    A sample's turn has come when every source has given one that is as new, or is overdue. A view waits for odometry in any
+    case. So, if all messages come, the order is that of a recording, whatever the order in which they came. How long a source
+    is silent is measured by a clock that runs only while others are heard.
+
+    Odometry is never left out for want of time. Views are, where the mapper would lag behind by more than
+    `LiveLimits.lag_s`: then only the newest one is kept.
 
     Attributes:
         sources: name -> what is known about it; `odometry` and the sensors (`scans`, `frames`).
@@ -113,116 +129,132 @@ class Inbox:
     def __init__(self, views: Iterable[str], limits: LiveLimits, now_s: float) -> None:
         """Start without a sample; `views` are the names of the sensors that are waited for."""
         self.sources = {name: Source() for name in (ODOMETRY, *views)}
-        self.largest_lag_s = 0.0
-        self.paused = False
         self.began_s = now_s
+        self.paused = False
+        self.largest_lag_s = 0.0
         self._limits = limits
+        self._tick_s, self._heard_s = 0.0, now_s
         self._unsorted: list[tuple[tuple[int, int], int, _Waiting]] = []
+        self._arrivals = 0
         self._due: deque[_Waiting] = deque()
-        self._in_child: deque[float] = deque()  # when the turn of each view came that is not mapped yet
-        self._untaken = 0
-        self._passed: tuple[int, int] | None = None
+        self._due_views: deque[_Waiting] = deque()
+        self._passed: tuple[int, int] | None = None  # sort key of the newest sample whose turn has come
+        self._untaken = 0  # views in the pipe
+        self._unmapped: deque[float] = deque()  # when the turn came of the views that were given and are not mapped yet
         self._busy_s: deque[float] = deque(maxlen=_RECENT)
 
     def add(self, sample: Sample, now_s: float) -> None:
         """Take in a sample that has come just now."""
         name = source_of(sample)
-        source, is_view = self.sources[name], isinstance(sample, Observation)
-        source.hear(sample.stamp_ns, now_s)
-        if self.paused and is_view:
+        source, waiting = self.sources[name], _Waiting(sample, self._tick(now_s))
+        jumped_s = source.back_s
+        source.hear(sample.stamp_ns, now_s, self._tick_s)
+        if source.back_s and not jumped_s:
+            log.warning("%s: stamps went back by %.3f s to %s s", name, source.back_s, format_stamp(sample.stamp_ns))
+        if self.paused and waiting.is_view:
             source.left_out[PAUSED] += 1
         elif self._passed is not None and sort_key(sample) < self._passed:
             source.left_out[LATE] += 1
         else:
-            heapq.heappush(self._unsorted, (sort_key(sample), source.count, _Waiting(sample, now_s)))
-            self._bound()
+            self._arrivals += 1
+            heapq.heappush(self._unsorted, (sort_key(sample), self._arrivals, waiting))
+        self._sort(now_s)
 
     def take(self, now_s: float) -> list[Sample]:
         """The samples that the mapper should get now, in order."""
-        while self._unsorted and (turn := self._turn(self._unsorted[0][2], now_s)) is not _Turn.LATER:
-            self._pass(now_s, never=turn is _Turn.NEVER)
-        self._shed(now_s)
+        self._sort(now_s)
         taken: list[Sample] = []
-        while self._due and not (isinstance(self._due[0].sample, Observation) and self._untaken >= AHEAD):
+        while self._due and not (self._due[0].is_view and self._untaken >= _IN_PIPE):
             taken.append(self._give())
         return taken
 
     def flush(self, now_s: float) -> list[Sample]:
         """End of the drive: all remaining samples, in order."""
         while self._unsorted:
-            self._pass(now_s, never=False)
+            self._pass(_Turn.NOW, now_s)
         return [self._give() for _ in range(len(self._due))]
 
     def done(self, taken: int, mapped: int, busy_s: float, now_s: float) -> None:
         """Note that the mapper has taken views from the pipe, and has mapped some, in `busy_s` seconds."""
         self._untaken -= taken
         self.largest_lag_s = max(self.largest_lag_s, self.lag_s(now_s))
-        for _ in range(min(mapped, len(self._in_child))):
-            self._in_child.popleft()
+        for _ in range(mapped):
+            self._unmapped.popleft()
         if mapped:
             self._busy_s.append(busy_s / mapped)
 
     def lag_s(self, now_s: float) -> float:
         """How long the oldest view whose turn has come is waiting for its end on the map."""
-        since = self._in_child[0] if self._in_child else min((one.since_s for one in self._views()), default=now_s)
-        return now_s - since
+        if self._unmapped:
+            return now_s - self._unmapped[0]
+        return now_s - self._due_views[0].since_s if self._due_views else 0.0
 
     @property
-    def waits(self) -> bool:
-        """Whether a sample is here that only time can bring on."""
-        return bool(self._unsorted or self._due)
+    def left_out(self) -> Counter[tuple[str, str]]:
+        """(source, reason) -> number of samples that the mapper did not get."""
+        every = self.sources.items()
+        return Counter({(name, why): number for name, source in every for why, number in source.left_out.items()})
 
-    def overdue(self, name: str, now_s: float) -> bool:
-        """Whether others need not wait for a source: it is silent, or was never heard since the beginning."""
-        source = self.sources[name]
-        if source.stamp_ns is None:
-            return now_s - self.began_s > LONGEST_WAIT_S
-        return now_s - source.heard_s > source.patience_s
+    def _tick(self, now_s: float) -> float:
+        """Let the clock of the input run on to now."""
+        self._tick_s += min(max(now_s - self._heard_s, 0.0), _TICK_MAX_S)
+        self._heard_s = now_s
+        return self._tick_s
 
-    def _views(self) -> list[_Waiting]:
-        return [one for one in self._due if isinstance(one.sample, Observation)]
+    def _sort(self, now_s: float) -> None:
+        """Find the samples whose turn has come, and leave out views that cannot be mapped in time."""
+        while self._unsorted and (turn := self._turn(self._unsorted[0][2])) is not _Turn.LATER:
+            self._pass(turn, now_s)
+        self._bound()
+        views = self._due_views
+        needed_s = max(self._busy_s, default=0.0) * (len(self._unmapped) + 1)
+        if len(views) > 1 and now_s - views[0].since_s + needed_s > self._limits.lag_s:
+            newest = views.pop()
+            for one in views:
+                self._leave_out(one, SLOW)
+            self._due_views = deque([newest])
+            self._due = deque(one for one in self._due if not one.is_view or one is newest)
 
-    def _turn(self, waiting: _Waiting, now_s: float) -> _Turn:
-        stamp_ns, needed = waiting.sample.stamp_ns, (ODOMETRY, source_of(waiting.sample))
-        behind = [name for name, source in self.sources.items() if source.stamp_ns is None or source.stamp_ns < stamp_ns]
-        if now_s - waiting.since_s > LONGEST_WAIT_S:
-            return _Turn.NEVER if any(name in needed for name in behind) else _Turn.NOW
-        waits = any(name in needed or not self.overdue(name, now_s) for name in behind)
-        return _Turn.LATER if waits else _Turn.NOW
+    def _turn(self, waiting: _Waiting) -> _Turn:
+        stamp_ns, own = waiting.sample.stamp_ns, self.sources[source_of(waiting.sample)]
+        behind = [one for one in self.sources.values() if one is not own and (one.stamp_ns is None or one.stamp_ns < stamp_ns)]
+        needs = waiting.is_view and any(one is self.sources[ODOMETRY] for one in behind)
+        needs |= own.stamp_ns is not None and stamp_ns - own.stamp_ns > SILENT_MIN_S * NS_PER_S
+        if self._tick_s - waiting.since_s > LONGEST_WAIT_S:
+            return _Turn.NEVER if needs else _Turn.NOW
+        return _Turn.LATER if needs or not all(map(self._overdue, behind)) else _Turn.NOW
 
-    def _pass(self, now_s: float, *, never: bool) -> None:
+    def _overdue(self, source: Source) -> bool:
+        return self._tick_s - source.tick_s > source.patience_s
+
+    def _pass(self, turn: _Turn, now_s: float) -> None:
         key, _, waiting = heapq.heappop(self._unsorted)
-        if never:
-            self.sources[source_of(waiting.sample)].left_out[AHEAD_OF] += 1
+        if turn is _Turn.NEVER:
+            self._leave_out(waiting, AHEAD)
             return
         self._passed, waiting.since_s = key, now_s
         self._due.append(waiting)
+        if waiting.is_view:
+            self._due_views.append(waiting)
 
     def _give(self) -> Sample:
         waiting = self._due.popleft()
-        if isinstance(waiting.sample, Observation):
+        if waiting.is_view:
             self._untaken += 1
-            self._in_child.append(waiting.since_s)
+            self._unmapped.append(self._due_views.popleft().since_s)
         return waiting.sample
-
-    def _shed(self, now_s: float) -> None:
-        """Leave out all views but the newest, where the oldest would be mapped too late."""
-        views = self._views()
-        needed_s = max(self._busy_s, default=0.0) * (len(self._in_child) + 1)
-        if len(views) > 1 and now_s - views[0].since_s + needed_s > self._limits.lag_s:
-            for one in views[:-1]:
-                self.sources[source_of(one.sample)].left_out[SLOW] += 1
-            gone = {id(one) for one in views[:-1]}
-            self._due = deque(one for one in self._due if id(one) not in gone)
 
     def _bound(self) -> None:
         """Leave out the oldest view where too many wait for odometry."""
-        views = [row for row in self._unsorted if isinstance(row[2].sample, Observation)]
-        if len(views) > MOST_WAITING:
-            oldest = min(views, key=lambda row: row[:2])
-            self.sources[source_of(oldest[2].sample)].left_out[AHEAD_OF] += 1
-            self._unsorted = [row for row in self._unsorted if row is not oldest]
+        views = [row for row in self._unsorted if row[2].is_view]
+        if len(views) > _MOST_WAITING:
+            oldest = min(views)
+            self._leave_out(oldest[2], AHEAD)
+            self._unsorted.remove(oldest)
             heapq.heapify(self._unsorted)
+
+    def _leave_out(self, waiting: _Waiting, why: str) -> None:
+        self.sources[source_of(waiting.sample)].left_out[why] += 1
 
 
 def source_of(sample: Sample) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections import Counter
@@ -21,11 +20,11 @@ from hybridmap.errors import HybridMapError, LiveError
 from hybridmap.export.keyframes import OccupancyGrid
 from hybridmap.geometry import Array, compose, inverse
 from hybridmap.live import doctor
-from hybridmap.live.child import Child
 from hybridmap.live.inbox import Inbox, LiveLimits
 from hybridmap.live.messages import Answer, Ask, Begin, Done, Dropped, End, Ready, Reset, Snapshot, empty_snapshot
 from hybridmap.live.odometry import ReceivedOdometry, SmoothedCorrection, Smoother
-from hybridmap.live.samples import check
+from hybridmap.live.process import MappingProcess
+from hybridmap.live.samples import check, used
 from hybridmap.session import Session
 from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.laser import LaserScan
@@ -33,18 +32,13 @@ from hybridmap.streams.rgbd import RgbdFrame
 from hybridmap.streams.sensors import carried
 from hybridmap.trajectory import stamp_ns_from_s
 
-log = logging.getLogger(__name__)
-
-_LOOK_S = 0.05
-"""How often samples that wait are looked at again, s."""
-
 
 @dataclass(frozen=True, slots=True)
 class LiveReport:
     """How a live mapper is doing.
 
     Attributes:
-        state: `mapping`, `paused`, `finished` or `failed`.
+        state: `mapping`, `paused`, `finishing`, `finished` or `failed`.
         samples: source -> number of samples that came.
         dropped: source -> reason -> number of them that the mapper did not get.
         lag_s, largest_lag_s: time from the turn of the oldest view that is not on the map until now, and the largest so far.
@@ -57,6 +51,22 @@ class LiveReport:
     lag_s: float
     largest_lag_s: float
     nodes: int
+
+
+class _Drive:
+    """What belongs to one map, so that `reset` replaces all of it at once."""
+
+    def __init__(self, rig: Rig, limits: LiveLimits) -> None:
+        self.inbox = Inbox((kind.counted for kind, _ in carried(rig)), limits, time.monotonic())
+        self.odometry = ReceivedOdometry()
+        self.smoother = Smoother(limits.correction_m_s, np.deg2rad(limits.correction_deg_s))
+        self.correction: Array | None = None
+        self.snapshot = empty_snapshot()
+
+    @property
+    def pose_map_odom(self) -> Array:
+        """(3,) the newest correction; before the first, the map begins where the robot did."""
+        return inverse(self.odometry.first) if self.correction is None else self.correction
 
 
 class LiveMapper:
@@ -85,6 +95,7 @@ class LiveMapper:
         name: str = "live",
         limits: LiveLimits | None = None,
         overwrite: bool = False,
+        process: MappingProcess | None = None,
     ) -> None:
         """Start the mapping process and wait until it is set up, some seconds.
 
@@ -95,13 +106,14 @@ class LiveMapper:
             name: name of the source in the session, for people.
             limits: of lag and correction.
             overwrite: replace a session that exists.
+            process: one that was started before, so that less has to be waited for.
 
         Raises:
             ConfigError, BackendError, StreamError: the configuration names something that does not exist.
             OutputError: the folder cannot be used, or another run is writing there.
             LiveError: the mapping process cannot be started.
         """
-        self._limits, self._rig = limits or LiveLimits(), rig
+        self._limits, self._rig = limits or LiveLimits(), used(rig, config.vision.sensor)
         self._changed = threading.Condition()
         self._outgoing: list[Any] = []  # messages that go before any sample
         self._told: Counter[tuple[str, str]] = Counter()  # what the child knows of samples that were left out
@@ -109,23 +121,16 @@ class LiveMapper:
         self._numbers = 0
         self._ready: Future[None] = Future()
         self._result: Future[Session] = Future()
-        self._begin()
-        self._child = Child(Begin(config, rig, out, name, overwrite), self._receive, self._fail)
+        self._ending = False
+        self._drive = _Drive(self._rig, self._limits)
+        self._process = process or MappingProcess()
+        self._process.begin(Begin(config, self._rig, out, name, overwrite), self._receive, self._fail)
         try:
             self._ready.result()
         except BaseException:
-            self._child.close()
+            self._process.close()
             raise
         threading.Thread(target=self._feed, name="hybridmap-feed", daemon=True).start()
-
-    def _begin(self) -> None:
-        """Forget everything that belongs to one map."""
-        self._inbox = Inbox((kind.counted for kind, _ in carried(self._rig)), self._limits, time.monotonic())
-        self._odometry = ReceivedOdometry()
-        self._smoother = Smoother(self._limits.correction_m_s, np.deg2rad(self._limits.correction_deg_s))
-        self._correction: Array | None = None
-        self._snapshot = empty_snapshot()
-        self._ending = False
 
     # ------------------------------------------------------------------ samples
 
@@ -159,14 +164,12 @@ class LiveMapper:
             LiveError, or the mapper's own error: the mapping process has ended.
         """
         self._require_running()
-        check(sample, self._rig, self._odometry.kind)
+        check(sample, self._rig, self._drive.odometry.kind)
         now_s = time.monotonic()
         with self._changed:
             if not isinstance(sample, Observation):
-                self._odometry.add(sample)
-                if self._correction is None:  # the map begins where the robot is
-                    self._correction = inverse(self._odometry.newest)
-            self._inbox.add(sample, now_s)
+                self._drive.odometry.add(sample)
+            self._drive.inbox.add(sample, now_s)
             self._changed.notify()
 
     # ------------------------------------------------------------------ poses
@@ -174,12 +177,13 @@ class LiveMapper:
     @property
     def pose_map_odom(self) -> Array:
         """(3,) the newest correction `map -> odom` (REP-105), m and rad; a loop closure makes it jump."""
-        return np.zeros(3) if self._correction is None else self._correction
+        return self._drive.pose_map_odom
 
     def smoothed_map_odom(self, now_s: float) -> SmoothedCorrection:
         """The correction, slowed to `LiveLimits.correction_m_s` and `correction_deg_s`, at a time of any steady clock, s."""
         with self._changed:
-            return self._smoother.step(now_s, self.pose_map_odom, self._odometry.newest)
+            drive = self._drive
+            return drive.smoother.step(now_s, drive.pose_map_odom, drive.odometry.newest)
 
     def pose_map_robot(self, stamp_s: float | None = None) -> Array:
         """(3,) the robot on the map: its newest odometry, or that at a stamp, by the newest correction; m and rad.
@@ -187,14 +191,14 @@ class LiveMapper:
         Raises:
             StreamError: the stamp lies before the odometry that is kept, some 4000 messages.
         """
-        odometry = self._odometry
-        pose = odometry.newest if stamp_s is None else odometry.at(stamp_ns_from_s(stamp_s))
-        return compose(self.pose_map_odom, pose)
+        drive = self._drive
+        pose = drive.odometry.newest if stamp_s is None else drive.odometry.at(stamp_ns_from_s(stamp_s))
+        return compose(drive.pose_map_odom, pose)
 
     @property
     def snapshot(self) -> Snapshot:
         """The newest map that the mapping process has sent, after about every node."""
-        return self._snapshot
+        return self._drive.snapshot
 
     # ------------------------------------------------------------------ how it is doing
 
@@ -202,7 +206,7 @@ class LiveMapper:
     def report(self) -> LiveReport:
         """Numbers of samples, what was left out, and the lag."""
         with self._changed:
-            inbox, now_s = self._inbox, time.monotonic()
+            inbox, now_s = self._drive.inbox, time.monotonic()
             lag_s = inbox.lag_s(now_s)
             return LiveReport(
                 self._state,
@@ -210,28 +214,28 @@ class LiveMapper:
                 {name: dict(source.left_out) for name, source in inbox.sources.items() if source.left_out},
                 lag_s,
                 max(lag_s, inbox.largest_lag_s),
-                len(self._snapshot.poses),
+                len(self._drive.snapshot.poses),
             )
 
     @property
     def pid(self) -> int:
         """Number of the mapping process."""
-        return self._child.pid
+        return self._process.pid
 
     def doctor(self) -> list[str]:
         """What is wrong with the input, in sentences: sources that are missing, late, or on another clock; empty if nothing."""
         with self._changed:
-            return doctor.sentences(self._inbox, time.monotonic())
+            return doctor.sentences(self._drive.inbox, time.monotonic())
 
     # ------------------------------------------------------------------ services
 
     def pause(self) -> None:
         """Leave views out until `resume`. Odometry is taken in all the same, as the robot may be moved meanwhile."""
-        self._inbox.paused = True
+        self._drive.inbox.paused = True
 
     def resume(self) -> None:
         """Take in views again."""
-        self._inbox.paused = False
+        self._drive.inbox.paused = False
 
     def save(self, timeout_s: float | None = None) -> None:
         """Write everything so far into the session folder, and wait until it is there; others may read it meanwhile.
@@ -256,7 +260,7 @@ class LiveMapper:
         self._require_running()
         with self._changed:
             self._ready = Future()
-            self._begin()
+            self._drive = _Drive(self._rig, self._limits)
             self._told.clear()
             self._outgoing.append(Reset())
             self._changed.notify()
@@ -278,7 +282,7 @@ class LiveMapper:
     def close(self) -> None:
         """Let go of the mapping process without waiting; what was not finished it concludes by itself."""
         self._fail(LiveError("the live mapper was closed"))
-        self._child.close()
+        self._process.close()
 
     def __enter__(self) -> Self:
         return self
@@ -296,11 +300,14 @@ class LiveMapper:
     def _state(self) -> str:
         if self._result.done():
             return "failed" if self._result.exception() is not None else "finished"
-        return "paused" if self._inbox.paused else "mapping"
+        if self._ending:
+            return "finishing"
+        return "paused" if self._drive.inbox.paused else "mapping"
 
     def _require_running(self) -> None:
         if self._result.done():
             self._result.result()
+        if self._ending:
             raise LiveError("the session is finished; make a new LiveMapper")
 
     def _ask(self, what: str, *arguments: Any, timeout_s: float | None) -> Any:
@@ -319,8 +326,8 @@ class LiveMapper:
             with self._changed:
                 messages = self._next()
                 if not messages:
-                    self._changed.wait(_LOOK_S if self._inbox.waits else None)
-            self._child.send(messages)
+                    self._changed.wait()
+            self._process.send(messages)
             if messages and isinstance(messages[-1], End):
                 return
 
@@ -328,10 +335,8 @@ class LiveMapper:
         """The messages to send now."""
         now_s, asked = time.monotonic(), self._outgoing
         self._outgoing = []
-        samples = self._inbox.flush(now_s) if self._ending else self._inbox.take(now_s)
-        left_out = Counter(
-            {(name, why): number for name, source in self._inbox.sources.items() for why, number in source.left_out.items()}
-        )
+        samples = self._drive.inbox.flush(now_s) if self._ending else self._drive.inbox.take(now_s)
+        left_out = self._drive.inbox.left_out
         news = [Dropped(*key, number) for key, number in (left_out - self._told).items()]
         self._told = left_out
         return [*asked, *news, *samples, *([End()] if self._ending else [])]
@@ -346,10 +351,10 @@ class LiveMapper:
             elif not self._ready.done():
                 return  # of the map that was left
             elif isinstance(message, Done):
-                self._inbox.done(message.taken, message.mapped, message.busy_s, time.monotonic())
-                self._correction = message.pose_map_odom
+                self._drive.inbox.done(message.taken, message.mapped, message.busy_s, time.monotonic())
+                self._drive.correction = message.pose_map_odom
             elif isinstance(message, Snapshot):
-                self._snapshot, self._correction = message, message.pose_map_odom
+                self._drive.snapshot, self._drive.correction = message, message.pose_map_odom
             elif isinstance(message, Session):
                 self._result.set_result(message)
             self._changed.notify()

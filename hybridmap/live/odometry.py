@@ -12,6 +12,8 @@ from hybridmap.geometry import IDENTITY, Array, between, compose, exp, interpola
 from hybridmap.streams.base import Motion, SelfMotion, Velocity
 from hybridmap.trajectory import NS_PER_S, format_stamp
 
+_SAME = 1e-9
+"""Two poses are the same that differ by no more than this, m or rad."""
 _KEPT = 4000
 """Poses that are kept, for poses at stamps of the last minute or more."""
 
@@ -23,12 +25,14 @@ class ReceivedOdometry:
 
     Attributes:
         kind: the kind of self-motion; None before the first.
+        first: (3,) the first pose, m and rad; the identity before it.
     """
 
     def __init__(self) -> None:
         self._poses: tuple[list[int], list[Array]] = ([], [])
         self._velocity: Velocity | None = None
         self.kind: type[Motion] | None = None
+        self.first: Array = IDENTITY
 
     def add(self, sample: Motion) -> None:
         """Take in a motion; one that is not newer than the newest is left out."""
@@ -40,6 +44,8 @@ class ReceivedOdometry:
         self._velocity = sample if isinstance(sample, Velocity) else None
         if len(stamps) >= 2 * _KEPT:
             stamps, poses = self._poses = stamps[-_KEPT:], poses[-_KEPT:]
+        if not stamps:
+            self.first = pose
         poses.append(pose)
         stamps.append(sample.stamp_ns)
 
@@ -108,12 +114,12 @@ class Smoother:
         shown, wanted = compose(smoothed, pose_odom_robot), compose(pose_map_odom, pose_odom_robot)
         way = between(shown, wanted)
         length, turn = float(np.hypot(way[0], way[1])), float(way[2])
-        share = min(1.0, self._m_s * dt_s / length) if length else 1.0
-        turned = float(np.clip(turn, -self._rad_s * dt_s, self._rad_s * dt_s))
-        if share < 1.0 or turned != turn:
-            robot = compose(shown, np.array([share * way[0], share * way[1], turned]))
-            smoothed = compose(robot, inverse(pose_odom_robot))
-        else:
-            smoothed = pose_map_odom
+        reach_m, reach_rad = self._m_s * dt_s + _SAME, self._rad_s * dt_s + _SAME
+        if length <= reach_m and abs(turn) <= reach_rad:
+            self._last = now_s, pose_map_odom
+            return SmoothedCorrection(pose_map_odom, 0.0, 0.0)
+        share, turned = min(1.0, reach_m / max(length, _SAME)), float(np.clip(turn, -reach_rad, reach_rad))
+        robot = compose(shown, np.array([share * way[0], share * way[1], turned]))
+        smoothed = compose(robot, inverse(pose_odom_robot))
         self._last = now_s, smoothed
         return SmoothedCorrection(smoothed, (1.0 - share) * length, abs(turn - turned))

@@ -8,8 +8,14 @@ from hybridmap.errors import StreamError
 from hybridmap.streams.base import Motion, Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame, checked_frame
-from hybridmap.streams.sensors import kind_of
+from hybridmap.streams.sensors import carried, kind_of, wanted
 from hybridmap.trajectory import format_stamp
+
+
+def used(rig: Rig, sensor: str) -> Rig:
+    """The sensors of a rig that a value of `vision.sensor` maps with: for `auto`, the first kind of the table."""
+    chosen = [(kind.sensor_name, one) for kind, one in carried(rig) if kind in wanted(sensor)]
+    return Rig(**dict(chosen[:1] if sensor == "auto" else chosen))
 
 
 def check(sample: Sample, rig: Rig, motion: type[Motion] | None) -> None:
@@ -32,7 +38,7 @@ def check(sample: Sample, rig: Rig, motion: type[Motion] | None) -> None:
     sensor = rig.sensors.get(kind.sensor_name)
     if sensor is None:
         known = ", ".join(rig.sensors) or "none"
-        raise StreamError(f"{type(sample).__name__} at stamp {stamp} s: the rig has no {kind.sensor_name} (it has: {known})")
+        raise StreamError(f"{kind.counted}: the mapper has no {kind.sensor_name} (it maps with: {known}); see vision.sensor")
     if isinstance(sample, RgbdFrame):
         checked_frame(sample, sensor)
     if isinstance(sample, LaserScan) and sample.ranges_m.shape != sensor.bearings_rad.shape:

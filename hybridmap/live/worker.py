@@ -21,7 +21,7 @@ from hybridmap.errors import HybridMapError
 from hybridmap.export.formats import ExportOptions, SessionView
 from hybridmap.export.keyframes import OccupancyGrid, build_grid
 from hybridmap.graph.io import graph_hash
-from hybridmap.live.inbox import source_of
+from hybridmap.live.inbox import SLOW, source_of
 from hybridmap.live.messages import Answer, Ask, Begin, Done, Dropped, End, Failed, Ready, Reset, Snapshot
 from hybridmap.mapper import Mapper
 from hybridmap.store import MapStore
@@ -147,6 +147,8 @@ class PipedStream:
     def _note(self, dropped: Dropped) -> None:
         """Count what the robot's process has left out, for the figures and the verdict."""
         self.report.count(f"{dropped.source} left out ({dropped.reason})", dropped.count)
+        if dropped.reason == SLOW:
+            self.report.dropped[dropped.source] = self.report.dropped.get(dropped.source, 0) + dropped.count
 
 
 def snapshot_of(mapper: Mapper, *, ended: bool) -> Snapshot:

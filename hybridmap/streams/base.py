@@ -250,12 +250,14 @@ class StreamReport:
         lost: topic or list of pictures -> (messages that were not used, messages in all), where the recording states to hold
             messages that cannot be read, or damaged ones were skipped.
         skipped: what was skipped as damaged, in words with stamp and place, in the order of reading.
+        dropped: kind of observation (`scans`) -> number of those that a live mapper left out, as it was too slow for them.
     """
 
     counts: dict[str, int] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     lost: dict[str, tuple[int, int]] = field(default_factory=dict)
     skipped: list[str] = field(default_factory=list)
+    dropped: dict[str, int] = field(default_factory=dict)
 
     def skip(self, name: str, total: int, stamp_ns: int, why: str) -> None:
         """Count a damaged observation as a lost message of a topic or list that has `total` messages in all.

@@ -46,6 +46,7 @@ class Facts:
         clock: the offset between the clocks of views and odometry; None if it was not looked for.
         driven: whether the loops were proposed by a front-end on a drive, and not read from a file.
         lost: topic -> (messages that are missing or damaged, messages in all).
+        dropped: kind of observation -> (those that a live mapper was too slow for, observations in all).
     """
 
     graph: PoseGraph
@@ -63,6 +64,7 @@ class Facts:
     clock: ClockOffset | None = None
     driven: bool = False
     lost: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    dropped: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     @classmethod
     def of_graph(cls, graph: PoseGraph, solution: Solution) -> Facts:
@@ -85,12 +87,13 @@ class Facts:
         lost_since: int | None = None,
         clock: ClockOffset | None = None,
         lost: Mapping[str, tuple[int, int]] | None = None,
+        dropped: Mapping[str, tuple[int, int]] | None = None,
     ) -> Facts:
         """The facts of a finished drive: of its map and of the solution of its primary back-end.
 
         Args:
             experiences: nodes and all edges of the map, whatever their status.
-            solution, primary, failure, lost_since, clock, lost: the attributes of the same names.
+            solution, primary, failure, lost_since, clock, lost, dropped: the attributes of the same names.
         """
         edges = experiences.edges
         chosen = [
@@ -122,6 +125,7 @@ class Facts:
             lost_since=lost_since,
             clock=clock,
             lost=lost or {},
+            dropped=dropped or {},
         )
 
     @property

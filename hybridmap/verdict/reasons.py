@@ -129,6 +129,9 @@ KINDS = {
         "not joined: the map is {value:.0f} pieces, each in its own frame; where one lies on another is not known",
     ),
     "messages lost": Kind(Verdict.DOUBTFUL, "%", "{name}: messages that cannot be read: {count} ({value:.2g} %)"),
+    "views dropped": Kind(
+        Verdict.DOUBTFUL, "%", "{name}: left out, as the machine was too slow: {count} ({value:.0f} %, at most {limit:.0f} %)"
+    ),
 }
 """Every kind of reason by its name."""
 

@@ -51,6 +51,8 @@ a single slip is more."""
 BREAKS_MAX = 2
 """Most breaks of the motion without a kidnapping. Indoors there are none; bushes and trees, which look different from every
 side, give dozens, and then a kidnapping that was found may be one of them."""
+TOO_SLOW_MAX = 0.05
+"""Largest share of views that a live mapper may have been too slow for: most views are near a node and bring nothing new."""
 FREE_MAX_M = 10.0
 """Longest way on which odometry alone may know the motion where no loop spans it: good wheels err by some 0.1 m on it."""
 
@@ -297,6 +299,15 @@ def messages_lost(facts: Facts) -> Iterable[Reason]:
     ]
 
 
+def views_dropped(facts: Facts) -> Iterable[Reason]:
+    """A reason for each sensor of a live drive of whose views too many were left out, as the machine was too slow."""
+    return [
+        facts.reason("views dropped", 100.0 * gone / every, 100.0 * TOO_SLOW_MAX, count=gone, name=name)
+        for name, (gone, every) in facts.dropped.items()
+        if gone > TOO_SLOW_MAX * every
+    ]
+
+
 RULES: tuple[Callable[[Facts], Iterable[Reason]], ...] = (
     no_map,
     refused_together,
@@ -311,6 +322,7 @@ RULES: tuple[Callable[[Facts], Iterable[Reason]], ...] = (
     broken,
     lost,
     messages_lost,
+    views_dropped,
 )
 """What is asked of every map."""
 

@@ -2,16 +2,23 @@
 
 import os
 import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hybridmap import session
 from hybridmap.config import Config
-from hybridmap.errors import ConfigError, LiveError, OutputError, StreamError
+from hybridmap.errors import LiveError, OutputError, StreamError
+from hybridmap.export.formats import ExportOptions, open_view
+from hybridmap.geometry import compose, inverse
 from hybridmap.live import LiveLimits, LiveMapper
-from hybridmap.store import MapStore
-from hybridmap.streams.base import Observation, Rig
+from hybridmap.output import is_held
+from hybridmap.store import MapStore, SessionFolder
+from hybridmap.streams.base import Observation, Rig, SelfMotion
 from tests.streams_for_tests import RoomDrive
 
 CONFIG = Config.load("laser")
@@ -25,42 +32,140 @@ def as_they_arrive(drive):
     return sorted(drive, key=lambda sample: sample.stamp_ns + LATE_NS * isinstance(sample, Observation))
 
 
+def until(condition, timeout_s=60.0):
+    end_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end_s, "it did not come"
+        time.sleep(0.02)
+
+
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
-    return session.run(RoomDrive(laps=2.2, bias_rad_per_m=0.1), CONFIG, tmp_path_factory.mktemp("recorded") / "s")
+def drive():
+    return RoomDrive(laps=1.5)
 
 
-def test_the_map_is_that_of_the_recording_whatever_the_order_across_sources(recorded, tmp_path):
-    drive = RoomDrive(laps=2.2, bias_rad_per_m=0.1)
+@pytest.fixture(scope="module")
+def recorded(drive, tmp_path_factory):
+    return session.run(drive, CONFIG, tmp_path_factory.mktemp("recorded") / "s")
+
+
+def test_the_map_is_that_of_the_recording_whatever_the_order_across_sources(drive, recorded, tmp_path):
+    samples = as_they_arrive(drive)
     with LiveMapper(CONFIG, drive.rig, tmp_path / "s", limits=PATIENT) as mapper:
-        for sample in as_they_arrive(drive):
+        for sample in samples[:100]:
             mapper.add(sample)
+        until(lambda: mapper.report.nodes > 3)
+        early, before = mapper.snapshot, mapper.snapshot.poses.copy()
+        mapper.reset()
+        assert mapper.report.nodes == mapper.report.samples["scans"] == 0
+        for sample in samples:
+            mapper.add(sample)
+        until(lambda: mapper.report.lag_s == 0.0)
         mapper.save()
         with MapStore.open(tmp_path / "s") as store:
-            assert store.solutions()
+            assert store.primary in store.solutions()
             assert not store.ended
+        assert (mapper.grid(0.1).log_odds > 0.0).sum() > 50
         finished = mapper.finish()
         assert mapper.report.dropped == {}
         assert mapper.report.state == "finished"
+        with pytest.raises(LiveError, match="is finished"):
+            mapper.add(samples[0])
     assert finished.head["graph_hash"] == recorded.head["graph_hash"] == mapper.snapshot.graph_hash
-    assert finished.head["stream"] == {"odometry": 277, "scans": 139}
+    assert finished.head["stream"] == {"odometry": 189, "scans": 95}
     with MapStore.open(tmp_path / "s") as store:
         np.testing.assert_array_equal(mapper.snapshot.poses, store.solutions()[store.primary].poses)
+        assert len(mapper.snapshot.edges) == len(store.map().pose_graph().sources)
+    np.testing.assert_array_equal(early.poses, before)
+    for array in (early.poses, early.edges, early.kinds, early.stamps_ns, early.covariance):
+        assert array is not None
+        assert not array.flags.writeable
 
 
-def test_a_killed_mapping_process_is_one_clear_error_and_poses_go_on(tmp_path):
-    drive = RoomDrive(laps=0.5)
+def test_everything_answers_while_the_mapper_does_not_and_what_is_left_out_is_said(drive, tmp_path):
+    samples = as_they_arrive(drive)
+    with LiveMapper(CONFIG, drive.rig, tmp_path / "s", limits=LiveLimits(lag_s=0.5)) as mapper:
+        for sample in samples[:40]:
+            mapper.add(sample)
+        until(lambda: mapper.report.nodes > 0)
+        os.kill(mapper.pid, signal.SIGSTOP)
+        slowest_s = 0.0
+        for sample in samples[40:240]:
+            began_s = time.perf_counter()
+            mapper.add(sample)
+            pose = mapper.pose_map_robot()
+            slowest_s = max(slowest_s, time.perf_counter() - began_s)
+            if isinstance(sample, SelfMotion):
+                np.testing.assert_allclose(pose, compose(mapper.pose_map_odom, sample.pose_odom_robot))
+            time.sleep(0.01)
+        assert slowest_s < 0.25  # on a machine that does much else
+        report = mapper.report
+        with pytest.raises(LiveError, match=r"no answer in 0\.1 s"):
+            mapper.save(0.1)
+        os.kill(mapper.pid, signal.SIGCONT)
+        for sample in samples[240:]:
+            mapper.add(sample)
+            time.sleep(0.02)
+        finished = mapper.finish()
+    assert report.dropped["scans"]["too slow"] > 20
+    assert "odometry" not in report.dropped
+    assert any("scans:" in one and "slower than they come" in one for one in mapper.doctor())
+    dropped = mapper.report.dropped["scans"]["too slow"]
+    assert finished.head["stream"] == {"odometry": 189, "scans": 95 - dropped, "scans left out (too slow)": dropped}
+    (reason,) = [reason for reason in finished.head["reasons"] if reason["kind"] == "views dropped"]
+    assert reason["value"] == pytest.approx(100.0 * dropped / 95)
+
+
+def test_a_bad_sample_costs_itself_and_a_killed_mapping_process_is_one_clear_error(drive, tmp_path):
     mapper = LiveMapper(CONFIG, drive.rig, tmp_path / "s")
-    samples = list(drive)
-    for sample in samples[:20]:
-        mapper.add(sample)
+    mapper.add_odometry(0.0, (2.0, 1.0, 0.5))
+    np.testing.assert_allclose(mapper.pose_map_robot(), np.zeros(3), atol=1e-12)  # the map begins where the robot is
+    np.testing.assert_allclose(mapper.pose_map_odom, inverse([2.0, 1.0, 0.5]))
+    for bad, said in (
+        (lambda: mapper.add_odometry(0.1, (np.nan, 0.0, 0.0)), "NaN"),
+        (lambda: mapper.add_odometry(0.1, (0.0, 0.0)), "shape"),
+        (lambda: mapper.add_velocity(0.1, 0.0, 0.0), "mixed"),
+        (lambda: mapper.add_scan(0.1, [1.0, 2.0]), "expected"),
+        (lambda: mapper.add_rgbd(0.1, np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.float32)), "no camera"),
+    ):
+        with pytest.raises(StreamError, match=said):
+            bad()
+    assert mapper.report.samples == {"odometry": 1, "scans": 0}
     os.kill(mapper.pid, signal.SIGKILL)
-    with pytest.raises(LiveError, match="ended by signal 9"):
-        mapper.finish(10.0)
-    with pytest.raises(LiveError, match="ended by signal 9"):
-        mapper.add(samples[20])
+    for call in (lambda: mapper.finish(10.0), lambda: mapper.add_odometry(0.1, np.zeros(3)), mapper.save, mapper.reset):
+        with pytest.raises(LiveError, match="ended by signal 9"):
+            call()
     assert mapper.report.state == "failed"
-    assert np.isfinite(mapper.pose_map_robot()).all()
+    np.testing.assert_allclose(mapper.pose_map_robot(), np.zeros(3), atol=1e-12)
+    mapper.close()
+
+
+ROBOT = """
+import os, sys, signal, time
+from pathlib import Path
+from hybridmap.config import Config
+from hybridmap.live import LiveLimits, LiveMapper
+from tests.streams_for_tests import RoomDrive
+
+drive = RoomDrive(laps=0.5)
+mapper = LiveMapper(Config.load("laser"), drive.rig, Path(sys.argv[1]), limits=LiveLimits(lag_s=600.0))
+for sample in drive:
+    mapper.add(sample)
+while mapper.report.lag_s:
+    time.sleep(0.01)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_robot_whose_program_dies_keeps_its_map(tmp_path):
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run([sys.executable, "-c", ROBOT, str(tmp_path / "s")], cwd=root, check=False, timeout=120)
+    assert done.returncode == -signal.SIGKILL
+    until(lambda: not is_held(tmp_path / "s"))
+    with MapStore.open(tmp_path / "s") as store:
+        assert store.ended
+    recorded = session.run(RoomDrive(laps=0.5), CONFIG, tmp_path / "recorded")
+    assert SessionFolder(tmp_path / "s").read_metrics().head["graph_hash"] == recorded.head["graph_hash"]
 
 
 def test_what_cannot_be_set_up_is_said_at_once(tmp_path):
@@ -69,5 +174,27 @@ def test_what_cannot_be_set_up_is_said_at_once(tmp_path):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(OutputError, match="not empty"):
         LiveMapper(CONFIG, RoomDrive().rig, tmp_path)
-    with pytest.raises(ConfigError):
-        LiveMapper(Config.load("laser", {"vision.sensor": "none such"}), RoomDrive().rig, tmp_path / "s")
+
+
+def test_a_stored_solution_that_nodes_came_after_is_left_out_until_the_end(drive, tmp_path):
+    kept = []
+
+    def opened(mapper, store):
+        kept.extend([mapper, store])
+
+    class Stream(RoomDrive):
+        def __iter__(self):
+            for number, sample in enumerate(super().__iter__()):
+                yield sample
+                mapper, store = kept
+                if number == 150:
+                    solution = mapper.backends.solutions[mapper.backends.primary]
+                    store.put_solution(mapper.backends.primary, solution.poses, solution.report)
+                    store.commit()
+                    assert store.solutions()
+            assert store.solutions() == {}
+            view = open_view(store.path.parent, None, ExportOptions())
+            assert len(view.poses) == len(mapper.map)
+            view.store.close()
+
+    session.run(Stream(laps=1.0), CONFIG, tmp_path / "s", opened=opened)

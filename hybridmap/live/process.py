@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -21,24 +22,19 @@ from hybridmap.session import Session
 _PACKAGE = str(Path(hybridmap.__file__).parents[1])
 
 
-class Child:
+class MappingProcess:
     """A process that runs `hybridmap.live.worker`, with a pipe in both directions.
 
-    It is no child by fork, as a robot's program has threads, and it gets no Ctrl-C, as that is for the robot's program.
+    It is started anew and not forked, as a robot's program has threads. It gets no Ctrl-C, as that is for the robot's
+    program. Until `begin` it only loads what mapping needs, which takes some seconds: start it early.
     """
 
-    def __init__(self, begin: Begin, receive: Callable[[Any], None], ended: Callable[[HybridMapError], None]) -> None:
+    def __init__(self) -> None:
         """Start the process.
 
-        Args:
-            begin: what to map.
-            receive: called in a thread of its own with each message from the process.
-            ended: called in that thread, once, if the process ends before it has sent its session.
-
         Raises:
-            LiveError: the process cannot be started.
+            LiveError: it cannot be started.
         """
-        self._receive, self._ended = receive, ended
         self._socket, theirs = socket.socketpair()
         self._pipe = Connection(os.dup(self._socket.fileno()))
         paths = [_PACKAGE, *filter(None, [os.environ.get("PYTHONPATH")])]
@@ -53,44 +49,48 @@ class Child:
                 )
             except OSError as error:
                 raise LiveError(f"the mapping process cannot be started: {error}") from None
-        self.send([begin])
-        threading.Thread(target=self._listen, name="hybridmap-listen", daemon=True).start()
 
     @property
     def pid(self) -> int:
         """Number of the process."""
         return self._process.pid
 
+    def begin(self, begin: Begin, receive: Callable[[Any], None], ended: Callable[[HybridMapError], None]) -> None:
+        """Begin to map.
+
+        Args:
+            begin: what, and where to.
+            receive: called in a thread of its own with each message from the process.
+            ended: called in that thread, once, if the process ends before it has sent its session.
+        """
+        self.send([begin])
+        threading.Thread(target=self._listen, args=(receive, ended), name="hybridmap-listen", daemon=True).start()
+
     def send(self, messages: Iterable[Any]) -> None:
         """Write messages; it waits while the pipe is full. That the process has gone is told by `ended`, and not here."""
-        try:
+        with suppress(OSError):
             for message in messages:
                 self._pipe.send(message)
-        except OSError:
-            return
 
     def close(self) -> None:
         """Close the pipe; the process then concludes its session. It may be called twice."""
-        try:
+        with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
-        except OSError:
-            return
 
-    def _listen(self) -> None:
+    def _listen(self, receive: Callable[[Any], None], ended: Callable[[HybridMapError], None]) -> None:
         """Pass on messages until the process ends."""
         error: HybridMapError | None = None
         finished = False
-        try:
+        with suppress(EOFError, OSError):
             while True:
                 message = self._pipe.recv()
                 if isinstance(message, Failed):
                     error = getattr(errors, message.error, LiveError)(message.words)
                 else:
                     finished |= isinstance(message, Session)
-                    self._receive(message)
-        except (EOFError, OSError):
-            code = self._process.wait()
+                    receive(message)
+        code = self._process.wait()
         if not finished:
             how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
-            self._ended(error or LiveError(f"the mapping process ended {how}; what it had mapped is in the session folder"))
+            ended(error or LiveError(f"the mapping process ended {how}; what it had mapped is in the session folder"))
         self._socket.close()
