@@ -31,6 +31,10 @@ class StreamError(HybridMapError):
     """A source of sensor data that is missing, damaged, unordered or of the wrong kind."""
 
 
+class RosError(HybridMapError):
+    """A ROS that cannot be found or reached."""
+
+
 class OutputError(HybridMapError):
     """A file or folder that cannot be written: it exists, is of another kind, is in use by another run, or is not writable."""
 

@@ -20,11 +20,23 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-_PYTHON = """
-    rospy rosmaster rosgraph rosgraph-msgs roslib genpy genmsg roscpp-msg rosbag roslz4 rospkg catkin catkin-pkg distro
-    std-msgs std-srvs geometry-msgs nav-msgs sensor-msgs tf2-msgs visualization-msgs diagnostic-msgs actionlib-msgs
-    defusedxml netifaces gnupg pycryptodome
-""".split()
+_PYTHON = (
+    *(
+        "rospy",
+        "rosmaster",
+        "rosgraph",
+        "rosgraph-msgs",
+        "roslib",
+        "genpy",
+        "genmsg",
+        "roscpp-msg",
+        "rosbag",
+        "roslz4",
+        "rospkg",
+    ),
+    *("catkin", "catkin-pkg", "distro", "std-msgs", "std-srvs", "geometry-msgs", "nav-msgs", "sensor-msgs", "tf2-msgs"),
+    *("visualization-msgs", "diagnostic-msgs", "actionlib-msgs", "defusedxml", "netifaces", "gnupg", "pycryptodome"),
+)
 """Python packages. PyYAML is that of hybridmap, which a second one must not hide."""
 _PLAYER = re.compile(
     r"lib(ros|boost-(chrono|filesystem|program-options|regex|thread)|console-bridge|cpp-common|xmlrpcpp|log4cxx|apr|topic-tools"
@@ -66,6 +78,7 @@ class Ros1:
             "ROS_IP": "127.0.0.1",
             "ROS_LOG_DIR": str(self.folder / "log"),
             "ROS_PACKAGE_PATH": str(self.folder / "root" / "usr" / "share"),
+            "CMAKE_PREFIX_PATH": str(self.folder / "root" / "usr"),  # where rosbag looks for its plugins
         }
 
 
@@ -94,6 +107,8 @@ def fetch(folder: Path) -> Ros1:
         unpacked = _run("dpkg", "-x", str(deb), str(folder / "root"))
         if unpacked.returncode:
             raise Ros1Error(f"dpkg -x {deb.name}: {unpacked.stderr.strip()}")
+    for plugin in (folder / "root" / "usr" / "lib").glob("*/ros/*.so"):
+        (folder / "root" / "usr" / "lib" / plugin.name).symlink_to(plugin)
     marker.write_text("\n".join(names) + "\n")
     return ros
 
@@ -159,7 +174,15 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     ros = fetch(parser.parse_args().folder.resolve())
     here = ros.environment()
-    for name in ("PYTHONPATH", "LD_LIBRARY_PATH", "ROS_MASTER_URI", "ROS_HOSTNAME", "ROS_LOG_DIR", "ROS_PACKAGE_PATH"):
+    for name in (
+        "PYTHONPATH",
+        "LD_LIBRARY_PATH",
+        "ROS_MASTER_URI",
+        "ROS_HOSTNAME",
+        "ROS_LOG_DIR",
+        "ROS_PACKAGE_PATH",
+        "CMAKE_PREFIX_PATH",
+    ):
         print(f"export {name}={here[name]!r}")
     run = "from rosmaster.main import rosmaster_main; rosmaster_main()"
     print(f"# a master:        {sys.executable} -c {run!r} --core")

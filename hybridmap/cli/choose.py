@@ -8,13 +8,12 @@ from functools import partial
 from typing import Any
 
 from hybridmap.config import Config
-from hybridmap.config.root import named_configs
 from hybridmap.config.section import value_of
 from hybridmap.errors import ConfigError
 from hybridmap.streams import open_stream
-from hybridmap.streams.base import Rig, Stream
+from hybridmap.streams.base import Stream
 from hybridmap.streams.open import world_of
-from hybridmap.streams.sensors import carried
+from hybridmap.streams.sensors import carried, config_for
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,14 +74,7 @@ def choose(
         return OpenedSource(opened(config), config)
     default = Config.load(None, overrides)
     stream = opened(default)
-    config = _config_for(stream.rig, overrides)
+    config = config_for(next((kind for kind, _ in carried(stream.rig)), None), overrides)
     if config.sensors != default.sensors:
         stream = opened(config)
     return OpenedSource(stream, config)
-
-
-def _config_for(rig: Rig, overrides: Mapping[str, Any]) -> Config:
-    """The configuration named after the first kind of sensor found; the defaults if there is no sensor."""
-    for kind, _ in carried(rig):
-        return Config.load(kind.name if kind.name in named_configs() else None, overrides)
-    return Config.load(None, {**overrides, "vision.sensor": "none"})

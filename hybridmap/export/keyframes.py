@@ -51,6 +51,16 @@ class OccupancyGrid:
     origin_m: Array
     resolution_m: float
 
+    @property
+    def occupied(self) -> NDArray[np.bool_]:
+        """(H, W) cells that are occupied, by `map_server`'s threshold."""
+        return 1.0 / (1.0 + np.exp(-self.log_odds)) > _OCCUPIED_THRESHOLD
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """(H, W) cells that are free; the others are unknown."""
+        return 1.0 / (1.0 + np.exp(-self.log_odds)) < 1.0 - _OCCUPIED_THRESHOLD
+
 
 @dataclass(frozen=True, slots=True)
 class _Fan:
@@ -69,11 +79,14 @@ def write_grid(view: SessionView, path: Path) -> list[Metric]:
     Raises:
         ExportError: the session's keyframes hold no obstacle, or the grid would be too large.
     """
-    grid = build_grid(view)
-    occupancy = 1.0 / (1.0 + np.exp(-grid.log_odds))
+    return write_picture(build_grid(view), path)
+
+
+def write_picture(grid: OccupancyGrid, path: Path) -> list[Metric]:
+    """Write a grid as `write_grid` does."""
     picture: NDArray[np.uint8] = np.full(grid.log_odds.shape, _UNKNOWN, dtype=np.uint8)
-    picture[occupancy > _OCCUPIED_THRESHOLD] = _OCCUPIED
-    picture[occupancy < 1.0 - _OCCUPIED_THRESHOLD] = _FREE
+    picture[grid.occupied] = _OCCUPIED
+    picture[grid.free] = _FREE
     height, width = grid.log_odds.shape
     image = path.with_suffix(".pgm")
     image.write_bytes(f"P5\n{width} {height}\n255\n".encode() + picture[::-1].tobytes())

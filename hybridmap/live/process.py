@@ -36,6 +36,8 @@ class MappingProcess:
             LiveError: it cannot be started.
         """
         self._socket, theirs = socket.socketpair()
+        for end in (self._socket, theirs):
+            end.setblocking(True)  # whatever `socket.setdefaulttimeout` says: rospy sets it
         self._pipe = Connection(os.dup(self._socket.fileno()))
         paths = [_PACKAGE, *filter(None, [os.environ.get("PYTHONPATH")])]
         with theirs:

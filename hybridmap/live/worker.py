@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
+from importlib import import_module
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -26,6 +27,7 @@ from hybridmap.live.messages import Answer, Ask, Begin, Done, Dropped, End, Fail
 from hybridmap.mapper import Mapper
 from hybridmap.store import MapStore
 from hybridmap.streams.base import Observation, Sample, StreamReport
+from hybridmap.streams.sensors import kinds
 
 log = logging.getLogger(__name__)
 
@@ -169,6 +171,7 @@ def snapshot_of(mapper: Mapper, *, ended: bool) -> Snapshot:
 
 def work(pipe: Connection) -> None:
     """Map what comes through the pipe into a session, and say how it ended."""
+    _load()
     begin: Begin = pipe.recv()
     overwrite = begin.overwrite
     while True:
@@ -181,6 +184,15 @@ def work(pipe: Connection) -> None:
         stream.show(ended=True)
         pipe.send(finished)
         return
+
+
+def _load() -> None:
+    """Load what a mapper needs, for a robot that says later what to map with: a drive then begins at once."""
+    for kind in kinds():
+        if isinstance(kind.front_end, str):
+            import_module(kind.front_end.partition(":")[0])
+    import_module("hybridmap.compiled")
+    import_module("gtsam")
 
 
 def main() -> None:

@@ -110,6 +110,12 @@ class Incoming:
         return [] if self.rig is not None else named or self._missing
 
     @property
+    def frames(self) -> tuple[str, str]:
+        """Names of the frame of the odometry and of the base, such as `odom` and `base_link`; known with the rig."""
+        assert self._motion is not None
+        return self._motion.track.parent or "odom", self._motion.base_frame
+
+    @property
     def losses(self) -> dict[str, int]:
         """Name -> number of messages that no observation uses (`unmatched color`)."""
         return {} if self._gatherer is None else dict(self._gatherer.losses)

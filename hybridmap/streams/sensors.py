@@ -5,10 +5,11 @@ A new kind is one `SensorKind`, given to `register`. Nothing else in the package
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from hybridmap.config.inputs import SensorsConfig
+from hybridmap.config.root import Config, named_configs
 from hybridmap.errors import ConfigError
 from hybridmap.plugins import Table
 from hybridmap.streams.base import Keyframe, Observation, Rig, Seen, SensorKind
@@ -59,6 +60,17 @@ def kind_of(observation: Observation) -> SensorKind:
 def rig_of(config: SensorsConfig) -> Rig:
     """The rig of those sensors that a configuration alone describes, for users who feed the mapper themselves."""
     return Rig(**{kind.sensor_name: kind.configured(config) for kind in kinds()})
+
+
+def config_for(kind: SensorKind | None, overrides: Mapping[str, Any]) -> Config:
+    """The configuration named after a kind of sensor, with dotted key -> value over it; without one that for self-motion alone.
+
+    Raises:
+        ConfigError: a key or value is not valid.
+    """
+    if kind is None:
+        return Config.load(None, {**overrides, "vision.sensor": "none"})
+    return Config.load(kind.name if kind.name in named_configs() else None, overrides)
 
 
 def message_types() -> tuple[str, ...]:

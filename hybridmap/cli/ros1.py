@@ -1,0 +1,84 @@
+"""`hybridmap ros1`: map on a robot under ROS 1."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hybridmap.cli.node import (
+    CorrectionSpeed,
+    CorrectionTurn,
+    Lag,
+    MapEvery,
+    MapFrame,
+    Rate,
+    Resolution,
+    RobotTopic,
+    run_node,
+)
+from hybridmap.cli.options import OUT, AsJson, SensorSetting
+
+_Configuration = Annotated[
+    str | None,
+    typer.Option(
+        help="Configuration: a name (an unknown one gives the list) or a YAML file. Default: the one for the sensor found."
+    ),
+]
+
+
+def ros1(
+    out: Annotated[Path, typer.Option(help=OUT)],
+    remappings: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME:=NAME]...", help="Remappings of ROS, such as map:=/floor_2.")
+    ] = None,
+    config: _Configuration = None,
+    odometry_topic: RobotTopic = None,
+    scan_topic: RobotTopic = None,
+    color_topic: RobotTopic = None,
+    depth_topic: RobotTopic = None,
+    camera_info_topic: RobotTopic = None,
+    setting: SensorSetting = None,
+    rate: Rate = 20.0,
+    map_every: MapEvery = 5.0,
+    resolution: Resolution = 0.05,
+    map_frame: MapFrame = "map",
+    correction_m_s: CorrectionSpeed = 0.1,
+    correction_deg_s: CorrectionTurn = 5.0,
+    lag_s: Lag = 2.0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Map on a robot under ROS 1, until Ctrl-C.
+
+    Takes odometry, by topic or by /tf, and laser scans or RGB-D pictures; gives map -> odom on /tf, /map, the path and graph of
+    the map, and services to save, pause and reset it: docs/ros.md. Ctrl-C concludes the session, as at the end of a recording.
+    Needs rospy and a ROS master.
+    """
+    from hybridmap.cli.choose import parse_settings
+    from hybridmap.live import LiveLimits
+    from hybridmap.ros.robot import NodeOptions
+    from hybridmap.ros.ros1 import Ros1, import_rospy
+
+    import_rospy()
+    named: dict[str, Any] = {
+        "odometry_topic": odometry_topic,
+        "scan_topic": scan_topic,
+        "color_topic": color_topic,
+        "depth_topic": depth_topic,
+        "camera_info_topic": camera_info_topic,
+    }
+    topics = {f"sensors.{name}": topic for name, topic in named.items() if topic is not None}
+    options = NodeOptions(
+        out,
+        config,
+        {**topics, **parse_settings(setting)},
+        overwrite,
+        rate_hz=rate,
+        map_every_s=map_every,
+        resolution_m=resolution,
+        map_frame=map_frame,
+        limits=LiveLimits(lag_s=lag_s, correction_m_s=correction_m_s, correction_deg_s=correction_deg_s),
+    )
+    run_node(Ros1("hybridmap", remappings or ()), options, as_json=as_json)

@@ -1,0 +1,97 @@
+"""The services of the node, under the names that users of slam_toolbox, RTAB-Map and map_server know."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from hybridmap.errors import HybridMapError, RosError
+from hybridmap.export.keyframes import write_picture
+from hybridmap.live import LiveMapper
+from hybridmap.output import staged
+from hybridmap.ros import contents
+from hybridmap.ros.contents import Contents
+from hybridmap.ros.middleware import Service, ServiceKind
+
+_ANSWER_S = 60.0
+_NO_LOCALISATION = "localisation on a finished map is not supported yet: this node maps"
+
+
+class Services:
+    """What the services do."""
+
+    def __init__(self, mapper: Callable[[], LiveMapper], out: Path, map_frame: str, resolution_m: float) -> None:
+        """Remember what they need.
+
+        Args:
+            mapper: gives the mapper; raises a RosError before it has begun.
+            out: the session folder; `save_map` writes beside it.
+            map_frame: name of the frame of the map.
+            resolution_m: side of a cell of the grid.
+        """
+        self._mapper, self._out, self._map_frame, self._resolution_m = mapper, out, map_frame, resolution_m
+
+    @property
+    def table(self) -> tuple[Service, ...]:
+        """All services."""
+        return (
+            Service("~save_map", ServiceKind.TRIGGER, _answered(self._save_map)),
+            Service("~serialize_map", ServiceKind.TRIGGER, _answered(self._serialize_map)),
+            Service("~deserialize_map", ServiceKind.TRIGGER, _answered(_refuse)),
+            Service("~set_localization_mode", ServiceKind.SET_BOOL, _answered(_stay_mapping)),
+            Service("~pause", ServiceKind.EMPTY, self._pause),
+            Service("~resume", ServiceKind.EMPTY, self._resume),
+            Service("~reset", ServiceKind.EMPTY, self._reset),
+            Service("dynamic_map", ServiceKind.GET_MAP, self._dynamic_map),
+        )
+
+    def _save_map(self, _: bool) -> str:
+        grid = self._mapper().grid(self._resolution_m, timeout_s=_ANSWER_S)
+        yaml = self._out.with_name(f"{self._out.name}.yaml")
+        image = yaml.with_suffix(".pgm")
+        with staged(yaml, image, overwrite=True) as work:
+            write_picture(grid, work / yaml.name)
+        return f"{yaml} and {image.name}, for map_server"
+
+    def _serialize_map(self, _: bool) -> str:
+        self._mapper().save(timeout_s=_ANSWER_S)
+        return f"everything so far is in the session folder {self._out}"
+
+    def _pause(self, _: bool) -> Contents:
+        self._mapper().pause()
+        return {}
+
+    def _resume(self, _: bool) -> Contents:
+        self._mapper().resume()
+        return {}
+
+    def _reset(self, _: bool) -> Contents:
+        self._mapper().reset()
+        return {}
+
+    def _dynamic_map(self, _: bool) -> Contents:
+        mapper = self._mapper()
+        grid = mapper.grid(self._resolution_m, timeout_s=_ANSWER_S)
+        return {"map": contents.occupancy(mapper.snapshot.stamp_ns, self._map_frame, grid)}
+
+
+def _answered(do: Callable[[bool], str]) -> Callable[[bool], Contents]:
+    """The response of Trigger or SetBool: a failure is an answer, too."""
+
+    def answer(value: bool) -> Contents:
+        try:
+            return {"success": True, "message": do(value)}
+        except HybridMapError as error:
+            return {"success": False, "message": str(error)}
+
+    return answer
+
+
+def _refuse(_: bool) -> str:
+    raise RosError(_NO_LOCALISATION)
+
+
+def _stay_mapping(localise: bool) -> str:
+    if localise:
+        raise RosError(_NO_LOCALISATION)
+    return "mapping"
