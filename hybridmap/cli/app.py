@@ -16,6 +16,7 @@ from hybridmap.cli import INTERRUPTED
 from hybridmap.cli.calibrate import calibrate
 from hybridmap.cli.compare import compare
 from hybridmap.cli.demo import demo
+from hybridmap.cli.edit import edit
 from hybridmap.cli.evaluate import evaluate
 from hybridmap.cli.explain import explain
 from hybridmap.cli.export import export
@@ -77,6 +78,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], dict[int, str]]] = {
     "merge": (merge, {0: "the map of both is written, whether or not they could be joined"}),
     "import": (import_session, {0: "the session is written, whatever its verdict"}),
     "ros1": (ros1, {0: "the session is written, whatever its verdict"}),
+    "edit": (edit, {0: "the changed map is written, whatever its verdict"}),
     "evaluate": (evaluate, {0: "evaluated, even if metrics.json or the page cannot be written, which is only warned of"}),
     "explain": (explain, {0: "explained"}),
     "export": (export, {0: "written"}),

@@ -51,6 +51,7 @@ class Method(StrEnum):
     PROFILE = "profile"
     SEQUENCE = "sequence"
     LOOPS = "loops"
+    BY_HAND = "by hand"
 
     @property
     def words(self) -> str:
@@ -96,6 +97,7 @@ class Lack(StrEnum):
     NO_DEPTH = "no depth"
     OVERRULED = "overruled"
     KIDNAPPED = "kidnapped"
+    REMOVED = "removed"
 
     @property
     def words(self) -> str:
@@ -117,6 +119,7 @@ _METHODS = {
     Method.PROFILE: "profile alone, not verified",
     Method.SEQUENCE: "profiles agree along the way",
     Method.LOOPS: "where the loops put the robot",
+    Method.BY_HAND: "measured by hand",
 }
 _SEARCHES = {
     Search.CHAIN: "",
@@ -147,6 +150,7 @@ _LACKS = {
         "a registration that agrees with the odometry, or edges.drop_contradicted: false",
     ),
     Lack.KIDNAPPED: ("the robot was kidnapped between the two nodes", "a robot that drove from one node to the other"),
+    Lack.REMOVED: ("taken out by hand", "nobody who takes it out"),
 }
 
 

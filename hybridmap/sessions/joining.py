@@ -17,16 +17,19 @@ from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.io import graph_hash
 from hybridmap.metrics import Metric, figure
+from hybridmap.output import write_bytes
 from hybridmap.session import Progress, run
-from hybridmap.sessions.joint_map import JointMap
+from hybridmap.sessions.joint_map import JointMap, joined_sessions
 from hybridmap.sessions.part import Part
 from hybridmap.store import MapStore
 from hybridmap.store.parts import copy_sessions
 from hybridmap.store.session_folder import SessionFolder
 from hybridmap.store.track import trajectory_of
 from hybridmap.streams.base import Stream
-from hybridmap.trajectory import read_tum
 from hybridmap.verdict import Facts, Reason, reasons_of, said_of
+
+FIGURES = "metrics_json"
+"""Key of the facts of a session under which `metrics.json` is kept as it was before the session was joined to others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,27 +66,22 @@ def merge(base: Path, other: Path, out: Path, *, overwrite: bool = False) -> Joi
     """
     with MapStore.open(base) as first, MapStore.open(other) as second:
         config = config_of(first)
-        _require_same_rig(first, second)
+        require_same_rig(first, second)
         joint = JointMap(config, first.rig)
         joint.take_up(Part.of(first))
         joint.join(joint.take_up(Part.of(second)))
         folder = SessionFolder(out)
         with folder.writing(overwrite=overwrite):
             folder.write_config(config.to_yaml())
-            truth = SessionFolder(other).groundtruth
-            if truth.is_file():
-                folder.write_groundtruth(read_tum(truth))
-            name = f"{first.source} + {second.source}"
-            with MapStore.create(folder.path, first.config_yaml, first.rig, name) as store:
-                for part in (first, second):
+            with MapStore.create(folder.path, first.config_yaml, first.rig, "") as store:
+                for path, part in ((base, first), (other, second)):
+                    copied = len(store.sessions()) if store.one("SELECT COUNT(*) FROM nodes", ()) else 0
                     copy_sessions(part, store)
-                copied = int(store.one("SELECT COUNT(*) FROM edges", ()))
-                for number in range(copied, len(joint.map.edges)):
+                    keep_files(SessionFolder(path), folder, store, copied)
+                for number in range(int(store.one("SELECT COUNT(*) FROM edges", ())), len(joint.map.edges)):
                     store.put_edge(number, joint.map.edge(number))
-                store.put_info("config_yaml", first.config_yaml)
-                store.put_info("rig", first.info("rig"))
-                store.put_info("source", name)
-                return conclude(store, folder, joint.solutions(config.backends.names), config, joint.pieces)
+                describe(store, first, f"{first.source} + {second.source}")
+                return conclude(store, folder, joint.solutions(config.backends.names), config)
 
 
 def map_onto(
@@ -109,9 +107,7 @@ def map_onto(
         return merge(base, Path(alone) / "session", out, overwrite=overwrite)
 
 
-def conclude(
-    store: MapStore, folder: SessionFolder, solutions: Mapping[str, Solution], config: Config, pieces: list[list[int]]
-) -> Joined:
+def conclude(store: MapStore, folder: SessionFolder, solutions: Mapping[str, Solution], config: Config) -> Joined:
     """Write what is known of a map of several sessions once it is solved: frames, solutions, trajectories, figures, verdict.
 
     Args:
@@ -119,21 +115,14 @@ def conclude(
         folder: where it is.
         solutions: poses of all nodes by each back-end.
         config: names the back-ends; the first is the primary one.
-        pieces: numbers of the sessions of each piece.
     """
     primary = config.backends.names[0]
     _write_frames(store, solutions[primary].poses)
-    experiences = store.map()
+    experiences, sessions = store.map(), store.sessions()
+    pieces = joined_sessions(experiences)
     for name, solution in solutions.items():
         store.put_solution(name, solution.poses, solution.report)
-    sessions = store.sessions()
-    for session in sessions:
-        track, newest = store.track(session.number), session is sessions[-1]
-        place = "" if newest else f"session-{session.number}/"
-        folder.write_trajectory(f"{place}{ODOMETRY}", track.odometry)
-        for name, solution in solutions.items():
-            if name != ODOMETRY:
-                folder.write_trajectory(f"{place}{name}", trajectory_of(track, solution.poses))
+    write_trajectories(store, folder, {name: solution.poses for name, solution in solutions.items()})
     head = {
         **said_of(_reasons(experiences, solutions[primary], primary, pieces)),
         "graph_hash": graph_hash(experiences),
@@ -145,7 +134,7 @@ def conclude(
             for one in sessions
         ],
         "joined": len(pieces) == 1,
-        "remarks": [] if len(pieces) == 1 else [not_joined(store, pieces)],
+        "remarks": [] if len(pieces) == 1 else [_not_joined(store, pieces)],
     }
     metrics = _figures(experiences, pieces)
     folder.write_metrics(head, metrics)
@@ -155,19 +144,59 @@ def conclude(
     return Joined(folder, len(pieces) == 1, head, metrics)
 
 
+def write_trajectories(store: MapStore, folder: SessionFolder, poses_of: Mapping[str, Array]) -> None:
+    """Write the trajectory of every session by each back-end, given its poses (N, 3) of all nodes."""
+    sessions = store.sessions()
+    for session in sessions:
+        track, place = store.track(session.number), "" if session is sessions[-1] else f"session-{session.number}/"
+        folder.write_trajectory(f"{place}{ODOMETRY}", track.odometry)
+        for name, poses in poses_of.items():
+            if name != ODOMETRY:
+                folder.write_trajectory(f"{place}{name}", trajectory_of(track, poses))
+
+
+def describe(store: MapStore, like: MapStore, source: str) -> None:
+    """Write the facts of a map as a whole that do not depend on its solution; sensors and settings are those of another map."""
+    for key, value in (("config_yaml", like.config_yaml), ("rig", like.info("rig")), ("source", source)):
+        store.put_info(key, value)
+
+
+def keep_files(part: SessionFolder, folder: SessionFolder, store: MapStore, first: int) -> None:
+    """Keep what a part's folder has beside its map: the ground truth of its sessions, and the figures of a single one.
+
+    Args:
+        part: the folder of the part.
+        folder, store: the map that it became part of.
+        first: number there of its first session.
+    """
+    count = len(store.sessions()) - first
+    if count == 1 and part.metrics_json.is_file():
+        store.write_rows("info", [(first, FIGURES, part.metrics_json.read_text(encoding="utf-8"))])
+    for number in range(count):
+        own = part.groundtruth_of(number, newest=number == count - 1)
+        if own.is_file():
+            write_bytes(folder.groundtruth_of(first + number, newest=False), own.read_bytes())
+            write_bytes(folder.groundtruth, own.read_bytes())
+
+
 def config_of(store: MapStore) -> Config:
     """The configuration of a map, without settings that this version has no more."""
     return Config.from_tree(without_gone(store.config_tree), str(store.path))
 
 
-def not_joined(store: MapStore, pieces: list[list[int]]) -> str:
+def _not_joined(store: MapStore, pieces: list[list[int]]) -> str:
     """That the sessions of a map are not joined, in words."""
     names = {one.number: f"{one.number} ({one.name})" for one in store.sessions()}
     said = "; ".join(", ".join(names[number] for number in piece) for piece in pieces)
     return f"not joined: {counted(len(pieces), 'piece')}, each in its own frame, of the sessions {said}"
 
 
-def _require_same_rig(first: MapStore, second: MapStore) -> None:
+def require_same_rig(first: MapStore, second: MapStore) -> None:
+    """Refuse a map of other sensors.
+
+    Raises:
+        StoreError: the sensors differ.
+    """
     here, there = first.info("rig"), second.info("rig")
     if here != there:
         raise StoreError(f"{second.path}: was mapped with other sensors than {first.path}; maps of one robot can be joined")

@@ -16,6 +16,7 @@ from hybridmap.backends.base import Solution
 from hybridmap.backends.pieces import pieces_of, solve_by_piece
 from hybridmap.backends.registry import create
 from hybridmap.config import Config
+from hybridmap.config.backends import BackendsConfig
 from hybridmap.edge_book import EdgeBook
 from hybridmap.errors import ConfigError
 from hybridmap.geometry import Array, between, compose
@@ -91,37 +92,33 @@ class JointMap:
         self._covariance_from = None
         return range(first, len(self.map))
 
-    def join(self, nodes: range) -> bool:
+    def join(self, nodes: range) -> float | None:
         """Look for the place of the map that was taken up last, which has these nodes, on those before it.
 
-        Every node is compared, in order. If it is found, all poses are those of the joint map. Returns whether it was found.
+        Every node is compared, in order. If it is found, all poses are those of the joint map.
+
+        Returns:
+            Travel from its first node to the one at which its place was known, m; None if it was not found.
         """
         self._vision.arrive(nodes.start)
-        joined = False
+        found_m: float | None = None
         for node in nodes:
             accepted = self._enter(self._vision.meet(node, self._belief(node)))
-            if accepted and not joined:
+            if accepted and found_m is None:
                 self._place(nodes, accepted)
-                joined = True
+                found_m = float(self._travel_m[node] - self._travel_m[nodes.start])
             if accepted and self._travel_m[node] - self._solved_m > SOLVED_EVERY_M:
                 self._solve()
                 self._solved_m = float(self._travel_m[node])
-        if joined:
+        if found_m is not None:
             self._solve()
         while self._enter(self._vision.meet_again(self._belief(nodes.stop - 1))):
             self._solve()
-        return joined and self._settled(nodes)
+        return found_m if found_m is not None and self._settled(nodes) else None
 
     def solutions(self, names: Sequence[str]) -> dict[str, Solution]:
         """The map by each back-end of these names; pieces that are not joined are solved by themselves."""
-        graph = replace(self.map.pose_graph(), initial=self.poses)
-        return {name: solve_by_piece(create(name, self._config).solve, graph) for name in names}
-
-    @property
-    def pieces(self) -> list[list[int]]:
-        """The numbers of the sessions of each piece that is joined in itself; pieces in the order of their first session."""
-        of_node = np.repeat(np.arange(len(self.map.sessions)), [len(session) for session in self.map.sessions])
-        return [np.unique(of_node[nodes]).tolist() for nodes in pieces_of(self.map.pose_graph())]
+        return solutions_of(self.map, self.poses, names, self._config)
 
     def _apart(self, stamps_s: Array, travel_m: Array, session: range) -> tuple[Array, Array]:
         """All stamps and travel so far, and those of a session, which begin well after those before it."""
@@ -180,6 +177,24 @@ class JointMap:
             self._covariance_from = None
             self._solve()
         return joined
+
+
+def solutions_of(experiences: ExperienceMap, poses: Array, names: Sequence[str], config: BackendsConfig) -> dict[str, Solution]:
+    """Solve a map of several sessions by each back-end of these names, from poses (N, 3), m and rad.
+
+    A piece that is not joined to the first one is solved by itself, in the frame in which its first session was driven.
+    """
+    graph, initial = experiences.pose_graph(), poses.copy()
+    for nodes in pieces_of(graph)[1:]:
+        initial[nodes] = compose(experiences.initial[nodes[0]], between(poses[nodes[0]], poses[nodes]))
+    graph = replace(graph, initial=initial)
+    return {name: solve_by_piece(create(name, config).solve, graph) for name in names}
+
+
+def joined_sessions(experiences: ExperienceMap) -> list[list[int]]:
+    """The numbers of the sessions of each piece that is joined in itself; pieces in the order of their first session."""
+    of_node = np.repeat(np.arange(len(experiences.sessions)), [len(session) for session in experiences.sessions])
+    return [np.unique(of_node[nodes]).tolist() for nodes in pieces_of(experiences.pose_graph())]
 
 
 def _end(experiences: ExperienceMap, first: int) -> int:

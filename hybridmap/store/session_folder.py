@@ -104,6 +104,11 @@ class SessionFolder:
         """Path of the ground-truth trajectory; the file exists only if the source has one."""
         return self.path / "reference" / "groundtruth.tum"
 
+    def groundtruth_of(self, session: int, *, newest: bool) -> Path:
+        """Path of the ground truth of one session of several; that of the newest is `groundtruth` if it has no own file."""
+        own = self.path / "reference" / f"session-{session}.tum"
+        return self.groundtruth if newest and not own.is_file() else own
+
     @property
     def report(self) -> Path:
         """Path of the HTML report."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 import sqlite3
 
 import numpy as np
@@ -15,9 +16,9 @@ from hybridmap.errors import StoreError
 from hybridmap.geometry import align, between, compose
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.session import run
+from hybridmap.sessions.editing import Measured, add_edge, remove_edge, remove_session
 from hybridmap.sessions.joining import merge
 from hybridmap.store import MapStore
-from hybridmap.store.parts import copy_sessions
 from hybridmap.streams.open import open_stream
 from hybridmap.trajectory import read_tum
 
@@ -77,11 +78,53 @@ def test_the_maps_that_are_read_stay_as_they_are(drives, tmp_path):
 
 
 def test_every_part_comes_back_bit_for_bit(drives, joined, tmp_path):
-    with MapStore.open(joined.folder.path) as whole:
-        for number, path in enumerate(drives[:2]):
-            with MapStore.create(tmp_path / str(number), whole.config_yaml, whole.rig, "") as store:
-                copy_sessions(whole, store, [number])
-            assert rows(tmp_path / str(number)) == rows(path)
+    """Map, figures, trajectories and truth are those of before; what is left of two sessions is the other one."""
+    for number, path in enumerate(drives[:2]):
+        back = remove_session(joined.folder.path, 1 - number, tmp_path / str(number)).folder.path
+        assert rows(back) == rows(path)
+        files = sorted(file.relative_to(path) for file in path.rglob("*") if file.is_file() and file.name != "map.db")
+        assert sorted(file.relative_to(back) for file in back.rglob("*") if file.is_file() and file.name != "map.db") == files
+        for file in files:
+            assert (back / file).read_bytes() == (path / file).read_bytes(), file
+
+
+def test_an_edge_that_is_taken_out_stays_in_the_file_and_parts_what_it_joined(joined, tmp_path):
+    """With all edges between them gone the two are pieces again, each in its own frame; one by hand joins them."""
+    whole = tmp_path / "whole"
+    shutil.copytree(joined.folder.path, whole)
+    with MapStore.open(whole) as store:
+        experiences, poses = store.map(), store.solutions()["gtsam-gnc"].poses
+    here, there = experiences.sessions
+    across = [
+        number
+        for number, edge in enumerate(experiences.edges)
+        if edge.status is Status.ACCEPTED and (edge.source in here) != (edge.target in here)
+    ]
+    for number in across:
+        done = remove_edge(whole, number, whole, overwrite=True)
+    assert not done.joined
+    assert [reason["kind"] for reason in done.head["reasons"]] == ["not joined"]
+    with MapStore.open(whole) as store:
+        parted = store.map()
+        assert {parted.edge(number).status for number in across} == {Status.RETRACTED}
+        assert store.solutions()["gtsam-gnc"].poses[there[0]] == pytest.approx(parted.initial[there[0]])
+    by_hand = Measured(here[0], there[0], between(poses[here[0]], poses[there[0]]), 0.02, 0.01)
+    again = add_edge(whole, by_hand, whole, overwrite=True)
+    assert again.joined
+    with MapStore.open(whole) as store:
+        assert store.solutions()["gtsam-gnc"].poses[there[0]] == pytest.approx(poses[there[0]], abs=0.02)
+
+
+def test_only_what_is_there_can_be_taken_out(drives, joined, tmp_path):
+    with pytest.raises(StoreError, match="session 7 cannot be removed"):
+        remove_session(joined.folder.path, 7, tmp_path / "out")
+    with pytest.raises(StoreError, match="holds 1 session"):
+        remove_session(drives[0], 0, tmp_path / "out")
+    with pytest.raises(StoreError, match="edge 0: odometry"):
+        remove_edge(joined.folder.path, 0, tmp_path / "out")
+    with pytest.raises(StoreError, match="two different nodes"):
+        add_edge(joined.folder.path, Measured(3, 3, np.zeros(3), 0.1, 0.1), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_is_not_found_stays_apart_and_says_so(drives, tmp_path):
@@ -118,3 +161,16 @@ def test_other_sensors_are_refused(drives, tmp_path):
     with pytest.raises(StoreError, match="other sensors"):
         merge(drives[0], tmp_path / "other", tmp_path / "both")
     assert not (tmp_path / "both").exists()
+
+
+def test_a_camera_finds_its_place_too(tmp_path):
+    """Begun a metre ahead with the same heading: the two are one map, and neither is where the other began."""
+    here, there = drive("lab", tmp_path / "here", 0.0, 14.0, 1, "rgbd"), drive("lab", tmp_path / "there", 3.0, 16.0, 2, "rgbd")
+    both = merge(here, there, tmp_path / "both")
+    assert both.joined
+    with MapStore.open(both.folder.path) as store:
+        firsts = [nodes[0] for nodes in store.map().sessions]
+        poses, stamps_ns = store.solutions()["gtsam-gnc"].poses[firsts], store.map().stamps_ns[firsts]
+    true = read_tum(here / "reference" / "groundtruth.tum").at(stamps_ns)
+    assert np.hypot(*(true[1] - true[0])[:2]) > 1.0
+    assert between(poses[0], poses[1]) == pytest.approx(between(true[0], true[1]), abs=0.03)

@@ -190,6 +190,17 @@ class LoopCloser:
         out += self._relocaliser.dismiss()
         return [*out, *self.support.give_up(before=len(self._keyframes))]
 
+    def beside(self, node: int, before: int, belief: Belief) -> list[Edge]:
+        """Compare a node with the nodes before `before` that are near it on the map, and give up what waited too long.
+
+        Returns new and changed edges; none where two of its loops were accepted already.
+        """
+        out = self.support.give_up(before=node - PENDING_NODES)
+        if self._unverified or self.support.accepted(node) >= ACCEPT:
+            return out
+        near = self._nearest(node, REPROPOSE_PER_NODE, belief, before)
+        return out + self._try_again(node, near, belief, {j for j in near if self._is_sure(node, j, belief)})
+
     def anywhere(self, node: int, targets: Indices) -> list[Edge]:
         """Compare a node with nodes `targets` (n,), ascending, at any pose; see `GlobalSearch.search`. Nothing is kept."""
         return self._global_search.search(node, targets)
@@ -308,12 +319,13 @@ class LoopCloser:
             self._travel_at_closure = max(self._travel_at_closure, float(belief.travel_m[node]))
         return changed
 
-    def _nearest(self, node: int, most: int, belief: Belief) -> dict[int, Candidate]:
-        """Earlier nodes of nearly the same pose without an edge to this one, nearest first."""
+    def _nearest(self, node: int, most: int, belief: Belief, before: int | None = None) -> dict[int, Candidate]:
+        """Nodes before this one, or before `before`, of nearly the same pose without an edge to this one, nearest first."""
+        earlier = slice(node if before is None else before)
         poses = belief.poses_map_node
-        gap = np.hypot(*(poses[:node, :2] - poses[node, :2]).T)
-        turned = np.abs(wrap_angle(poses[:node, 2] - poses[node, 2]))
-        old = belief.stamps_s[node] - belief.stamps_s[:node] >= MIN_AGE_S
+        gap = np.hypot(*(poses[earlier, :2] - poses[node, :2]).T)
+        turned = np.abs(wrap_angle(poses[earlier, 2] - poses[node, 2]))
+        old = belief.stamps_s[node] - belief.stamps_s[earlier] >= MIN_AGE_S
         near = old & (gap <= REPROPOSE_M) & (turned <= np.deg2rad(HEADING_DEG))
         cost = gap + turned
         order = np.argsort(np.where(near, cost, np.inf), kind="stable")[: int(near.sum())]

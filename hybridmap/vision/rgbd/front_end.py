@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.vision import VisionConfig
+from hybridmap.errors import StreamError
 from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.edges import Check, Edge
 from hybridmap.metrics import StageClock
@@ -19,8 +20,8 @@ from hybridmap.vision.base import HELD_IMAGES, UNEXPECTED, Belief, Division, Vie
 from hybridmap.vision.profile import image_profile
 from hybridmap.vision.rgbd import checks
 from hybridmap.vision.rgbd.closing import LoopCloser
-from hybridmap.vision.rgbd.depth_grid import cell_px, make_grid, place
-from hybridmap.vision.rgbd.features import detect
+from hybridmap.vision.rgbd.depth_grid import DepthGrid, cell_px, make_grid, place
+from hybridmap.vision.rgbd.features import Features, detect
 from hybridmap.vision.rgbd.keyframe import (
     Keyframe,
     WorkingImage,
@@ -28,9 +29,11 @@ from hybridmap.vision.rgbd.keyframe import (
     working_factor,
     working_image,
 )
+from hybridmap.vision.rgbd.meeting import FeatureMeeting
 from hybridmap.vision.rgbd.noise_level import NoiseLevel
 from hybridmap.vision.rgbd.pnp import Verifier
 from hybridmap.vision.rgbd.posture import Posture
+from hybridmap.vision.rgbd.stance import Stance
 from hybridmap.vision.rgbd.tracking import Tracker, odometry_sigma
 from hybridmap.vision.rgbd.witness import FeatureWitness
 from hybridmap.vision.templates import ViewTemplates
@@ -39,7 +42,7 @@ from hybridmap.vision.templates import ViewTemplates
 class RgbdFrontEnd:
     """The RGB-D front-end: profiles, depth registration of consecutive nodes, loops verified by features and depth.
 
-    Implements `vision.base.VerifyingFrontEnd`, `PartingFrontEnd` and `second_opinion.LocalisingFrontEnd`.
+    Implements `vision.base.VerifyingFrontEnd`, `PartingFrontEnd`, `MeetingFrontEnd` and `second_opinion.LocalisingFrontEnd`.
 
     Args:
         config: settings of the visual side.
@@ -78,6 +81,7 @@ class RgbdFrontEnd:
             keys.__next__,
             clock or StageClock(),
         )
+        self._meeting = FeatureMeeting(self.closer, keys.__next__, config.closing.revisit_rounds)
         verified = config.relocalising.enabled and rgbd.verify != "none"
         self.witness = FeatureWitness(self.closer, keys.__next__) if verified else None
         self._frame: RgbdFrame | None = None
@@ -104,13 +108,19 @@ class RgbdFrontEnd:
         """
         if self._frame is None or self._image is None or node != len(self.keyframes):
             raise ValueError(f"vision: found node {node}, expected node {len(self.keyframes)} after a frame was observed")
-        rgbd = self._config.rgbd
-        features = detect(self._image.grey, self._image.depth_m, self._camera)
-        grid = make_grid(self._image.depth_m, self._camera, self._cell_px, rgbd.registration.depth_sigma)
+        features, grid = self._seen(self._image)
         stance = self._posture.stance(grid, features, self.keyframes[-1] if self.keyframes else None)
-        self.keyframes.append(Keyframe(view.profile, features, place(grid, stance)))
+        self._keep(Keyframe(view.profile, features, place(grid, stance)))
         self._images.append((node, self._frame))
-        self.closer.add_node(view.profile)
+
+    def _seen(self, image: WorkingImage) -> tuple[Features, DepthGrid]:
+        """The features and the depth grid of a picture."""
+        sigma = self._config.rgbd.registration.depth_sigma
+        return detect(image.grey, image.depth_m, self._camera), make_grid(image.depth_m, self._camera, self._cell_px, sigma)
+
+    def _keep(self, keyframe: Keyframe) -> None:
+        self.keyframes.append(keyframe)
+        self.closer.add_node(keyframe.profile)
 
     def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
         """Register the new node to the two before it; see `FrontEnd.track`.
@@ -177,6 +187,40 @@ class RgbdFrontEnd:
             "T_base_camera": kept.surface.stance.T_base_camera,
             **self.closer.note(node),
         }
+
+    def state(self, node: int) -> dict[str, NDArray[np.generic]]:
+        """`stance` (3,) of a node: uncertainty of tilt (rad) and height (m), and whether they were estimated there."""
+        stance = self.keyframes[node].surface.stance
+        return {"stance": np.array([stance.tilt_sigma_rad, stance.height_sigma_m, stance.held])}
+
+    def restore(
+        self, node: int, keyframe: Mapping[str, NDArray[np.generic]], state: Mapping[str, NDArray[np.generic]], begins: bool
+    ) -> None:
+        """Take up a node of a finished session; see `MeetingFrontEnd.restore`. `begins` is not used: see `part`."""
+        del begins
+        frame = RGBD.restore(keyframe, 0)
+        if frame is None or "stance" not in state:
+            found = ", ".join([*keyframe, *state]) or "nothing"
+            raise StreamError(
+                f"RGB-D: node {node} of a stored map: expected a picture with depth and its stance, found {found}; "
+                f"map its source again"
+            )
+        features, grid = self._seen(working_image(checked_frame(frame, self._full_camera), self._factor))
+        tilt_sigma_rad, height_sigma_m, was_held = np.asarray(state["stance"]).tolist()
+        stance = Stance(np.asarray(keyframe["T_base_camera"]), tilt_sigma_rad, height_sigma_m, bool(was_held))
+        self._keep(Keyframe(np.asarray(keyframe["profile"], dtype=np.float32), features, place(grid, stance)))
+
+    def arrive(self, first: int) -> None:
+        """A session begins whose place on the map is to be found; see `MeetingFrontEnd.arrive`."""
+        self._meeting.arrive(first)
+
+    def meet(self, node: int, belief: Belief) -> list[Edge]:
+        """Look for loops of a node to earlier sessions; see `MeetingFrontEnd.meet`."""
+        return self._meeting.meet(node, belief)
+
+    def meet_again(self, belief: Belief) -> list[Edge]:
+        """Compare nodes near each other on the map, and decide what is pending; see `MeetingFrontEnd.meet_again`."""
+        return self._meeting.meet_again(belief)
 
     def _yaw_of_shift(self, shift: int) -> float:
         """Yaw of the stored view seen from the query: things farther right in the query mean that it looks farther left."""
