@@ -8,6 +8,8 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import Reader as Reader2
 
 from hybridmap.config import Config
 from hybridmap.errors import ExportError, GraphError, StreamError
@@ -96,6 +98,13 @@ def test_actions_and_odometry_make_a_session(tmp_path, kind):
     assert np.diag(loop.covariance)[0] >= 0.25**2 > np.diag(link.covariance)[0], "half of the way between experiences"
 
 
+def test_a_robot_that_stays_in_its_experience_keeps_its_way_and_edges_their_time(tmp_path):
+    drive = [(CREATE_NODE, 0, 0), (SET_NODE, 0, 0), *ROUND[1:], (CREATE_EDGE, 15, 0), (CREATE_NODE, 0, 16)]
+    experiences = imported(driven(drive).write(tmp_path / "drive.mcap"), tmp_path / "s")[0]
+    np.testing.assert_allclose(known(experiences.edge(0).relative).delta, drifting(2 * STRIDE + 1)[-1], atol=1e-12)
+    assert [edge.since_node for edge in experiences.edges] == [*range(1, 16), 15, 16]
+
+
 def test_odometry_by_twists_alone_is_integrated(tmp_path):
     poses = imported(driven().write(tmp_path / "a.mcap"), tmp_path / "s")[0].initial
     turning = imported(driven(twist=True).write(tmp_path / "b.mcap"), tmp_path / "t")[0].initial
@@ -134,6 +143,11 @@ def test_what_is_written_back_equals_the_session_and_imports_as_the_same_graph(t
     assert bag.read_bytes() == (tmp_path / "b" / f"map{suffix}").read_bytes()
     written = read_topological_map(BagFile(bag), "/ExperienceMap/Map")
     np.testing.assert_allclose(known(written.poses), solutions["gtsam-lm"].poses, atol=1e-12)
+    assert written.stamps_ns[-1] == experiences.nodes[-1].stamp_ns
+    with (Reader1 if suffix == ".bag" else Reader2)(bag) as reader:
+        assert (np.diff([stamp_ns for _, stamp_ns, _ in reader.messages()]) > 0)[:-1].all(), (
+            "an action comes after its odometry"
+        )
     assert len(written.links) == len(experiences.edges)
     for link, edge in zip(written.links, experiences.edges, strict=True):
         assert (link.source, link.target, link.duration_s) == (edge.source, edge.target, edge.figures["duration_s"])
@@ -234,6 +248,9 @@ def test_tables_make_a_session(tmp_path):
     ways = LINKS.replace("3.5", "2.5")
     track = imported(tables(tmp_path, links=ways), tmp_path / "t")[2]
     assert track.stamps_ns.tolist() == [0, 2_500_000_000, 5_000_000_000]
+    backward = LINKS.replace("1,2,1,0,0,3.5", "2,1,1,3.14159265,0,3.5")
+    experiences = imported(tables(tmp_path, links=backward), tmp_path / "u")[0]
+    np.testing.assert_allclose(experiences.initial[2], (2, 0, 0), atol=1e-6)
 
 
 @pytest.mark.parametrize(
