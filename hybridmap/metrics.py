@@ -50,6 +50,8 @@ FIGURES: dict[str, tuple[str, str]] = {
     "sessions": ("1", "drives that the map was made of"),
     "pieces": ("1", "pieces of the map that are not joined, each in a frame of its own; 1 if all is one map"),
     "loops_accepted": ("1", "loop closures in the graph"),
+    "found_after": ("m", "travel after which the place of the drive on the map was found"),
+    "known_on_map": ("1", "share of the poses whose place on the map is known"),
     "loops_between_sessions": ("1", "of those, the ones between two sessions"),
     "loops_pending": ("1", "loop closures still waiting at the end"),
     "loops_rejected": ("1", "loop closures refused, each with its reason"),

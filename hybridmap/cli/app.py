@@ -22,6 +22,7 @@ from hybridmap.cli.explain import explain
 from hybridmap.cli.export import export
 from hybridmap.cli.import_map import import_session
 from hybridmap.cli.inspect import inspect
+from hybridmap.cli.localize import localize
 from hybridmap.cli.map import map_source
 from hybridmap.cli.merge import merge
 from hybridmap.cli.optimize import optimize
@@ -78,6 +79,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], dict[int, str]]] = {
     "merge": (merge, {0: "the map of both is written, whether or not they could be joined"}),
     "import": (import_session, {0: "the session is written, whatever its verdict"}),
     "ros1": (ros1, {0: "the session is written, whatever its verdict"}),
+    "localize": (localize, {0: "the session of the drive is written, whether or not it was found on the map"}),
     "edit": (edit, {0: "the changed map is written, whatever its verdict"}),
     "evaluate": (evaluate, {0: "evaluated, even if metrics.json or the page cannot be written, which is only warned of"}),
     "explain": (explain, {0: "explained"}),

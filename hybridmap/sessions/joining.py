@@ -23,9 +23,10 @@ from hybridmap.sessions.joint_map import JointMap, joined_sessions
 from hybridmap.sessions.part import Part
 from hybridmap.store import MapStore
 from hybridmap.store.parts import copy_sessions
+from hybridmap.store.schema import rig_to_json
 from hybridmap.store.session_folder import SessionFolder
 from hybridmap.store.track import trajectory_of
-from hybridmap.streams.base import Stream
+from hybridmap.streams.base import Rig, Stream
 from hybridmap.verdict import Facts, Reason, reasons_of, said_of
 
 FIGURES = "metrics_json"
@@ -66,7 +67,7 @@ def merge(base: Path, other: Path, out: Path, *, overwrite: bool = False) -> Joi
     """
     with MapStore.open(base) as first, MapStore.open(other) as second:
         config = config_of(first)
-        require_same_rig(first, second)
+        require_sensors(first, second.rig, str(second.path))
         joint = JointMap(config, first.rig)
         joint.take_up(Part.of(first))
         joint.join(joint.take_up(Part.of(second)))
@@ -100,7 +101,8 @@ def map_onto(
     Raises:
         What `session.run` and `merge` raise. Then nothing is written.
     """
-    SessionFolder(base).require()
+    with MapStore.open(base) as known:
+        require_sensors(known, stream.rig, stream.name)
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out.absolute().parent, prefix=f".{out.name}.") as alone:
         run(stream, config, Path(alone) / "session", progress=progress)
@@ -191,15 +193,19 @@ def _not_joined(store: MapStore, pieces: list[list[int]]) -> str:
     return f"not joined: {counted(len(pieces), 'piece')}, each in its own frame, of the sessions {said}"
 
 
-def require_same_rig(first: MapStore, second: MapStore) -> None:
-    """Refuse a map of other sensors.
+def require_sensors(known: MapStore, rig: Rig, name: str) -> None:
+    """Refuse a drive or a map of other sensors than those of a map.
+
+    Args:
+        known: the map.
+        rig: the other sensors.
+        name: whose sensors they are.
 
     Raises:
         StoreError: the sensors differ.
     """
-    here, there = first.info("rig"), second.info("rig")
-    if here != there:
-        raise StoreError(f"{second.path}: was mapped with other sensors than {first.path}; maps of one robot can be joined")
+    if rig_to_json(rig) != rig_to_json(known.rig):
+        raise StoreError(f"{name}: has other sensors than {known.path}; only what one kind of robot saw can be joined")
 
 
 def _piece_of(session: int, pieces: list[list[int]]) -> int:

@@ -18,6 +18,7 @@ from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.session import run
 from hybridmap.sessions.editing import Measured, add_edge, remove_edge, remove_session
 from hybridmap.sessions.joining import merge
+from hybridmap.sessions.localizing import localize
 from hybridmap.store import MapStore
 from hybridmap.streams.open import open_stream
 from hybridmap.trajectory import read_tum
@@ -161,6 +162,34 @@ def test_other_sensors_are_refused(drives, tmp_path):
     with pytest.raises(StoreError, match="other sensors"):
         merge(drives[0], tmp_path / "other", tmp_path / "both")
     assert not (tmp_path / "both").exists()
+
+
+def test_a_drive_is_localised_on_a_map_that_stays_as_it_is(drives, tmp_path):
+    """Its trajectory is in the frame of the map; it is as right there as the map is."""
+    config = Config.load("laser", {"simulation.world": "lab", "seed": 4, "backends.names": ["gtsam-gnc"], "neural.modules": 0})
+    before = (drives[0] / "map.db").read_bytes()
+    done = localize(open_stream("lab", config, start_s=12.0, end_s=26.0), config, drives[0], tmp_path / "drive")
+    assert done.found
+    assert (drives[0] / "map.db").read_bytes() == before
+    here, there = (
+        read_tum(drives[0] / "trajectory" / "gtsam-gnc.tum"),
+        read_tum(tmp_path / "drive" / "trajectory" / "on_map.tum"),
+    )
+    truth = read_tum(drives[0] / "reference" / "groundtruth.tum")
+    pose_world_map = align(truth.at(here.stamps_ns), here.poses)
+    error_m = np.hypot(*(compose(pose_world_map, there.poses) - truth.at(there.stamps_ns))[:, :2].T)
+    assert np.sqrt(np.mean(error_m**2)) < 0.03
+    assert done.head["localized"]["graph_hash_before"] == done.head["localized"]["graph_hash_after"]
+    assert {metric.name: metric.value for metric in done.metrics}["found_after"] < 5.0
+
+
+def test_a_drive_elsewhere_is_not_localised_and_says_so(drives, tmp_path):
+    config = Config.load("laser", {"simulation.world": "office", "backends.names": ["gtsam-gnc"], "neural.modules": 0})
+    done = localize(open_stream("office", config, end_s=6.0), config, drives[0], tmp_path / "drive")
+    assert not done.found
+    assert not (tmp_path / "drive" / "trajectory" / "on_map.tum").exists()
+    assert any("not localised" in remark for remark in done.head["remarks"])
+    assert {metric.name: metric.value for metric in done.metrics}["known_on_map"] == 0.0
 
 
 def test_a_camera_finds_its_place_too(tmp_path):
