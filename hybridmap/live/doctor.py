@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from statistics import median
 
 from hybridmap.errors import counted
-from hybridmap.live.inbox import AHEAD, LATE, ODOMETRY, PAUSED, SLOW, Inbox
+from hybridmap.live.inbox import AHEAD, LATE, PAUSED, SLOW, Inbox
 
 QUIET_S = 3.0
 """Time that a source has before it is missed, s."""
-CLOCKS_APART_S = 0.5
-"""Stamps of two sources that come at the same time differ by less than this, s."""
+AHEAD_MAX_S, BEHIND_MAX_S = 0.5, 2.0
+"""How much later or earlier than the newest odometry a view may be stamped that comes, s: pictures take their time."""
 _OF_REASON = {
     LATE: "came after their turn: stamps out of order, or a source that comes and goes",
     SLOW: "left out, as mapping is slower than they come: give the machine more time, or send fewer",
@@ -49,11 +49,12 @@ def _jumps(inbox: Inbox) -> Iterator[str]:
 
 
 def _clocks(inbox: Inbox) -> Iterator[str]:
-    odometry = inbox.sources[ODOMETRY]
     for name, source in inbox.sources.items():
-        if source is odometry or not source.ahead_s or not odometry.ahead_s:
-            continue
-        apart_s = median(source.ahead_s) - median(odometry.ahead_s)
-        if abs(apart_s) > CLOCKS_APART_S:
-            way = "later" if apart_s > 0 else "earlier"
-            yield f"{name}: stamps are {abs(apart_s):.3f} s {way} than those of odometry of the same moment; expected one clock"
+        apart_s = median(source.apart_s) if source.apart_s else 0.0
+        if apart_s > AHEAD_MAX_S:
+            yield f"{name}: stamps are {apart_s:.3f} s later than those of odometry that has come by then; expected one clock"
+        elif apart_s < -BEHIND_MAX_S:
+            yield (
+                f"{name}: stamps are {-apart_s:.3f} s earlier than those of odometry that has come by then: it comes late, or"
+                " its clock is another"
+            )

@@ -37,7 +37,12 @@ _IN_PIPE = 1
 """Views in the pipe, besides the one that is being mapped."""
 _MOST_WAITING = 90
 """Views that may wait for odometry: 3 s of a camera."""
+_WORK_SHARE = 0.75
+"""Share of the largest lag that the views which wait may need; the rest is for those that need longer than the mean."""
 _RECENT = 10
+"""Newest gaps of a source that its patience is learnt from, and offsets of its stamps."""
+_RECENT_VIEWS = 30
+"""Newest views whose time on the mapper tells how long the next ones will need."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +69,7 @@ class Source:
         stamp_ns: stamp of the newest one; None before the first.
         heard_s, tick_s: when that one came, by the wall clock, and by that of the input (`Inbox`).
         gaps_s: the latest times between two of them, by the clock of the input.
-        ahead_s: how far the latest stamps are ahead of the wall clock.
+        apart_s: of views, how much later than the newest odometry the latest were stamped when they came.
         back_s: by how much the stamps went back when they last did so by more than a second; 0 if they never did.
         left_out: reason -> number of samples that the mapper did not get.
     """
@@ -74,7 +79,7 @@ class Source:
     heard_s: float = 0.0
     tick_s: float = 0.0
     gaps_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT))
-    ahead_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT))
+    apart_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT))
     back_s: float = 0.0
     left_out: Counter[str] = field(default_factory=Counter)
 
@@ -85,7 +90,6 @@ class Source:
             step_s = (stamp_ns - self.stamp_ns) / NS_PER_S
             self.back_s = -step_s if step_s < -SILENT_MIN_S else self.back_s
         self.count, self.stamp_ns, self.heard_s, self.tick_s = self.count + 1, stamp_ns, now_s, tick_s
-        self.ahead_s.append(stamp_ns / NS_PER_S - now_s)
 
     @property
     def patience_s(self) -> float:
@@ -99,6 +103,7 @@ class Source:
 class _Waiting:
     sample: Sample
     since_s: float  # when it came, by the clock of the input; after its turn, when that was, by the wall clock
+    left_out: bool = False
 
     @property
     def is_view(self) -> bool:
@@ -117,7 +122,7 @@ class Inbox:
     is silent is measured by a clock that runs only while others are heard.
 
     Odometry is never left out for want of time. Views are, where the mapper would lag behind by more than
-    `LiveLimits.lag_s`: then only the newest one is kept.
+    `LiveLimits.lag_s`; the newest one never is.
 
     Attributes:
         sources: name -> what is known about it; `odometry` and the sensors (`scans`, `frames`).
@@ -137,11 +142,12 @@ class Inbox:
         self._unsorted: list[tuple[tuple[int, int], int, _Waiting]] = []
         self._arrivals = 0
         self._due: deque[_Waiting] = deque()
-        self._due_views: deque[_Waiting] = deque()
+        self._due_views: list[_Waiting] = []  # the views of `_due` that are not left out
+        self._given_ns = 0  # stamp of the newest view that was given
         self._passed: tuple[int, int] | None = None  # sort key of the newest sample whose turn has come
         self._untaken = 0  # views in the pipe
         self._unmapped: deque[float] = deque()  # when the turn came of the views that were given and are not mapped yet
-        self._busy_s: deque[float] = deque(maxlen=_RECENT)
+        self._busy_s: deque[float] = deque(maxlen=_RECENT_VIEWS)
 
     def add(self, sample: Sample, now_s: float) -> None:
         """Take in a sample that has come just now."""
@@ -151,6 +157,9 @@ class Inbox:
         source.hear(sample.stamp_ns, now_s, self._tick_s)
         if source.back_s and not jumped_s:
             log.warning("%s: stamps went back by %.3f s to %s s", name, source.back_s, format_stamp(sample.stamp_ns))
+        odometry = self.sources[ODOMETRY]
+        if waiting.is_view and odometry.stamp_ns is not None and self._tick_s - odometry.tick_s < SILENT_MIN_S:
+            source.apart_s.append((sample.stamp_ns - odometry.stamp_ns) / NS_PER_S)
         if self.paused and waiting.is_view:
             source.left_out[PAUSED] += 1
         elif self._passed is not None and sort_key(sample) < self._passed:
@@ -164,15 +173,15 @@ class Inbox:
         """The samples that the mapper should get now, in order."""
         self._sort(now_s)
         taken: list[Sample] = []
-        while self._due and not (self._due[0].is_view and self._untaken >= _IN_PIPE):
-            taken.append(self._give())
+        while self._due and not (self._due[0].is_view and self._untaken >= _IN_PIPE and not self._due[0].left_out):
+            taken += self._give()
         return taken
 
     def flush(self, now_s: float) -> list[Sample]:
         """End of the drive: all remaining samples, in order."""
         while self._unsorted:
             self._pass(_Turn.NOW, now_s)
-        return [self._give() for _ in range(len(self._due))]
+        return [sample for _ in range(len(self._due)) for sample in self._give()]
 
     def done(self, taken: int, mapped: int, busy_s: float, now_s: float) -> None:
         """Note that the mapper has taken views from the pipe, and has mapped some, in `busy_s` seconds."""
@@ -180,8 +189,7 @@ class Inbox:
         self.largest_lag_s = max(self.largest_lag_s, self.lag_s(now_s))
         for _ in range(mapped):
             self._unmapped.popleft()
-        if mapped:
-            self._busy_s.append(busy_s / mapped)
+        self._busy_s.extend([busy_s / max(mapped, 1)] * mapped)
 
     def lag_s(self, now_s: float) -> float:
         """How long the oldest view whose turn has come is waiting for its end on the map."""
@@ -206,14 +214,22 @@ class Inbox:
         while self._unsorted and (turn := self._turn(self._unsorted[0][2])) is not _Turn.LATER:
             self._pass(turn, now_s)
         self._bound()
-        views = self._due_views
-        needed_s = max(self._busy_s, default=0.0) * (len(self._unmapped) + 1)
-        if len(views) > 1 and now_s - views[0].since_s + needed_s > self._limits.lag_s:
-            newest = views.pop()
-            for one in views:
-                self._leave_out(one, SLOW)
-            self._due_views = deque([newest])
-            self._due = deque(one for one in self._due if not one.is_view or one is newest)
+        self._thin(now_s)
+
+    def _thin(self, now_s: float) -> None:
+        """Leave out views that cannot be mapped in time: those that are missed least, and the oldest ones if they are too late.
+
+        The newest one stays. Least missed is the view whose neighbours are nearest to each other, so what stays is spread
+        evenly over the drive.
+        """
+        views, busy_s = self._due_views, self._busy_s
+        mean_s, longest_s, before = sum(busy_s) / max(len(busy_s), 1), max(busy_s, default=0.0), len(self._unmapped)
+        while len(views) > 1 and (before + len(views)) * mean_s > _WORK_SHARE * self._limits.lag_s:
+            stamps = [self._given_ns, *(one.sample.stamp_ns for one in views)]
+            gaps = [after - earlier for earlier, after in zip(stamps, stamps[2:], strict=False)]
+            self._leave_out(views.pop(gaps.index(min(gaps))), SLOW)
+        while len(views) > 1 and now_s - views[0].since_s + (before + 1) * longest_s > self._limits.lag_s:
+            self._leave_out(views.pop(0), SLOW)
 
     def _turn(self, waiting: _Waiting) -> _Turn:
         stamp_ns, own = waiting.sample.stamp_ns, self.sources[source_of(waiting.sample)]
@@ -237,12 +253,16 @@ class Inbox:
         if waiting.is_view:
             self._due_views.append(waiting)
 
-    def _give(self) -> Sample:
+    def _give(self) -> list[Sample]:
+        """The next sample; none if it was left out."""
         waiting = self._due.popleft()
+        if waiting.left_out:
+            return []
         if waiting.is_view:
             self._untaken += 1
-            self._unmapped.append(self._due_views.popleft().since_s)
-        return waiting.sample
+            self._given_ns = waiting.sample.stamp_ns
+            self._unmapped.append(self._due_views.pop(0).since_s)
+        return [waiting.sample]
 
     def _bound(self) -> None:
         """Leave out the oldest view where too many wait for odometry."""
@@ -254,6 +274,7 @@ class Inbox:
             heapq.heapify(self._unsorted)
 
     def _leave_out(self, waiting: _Waiting, why: str) -> None:
+        waiting.left_out = True
         self.sources[source_of(waiting.sample)].left_out[why] += 1
 
 

@@ -121,7 +121,7 @@ class LiveMapper:
         self._numbers = 0
         self._ready: Future[None] = Future()
         self._result: Future[Session] = Future()
-        self._ending = False
+        self._ended_s: float | None = None  # when `finish` was called
         self._drive = _Drive(self._rig, self._limits)
         self._process = process or MappingProcess()
         self._process.begin(Begin(config, self._rig, out, name, overwrite), self._receive, self._fail)
@@ -225,7 +225,7 @@ class LiveMapper:
     def doctor(self) -> list[str]:
         """What is wrong with the input, in sentences: sources that are missing, late, or on another clock; empty if nothing."""
         with self._changed:
-            return doctor.sentences(self._drive.inbox, time.monotonic())
+            return doctor.sentences(self._drive.inbox, self._ended_s or time.monotonic())
 
     # ------------------------------------------------------------------ services
 
@@ -274,7 +274,7 @@ class LiveMapper:
             LiveError: no answer in this time, or the mapping process has ended.
         """
         with self._changed:
-            self._ending = True
+            self._ended_s = self._ended_s or time.monotonic()
             self._changed.notify()
         session: Session = _waited(self._result, timeout_s)
         return session
@@ -300,14 +300,14 @@ class LiveMapper:
     def _state(self) -> str:
         if self._result.done():
             return "failed" if self._result.exception() is not None else "finished"
-        if self._ending:
+        if self._ended_s is not None:
             return "finishing"
         return "paused" if self._drive.inbox.paused else "mapping"
 
     def _require_running(self) -> None:
         if self._result.done():
             self._result.result()
-        if self._ending:
+        if self._ended_s is not None:
             raise LiveError("the session is finished; make a new LiveMapper")
 
     def _ask(self, what: str, *arguments: Any, timeout_s: float | None) -> Any:
@@ -333,13 +333,13 @@ class LiveMapper:
 
     def _next(self) -> list[Any]:
         """The messages to send now."""
-        now_s, asked = time.monotonic(), self._outgoing
+        now_s, asked, ending = time.monotonic(), self._outgoing, self._ended_s is not None
         self._outgoing = []
-        samples = self._drive.inbox.flush(now_s) if self._ending else self._drive.inbox.take(now_s)
+        samples = self._drive.inbox.flush(now_s) if ending else self._drive.inbox.take(now_s)
         left_out = self._drive.inbox.left_out
         news = [Dropped(*key, number) for key, number in (left_out - self._told).items()]
         self._told = left_out
-        return [*asked, *news, *samples, *([End()] if self._ending else [])]
+        return [*asked, *news, *samples, *([End()] if ending else [])]
 
     def _receive(self, message: Any) -> None:
         """Take in a message of the mapping process."""

@@ -149,6 +149,10 @@ def test_a_machine_that_is_too_slow_keeps_up_by_leaving_out_views(lag_s, period_
     assert sum(isinstance(sample, SelfMotion) for sample in got) == 3000
     assert got == sorted(got, key=sort_key)
     assert sum(isinstance(sample, LaserScan) for sample in got) == 600 - dropped
+    kept = np.array([sample.stamp_ns / 1e9 for sample in got if isinstance(sample, LaserScan)])
+    gaps = np.diff(kept) / period_s
+    assert gaps.max() <= 8.0  # not one gap of all that waited, which are 10 or 20
+    assert gaps[len(gaps) // 4 : -20].mean() == pytest.approx(3.0, abs=0.3)
     assert any(f"scans: {dropped} of 600 left out" in one for one in sentences(inbox, 60.0))
 
 
