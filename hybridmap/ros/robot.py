@@ -218,6 +218,8 @@ class RobotNode:
                 self._add(mapper, sample)
             self._early.clear()
             self._mapper = mapper
+            if self._newest is not None:
+                self._show_pose(mapper, self._newest[0])
         self._ros.inform(f"mapping into {options.out}")
 
     def _give(self, sample: Sample) -> None:

@@ -1,0 +1,132 @@
+"""A node maps what a robot publishes into the map of a bag of it, and publishes and serves that."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybridmap import session
+from hybridmap.config import Config
+from hybridmap.errors import OutputError, RosError, StreamError
+from hybridmap.geometry import compose
+from hybridmap.live import LiveLimits
+from hybridmap.ros.robot import NodeOptions, RobotNode
+from hybridmap.streams.base import SelfMotion
+from hybridmap.streams.laser import LaserScan
+from hybridmap.streams.rosbag import BagStream
+from tests.ros.robots import PlayedRobot
+from tests.streams.recordings import NS, Recording
+from tests.streams_for_tests import BEARINGS, RoomDrive
+
+NO_LIMIT = LiveLimits(lag_s=600.0)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory) -> Path:
+    """Laps in a room as a ROS 1 bag."""
+    recording, step = Recording(True), float(BEARINGS[1] - BEARINGS[0])
+    recording.transform("base_link", "laser", (0.1, 0.0, 0.3))
+    for sample in RoomDrive(laps=1.3, bias_rad_per_m=0.05):
+        stamp_ns = sample.stamp_ns + 100 * NS
+        if isinstance(sample, SelfMotion):
+            recording.odometry(stamp_ns, *sample.pose_odom_robot)
+        elif isinstance(sample, LaserScan):
+            recording.scan(stamp_ns, sample.ranges_m, angle_min=float(BEARINGS[0]), step=step, low=0.05, high=30.0)
+    return recording.write(tmp_path_factory.mktemp("bag") / "room.bag")
+
+
+def pose_of(contents) -> np.ndarray:
+    p, q = contents["position"], contents["orientation"]
+    return np.array([p["x"], p["y"], 2 * np.arctan2(q["z"], q["w"])])
+
+
+def transform_of(contents) -> np.ndarray:
+    p, q = contents["transform"]["translation"], contents["transform"]["rotation"]
+    return np.array([p["x"], p["y"], 2 * np.arctan2(q["z"], q["w"])])
+
+
+def read_by_map_server(yaml: Path) -> list[int]:
+    """Cells of the files of a map, as map_server publishes them (trinary)."""
+    words = dict(line.split(": ", 1) for line in yaml.read_text().splitlines())
+    head, size, _, pixels = (yaml.parent / words["image"]).read_bytes().split(b"\n", 3)
+    assert head == b"P5"
+    width, height = map(int, size.split())
+    occupied = (255 - np.frombuffer(pixels, np.uint8).reshape(height, width)[::-1].astype(float)) / 255
+    cells = np.full(occupied.shape, -1)
+    cells[occupied > float(words["occupied_thresh"])] = 100
+    cells[occupied < float(words["free_thresh"])] = 0
+    return cells.ravel().tolist()
+
+
+def test_the_map_is_that_of_the_bag_and_is_published_and_served(bag: Path, tmp_path: Path) -> None:
+    recorded = session.run(BagStream(bag, Config.load("laser")), Config.load("laser"), tmp_path / "recorded")
+    robot, out = PlayedRobot(bag), tmp_path / "live"
+    node = RobotNode(robot, NodeOptions(out, map_every_s=0.5, limits=NO_LIMIT))
+    assert robot.services == {}
+    node.start()
+    with pytest.raises(RosError, match="not mapping yet"):
+        robot.services["~pause"].does(False)
+    robot.wait_for(lambda: "/scan" in robot.takers)
+    robot.play(times_real_time=20.0)
+    robot.wait_for(lambda: bool(robot.published["~path"] and robot.published["map"]))
+    mapped = robot.services["dynamic_map"].does(False)["map"]
+    saved = robot.services["~save_map"].does(False)
+    assert saved["success"], saved
+    assert read_by_map_server(tmp_path / "live.yaml") == mapped["data"].tolist()
+    assert robot.services["~serialize_map"].does(False)["success"]
+    assert robot.services["~pause"].does(False) == robot.services["~resume"].does(False) == {}
+    for name, value in (("~deserialize_map", False), ("~set_localization_mode", True)):
+        refused = robot.services[name].does(value)
+        assert not refused["success"]
+        assert "not supported yet" in refused["message"]
+    robot.takers["initialpose"](b"", None)
+    assert any("initialpose" in warning for warning in robot.warnings)
+    robot.wait_for(lambda: len(robot.published["/tf"]) > 20)
+    finished = node.finish()
+    assert finished.head["graph_hash"] == recorded.head["graph_hash"]
+    assert finished.head["stream"] == recorded.head["stream"]
+    check_published(robot, bag)
+
+
+def check_published(robot: PlayedRobot, bag: Path) -> None:
+    """The correction on /tf, composed with the odometry, is the pose on the map."""
+    (last,) = robot.published["/tf"][-1]["transforms"]
+    assert (last["header"]["frame_id"], last["child_frame_id"]) == ("map", "odom")
+    stamps_ns = [message["transforms"][0]["header"]["stamp"].ns for message in robot.published["/tf"]]
+    assert stamps_ns == sorted(stamps_ns)
+    raw, shown = transform_of(robot.published["~map_to_odom"][-1]), robot.published["~pose"]
+    odometry = {
+        sample.stamp_ns: sample.pose_odom_robot for sample in BagStream(bag, Config()) if isinstance(sample, SelfMotion)
+    }
+    assert all(one["header"]["stamp"].ns in odometry for one in shown)
+    last_pose = shown[-1]
+    expected = compose(raw, odometry[last_pose["header"]["stamp"].ns])
+    assert np.allclose(pose_of(last_pose["pose"]["pose"])[:2], expected[:2], atol=0.05)
+    assert robot.published["map_metadata"][-1] == {**robot.published["map"][-1]["info"]}
+
+
+def test_a_node_without_a_sensor_says_what_it_waits_for_and_writes_nothing(bag: Path, tmp_path: Path) -> None:
+    robot = PlayedRobot(bag)
+    node = RobotNode(robot, NodeOptions(tmp_path / "s", overrides={"sensors.scan_topic": "/front"}))
+    node.start()
+    robot.wait_for(lambda: bool(robot.published["/diagnostics"]))
+    time.sleep(0.7)
+    assert "/front" in node.missing[0]
+    assert "/scan" in node.missing[0]
+    with pytest.raises(StreamError, match=r"nothing was mapped: .*'/front'"):
+        node.finish()
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_folder_that_holds_something_ends_the_node_with_the_reason(bag: Path, tmp_path: Path) -> None:
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / "letters.txt").write_text("dear")
+    robot = PlayedRobot(bag)
+    node = RobotNode(robot, NodeOptions(tmp_path / "s"))
+    node.start()
+    robot.wait_for(lambda: "/scan" in robot.takers)
+    robot.play(times_real_time=20.0)
+    assert node.ended.wait(60.0)
+    with pytest.raises(OutputError):
+        node.finish()
