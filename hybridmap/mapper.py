@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hybridmap.backends.base import Backend
-from hybridmap.backends.driver import Ensemble
+from hybridmap.backends.ensemble import Ensemble
 from hybridmap.calibration.online import OdometryWatch
 from hybridmap.config import Config
 from hybridmap.edge_book import EdgeBook, Position, Update

@@ -46,6 +46,17 @@ class Kind:
     useful_unfinished: bool = False
 
 
+@dataclass(slots=True)
+class Unfinished:
+    """The output that is being written, as given by `Held.replaced`.
+
+    Attributes:
+        worth_keeping: on an error it stays, with the old one whole in `PREVIOUS`, as after a kill. Ctrl-C does not ask for it.
+    """
+
+    worth_keeping: bool = False
+
+
 @dataclass(frozen=True, slots=True)
 class Held:
     """A locked folder, as given by `held`."""
@@ -54,31 +65,45 @@ class Held:
     kind: Kind
 
     @contextmanager
-    def replaced(self) -> Iterator[None]:
+    def replaced(self) -> Iterator[Unfinished]:
         """Context in which a new output is written while the old one is moved aside.
 
-        On an error the old output is restored; else it is deleted at the end.
+        On an error the old output is restored, unless the new one is worth keeping; else it is deleted at the end.
         """
         with _named(self.path):
             self._set_aside()
+        unfinished = Unfinished()
         try:
-            yield
+            yield unfinished
         except BaseException as error:
-            new = not (self.path / PREVIOUS).is_dir()
-            if not (new and self.kind.useful_unfinished and isinstance(error, KeyboardInterrupt)):
+            if not self._stays(unfinished, error):
                 self._restore()
             raise
+        self._drop_previous()
+
+    @contextmanager
+    def resumed(self) -> Iterator[Unfinished]:
+        """Context in which an unfinished output is gone on with. It stays on any error; an old one is deleted at the end."""
+        yield Unfinished(worth_keeping=True)
+        self._drop_previous()
+
+    def _stays(self, unfinished: Unfinished, error: BaseException) -> bool:
+        if isinstance(error, KeyboardInterrupt):
+            return self.kind.useful_unfinished and not (self.path / PREVIOUS).is_dir()
+        return unfinished.worth_keeping
+
+    def _drop_previous(self) -> None:
         if (self.path / PREVIOUS).is_dir():
             (self.path / PREVIOUS).rename(self.path / _DROPPED)  # from here on a kill does not bring it back
             shutil.rmtree(self.path / _DROPPED, ignore_errors=True)
 
-    def _admit(self, *, overwrite: bool) -> None:
+    def _admit(self, *, overwrite: bool, resume: bool) -> None:
         """Repair what a killed run left, and refuse a folder that must not be written to."""
         previous = self.path / PREVIOUS
         _refuse_strangers(self.path, self.kind, previous, self.path / _MOVING)
         self._move_back()
         shutil.rmtree(self.path / _DROPPED, ignore_errors=True)
-        if not self.kind.continued:
+        if not (self.kind.continued or resume):
             _refuse_own(self.path, self.kind, overwrite=overwrite)
         if overwrite and self.kind.is_ours(previous):
             self._restore()  # of the two, the one set aside is known to be whole
@@ -119,7 +144,7 @@ class Held:
 
 
 @contextmanager
-def held(folder: Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Held]:
+def held(folder: Path, kind: Kind, *, overwrite: bool = False, resume: bool = False) -> Iterator[Held]:
     """Context in which a folder for an output of this kind is made if needed, and locked against other runs.
 
     It gives the folder as `Held`; what a killed run left in it is repaired first. If the folder was made, and is empty at the
@@ -129,6 +154,7 @@ def held(folder: Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Held]
         folder: the folder.
         kind: what may be in it.
         overwrite: whether it may hold an output already. That stays until `Held.replaced` replaces it.
+        resume: whether it may hold an unfinished output, for `Held.resumed`.
 
     Raises:
         OutputError: the folder is a file, holds something else, holds an output of this kind without `overwrite`, is in use by
@@ -140,7 +166,7 @@ def held(folder: Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Held]
     with ExitStack() as stack:
         with _named(folder):
             stack.enter_context(_locked(folder, folder))
-            place._admit(overwrite=overwrite)
+            place._admit(overwrite=overwrite, resume=resume)
         yield place
 
 

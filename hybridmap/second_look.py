@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.backends.base import Solution
-from hybridmap.backends.driver import Ensemble
+from hybridmap.backends.ensemble import Ensemble
 from hybridmap.backends.judging.breaks import (
     LEAST_LOOPS,
     Freed,

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from hybridmap.backends.base import ODOMETRY
 from hybridmap.calibration.clock import ClockOffset
+from hybridmap.checkpoints import Checkpoints, Drive, resumable
 from hybridmap.conclusion import figures_of, head_of
 from hybridmap.config import Config
-from hybridmap.errors import StreamError, counted
+from hybridmap.errors import HybridMapError, StoreError, StreamError, counted
 from hybridmap.mapper import Mapper
 from hybridmap.metrics import Metric
+from hybridmap.output import Unfinished
 from hybridmap.recorder import Recorder
 from hybridmap.store import MapStore
 from hybridmap.store.session_folder import SessionFolder
@@ -52,40 +55,87 @@ def run(
     out: Path,
     *,
     overwrite: bool = False,
+    resume: bool = False,
     progress: Progress | None = None,
     opened: Opened | None = None,
 ) -> Session:
     """Map a stream into a session folder.
 
-    The map file is written as the run proceeds: a run that is killed leaves a readable map up to its last node. On any
-    error what this run wrote is removed, and an overwritten session is restored. Ctrl-C keeps what was written, unless it
-    overwrites a session.
+    The map file is written as the run proceeds: a run that is killed leaves a readable map up to its last node. An error
+    before the first node leaves nothing, and an overwritten session is restored. After it what was mapped stays, marked as
+    broken off with the reason, and an overwritten session lies whole in `.previous`. Ctrl-C keeps what was written, unless it
+    overwrites a session. `resume` goes on with what stayed, and comes to the same map as an unbroken run.
 
     Args:
         stream: the samples.
         config: every setting; saved resolved.
         out: the session folder itself.
         overwrite: replace a session that exists.
+        resume: go on with a session whose run did not end; map from the beginning, with a warning, if there is no checkpoint
+            that can be used. A session that ended is returned as it is.
         progress: called with (observations done, observations expected; None if unknown).
         opened: called with the mapper and the map file before the first sample, for a stream that shows what is mapped.
 
     Raises:
         StreamError: the stream is damaged or unordered, or has no odometry and views to map.
         OutputError: the folder cannot be used, or another run is writing there.
+        StoreError: the session to resume is of another source, configuration or version.
         ConfigError, BackendError: the configuration names a sensor or back-end that does not exist.
     """
-    mapper = Mapper(config, stream.rig)
     folder = SessionFolder(out)
-    with folder.writing(overwrite=overwrite):
-        folder.write_config(config.to_yaml())
-        if stream.groundtruth is not None:
-            folder.write_groundtruth(stream.groundtruth)  # before the drive, so that a killed run can be evaluated
-        with MapStore.create(folder.path, config.to_yaml(), stream.rig, stream.name) as store:
-            recorder = Recorder(mapper, store)
+    if resume and folder.ended:
+        log.warning("%s: the session is finished: there is nothing to resume", out)
+        read = folder.read_metrics()
+        return Session(folder, read.head, read.metrics)
+    before = resumable(folder, stream, config) if resume else None
+    mapper = Mapper(config, stream.rig) if before is None else before.mapper
+    with folder.writing(overwrite=overwrite or (resume and before is None), resume=before is not None) as unfinished:
+        if before is None:
+            folder.write_config(config.to_yaml())
+            if stream.groundtruth is not None:
+                folder.write_groundtruth(stream.groundtruth)  # before the drive, so that a killed run can be evaluated
+            store = MapStore.create(folder.path, config.to_yaml(), stream.rig, stream.name)
+        else:
+            store = MapStore.resume(folder.path)
+        with store, _kept(folder, store, mapper, unfinished):
+            drive = before or Drive(mapper, Recorder(mapper, store))
+            if before is not None:
+                before.rewind(store)
+                log.info("%s: resumed at node %d", out, len(mapper.map) - 1)
             if opened is not None:
                 opened(mapper, store)
-            _drive(stream, mapper, recorder, progress)
-            return _conclude(stream, mapper, recorder, folder)
+            checkpoints = Checkpoints(folder, stream, config)
+            _drive(stream, drive, checkpoints, progress)
+            session = _conclude(stream, mapper, drive.recorder, folder)
+            store.close()
+        checkpoints.remove()
+        return session
+
+
+@contextmanager
+def _kept(folder: SessionFolder, store: MapStore, mapper: Mapper, unfinished: Unfinished) -> Iterator[None]:
+    """Context in which an error marks the map as broken off, if anything is on it."""
+    try:
+        yield
+    except BaseException as error:
+        unfinished.worth_keeping = len(mapper.map) > 0
+        with suppress(StoreError):  # the disk may be full: the map up to the last commit is safe all the same
+            store.break_off(_reason(error))
+            unfinished.worth_keeping = store.nodes > 0
+        with suppress(StoreError):
+            store.close()
+        if unfinished.worth_keeping and not isinstance(error, KeyboardInterrupt):
+            log.warning("%s: what was mapped is kept; %s", folder.path, folder.what_to_do)
+        raise
+
+
+def _reason(error: BaseException) -> str:
+    """Why a run was broken off, on one line."""
+    if isinstance(error, HybridMapError):
+        return " ".join(str(error).split())
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    return f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
 
 
 def first_look(stream: Stream, config: Config) -> ClockOffset:
@@ -108,18 +158,20 @@ def first_look(stream: Stream, config: Config) -> ClockOffset:
     return replace(clock.offset, used_s=0.0)
 
 
-def _drive(stream: Stream, mapper: Mapper, recorder: Recorder, progress: Progress | None) -> None:
-    observations = 0
-    for sample in stream:
-        for update in mapper.add(sample):
+def _drive(stream: Stream, drive: Drive, checkpoints: Checkpoints, progress: Progress | None) -> None:
+    mapper, recorder = drive.mapper, drive.recorder
+    for sample in drive.samples(stream):
+        updates = mapper.add(sample)
+        for update in updates:
             recorder.record(update)
-        if isinstance(sample, Observation):
-            observations += 1
-            if progress is not None:
-                progress(observations, stream.expected_observations)
+        if progress is not None and isinstance(sample, Observation):
+            progress(drive.observations, stream.expected_observations)
+        if any(update.new_node is not None for update in updates):
+            checkpoints.follow(drive)
     for name, (gone, stated) in stream.report.lost.items():
         of = counted(stated, "message")
         log.warning("%s: %s: %d of %s damaged or missing, left out", stream.name, name, gone, of)
+    checkpoints.before_the_end(drive)
     for update in mapper.finish():
         recorder.record(update)
     recorder.rewrite_odometry()

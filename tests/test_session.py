@@ -141,16 +141,34 @@ def test_a_session_is_not_overwritten_by_chance_but_on_demand(tmp_path):
     assert (tmp_path / "s" / "notes.txt").read_text() == "mine"
 
 
-def test_bad_input_leaves_nothing_behind_and_loses_nothing(tmp_path):
+def test_an_error_before_the_first_node_leaves_nothing_behind_and_loses_nothing(tmp_path):
     config = Config.load("laser", {"vision.sensor": "none"})
     with pytest.raises(StreamError, match="NaN"):
-        session.run(RoomDrive(laps=0.5, nan_at=20), config, tmp_path / "new")
+        session.run(RoomDrive(laps=0.5, nan_at=0), config, tmp_path / "new")
     assert not (tmp_path / "new").exists()
     kept = session.run(RoomDrive(laps=0.2, with_scans=False), config, tmp_path / "old").head["graph_hash"]
     with pytest.raises(StreamError, match="NaN"):
-        session.run(RoomDrive(laps=0.5, nan_at=20), config, tmp_path / "old", overwrite=True)
+        session.run(RoomDrive(laps=0.5, nan_at=0), config, tmp_path / "old", overwrite=True)
     with MapStore.open(tmp_path / "old") as store:
         assert graph_hash(store.map()) == kept
+
+
+def test_an_error_late_in_a_drive_keeps_what_was_mapped_and_the_session_before(tmp_path, caplog):
+    config = Config.load("laser", {"vision.sensor": "none"})
+    kept = session.run(RoomDrive(laps=0.2, with_scans=False), config, tmp_path / "s").head["graph_hash"]
+    with pytest.raises(StreamError, match="NaN"):
+        session.run(RoomDrive(laps=0.5, nan_at=50), config, tmp_path / "s", overwrite=True)
+    assert "--resume" in caplog.text
+    assert f"{tmp_path}/s/.previous" in caplog.text
+    with MapStore.open(tmp_path / "s") as store:
+        assert len(store.map()) > 3
+        assert not store.ended
+        assert "NaN" in store.broken_off
+    with MapStore.open(tmp_path / "s" / ".previous") as store:
+        assert graph_hash(store.map()) == kept
+    caplog.clear()
+    evaluate_session(tmp_path / "s")
+    assert "broken off (odometry at stamp 5.000" in caplog.text
 
 
 class Interrupted(RoomDrive):
@@ -186,16 +204,12 @@ class TooLarge(RoomDrive):
             yield sample
 
 
-def test_a_failure_of_any_kind_brings_the_old_session_back(tmp_path):
-    config = Config.load("laser", {"vision.sensor": "none"})
-    kept = session.run(RoomDrive(laps=0.2, with_scans=False), config, tmp_path / "s").head["graph_hash"]
-    for folder in ("s", "new"):
-        with pytest.raises(MemoryError):
-            session.run(TooLarge(), config, tmp_path / folder, overwrite=True)
+def test_a_failure_of_any_kind_keeps_what_was_mapped(tmp_path):
+    with pytest.raises(MemoryError):
+        session.run(TooLarge(), Config.load("laser", {"vision.sensor": "none"}), tmp_path / "s")
     with MapStore.open(tmp_path / "s") as store:
-        assert graph_hash(store.map()) == kept
-        assert store.ended
-    assert [entry.name for entry in tmp_path.iterdir()] == ["s"]
+        assert len(store.map()) > 3
+        assert store.broken_off == "MemoryError"
 
 
 def test_nothing_to_map_is_said():

@@ -69,6 +69,16 @@ Solver = Callable[[PoseGraph, Array], Outcome]
 """Works on a graph from poses (N, 3) of its nodes; a RuntimeError says that it failed."""
 
 
+class Remembering(Protocol):
+    """A solver that keeps state from update to update, in a form of its own."""
+
+    def memory(self) -> Any:
+        """The state as plain values and arrays."""
+
+    def remember(self, memory: Any) -> None:
+        """Take over the state that `memory` returned: all further outcomes have the same bits."""
+
+
 @dataclass(frozen=True, slots=True)
 class SolveReport:
     """The report of a solution.

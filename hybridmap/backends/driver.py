@@ -1,29 +1,37 @@
-"""`Driver` makes a back-end of a solver: it follows a growing graph. `Ensemble` runs several back-ends on one graph.
+"""`Driver` makes a back-end of a solver: it follows a growing graph.
 
 A solver is a function from (graph, initial poses) to an outcome.
 """
 
 from __future__ import annotations
 
-import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
-from hybridmap.backends.base import Backend, Outcome, Solution, Solver, SolveReport, SolveStatus, SupportsPoseGraph
+from hybridmap.backends.base import (
+    Backend,
+    Outcome,
+    Remembering,
+    Solution,
+    Solver,
+    SolveReport,
+    SolveStatus,
+    SupportsPoseGraph,
+)
 from hybridmap.backends.judging.clusters import rejected_clusters
 from hybridmap.backends.objective import chi2, gate_of, hanging_nodes, squared_norms, total, unit_variance, weak_edges
-from hybridmap.backends.registry import create
+from hybridmap.backends.registry import unfiltered
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError, counted
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.order import in_driving_order
 from hybridmap.graph.paths import extend, require_connected
 from hybridmap.graph.pose_graph import Change, PoseGraph, difference, prefix
-from hybridmap.metrics import StageClock
 
 _ROUNDING = 1e-9  # of chi2: a chain without loops has none, and no solver finds less
 
@@ -60,6 +68,7 @@ class Driver:
         place: Extend = extend,
         most_rise: float = np.inf,
         softens: bool = False,
+        remembers: Remembering | None = None,
     ) -> None:
         """Make a back-end.
 
@@ -77,6 +86,7 @@ class Driver:
             most_rise: relative rise of chi2 above that of the start beyond which a solution is refused, and an update is
                 called `stalled`.
             softens: the solver puts the configured kernel on odometry and registration edges; outliers are reported.
+            remembers: what keeps the state of `follow` between updates; None: it keeps none.
         """
         self._name, self._config = name, config
         self._solve, self._follow, self._last, self._onward = solve, follow or solve, last, onward
@@ -88,6 +98,18 @@ class Driver:
         self._weights: dict[int, float] = {}
         self._rejected: tuple[int, ...] = ()
         self._waiting = 0  # loops and registrations that no solver has seen
+        self._remembers = remembers
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """How to make this back-end again: by its name and settings, and with the state that it has reached."""
+        memory = None if self._remembers is None else self._remembers.memory()
+        state = self._graph, self._poses, self._squared, self._weights, self._rejected, self._waiting, memory
+        return restored, (self._name, self._config), state
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self._graph, self._poses, self._squared, self._weights, self._rejected, self._waiting, memory = state
+        if self._remembers is not None:
+            self._remembers.remember(memory)
 
     @property
     def name(self) -> str:
@@ -260,6 +282,18 @@ class Driver:
         return Solution(outcome.poses, report, outcome.calibrated)
 
 
+def restored(name: str, config: BackendsConfig) -> Driver:
+    """The back-end of a name, as `Driver.__reduce__` asks for it.
+
+    Raises:
+        BackendError: no such name, or what it names is no `Driver`.
+    """
+    made = unfiltered(name, config)
+    if not isinstance(made, Driver):
+        raise BackendError(f"back-end {name!r}: cannot be restored; expected one of ours")
+    return made
+
+
 def replay(backend: Backend, graph: PoseGraph) -> Iterator[Solution]:
     """Give a graph to `Backend.update` node by node, as the robot made it; yields the solution after every node.
 
@@ -287,87 +321,3 @@ def first_line(error: BaseException) -> str:
     """The first line of an error's text, or the name of its class if it has none."""
     text = str(error).strip()
     return text.splitlines()[0] if text else type(error).__name__
-
-
-log = logging.getLogger(__name__)
-
-
-class Ensemble:
-    """Gives the same graph to several back-ends. A back-end that fails is reported and keeps its last poses.
-
-    Attributes:
-        names: names of the back-ends, in order.
-        primary: name of the first back-end, whose map the mapper uses.
-        solutions: name -> latest solution of the back-end.
-        failures: name -> error, for the back-ends whose latest call failed.
-    """
-
-    def __init__(self, config: BackendsConfig, clock: StageClock, backends: Sequence[str | Backend] | None = None) -> None:
-        """Create the back-ends.
-
-        Args:
-            config: their settings, and their names.
-            clock: gets a stage `backend/<name>` for each.
-            backends: names, or back-ends in a fresh state, instead of those that `config` names.
-
-        Raises:
-            BackendError: an unknown name, no name, or a name that is given twice.
-        """
-        made = [create(backend, config) for backend in (config.names if backends is None else backends)]
-        self.solutions: dict[str, Solution] = {}
-        self.failures: dict[str, str] = {}
-        self._clock = clock
-        self._backends: dict[str, Backend] = {backend.name: backend for backend in made}
-        if not made or len(self._backends) < len(made):
-            raise BackendError(f"back-ends: expected one or more, each once, found {[backend.name for backend in made]}")
-        self.names = tuple(self._backends)
-        self.primary = self.names[0]
-
-    def poses(self, graph: PoseGraph, name: str | None = None) -> Array:
-        """Latest poses (N, 3) by the back-end of this name (None: the primary), m and rad.
-
-        Nodes newer than its solution are placed by their best edges (`graph.paths.extend`).
-
-        Raises:
-            BackendError: there is no back-end of this name here.
-            GraphError: a node has no path to the others.
-        """
-        name = name or self.primary
-        if name not in self._backends:
-            raise BackendError(f"back-end {name!r}: is not in use; expected one of {', '.join(self.names)}")
-        solution = self.solutions.get(name)
-        return extend(graph, solution.poses if solution is not None else graph.initial[:1])
-
-    @property
-    def rejected(self) -> tuple[int, ...]:
-        """Numbers of the edges that the primary gave no weight in its latest solution."""
-        solution = self.solutions.get(self.primary)
-        return () if solution is None else tuple(solution.report.rejected_edge_ids)
-
-    def update(self, graph: PoseGraph) -> None:
-        """Let every back-end follow the graph; `solutions` and `failures` say how that went."""
-        for name, backend in self._backends.items():
-            self._run(name, backend, graph, final=False)
-
-    def finish(self, graph: PoseGraph) -> None:
-        """Let every back-end compute its final solution; `solutions` and `failures` say how that went."""
-        for name, backend in self._backends.items():
-            self._run(name, backend, graph, final=True)
-
-    def trial(self, graph: PoseGraph) -> Solution | None:
-        """Solve another graph by the primary back-end, whose own state stays as it is; None if it fails."""
-        try:
-            with self._clock.stage(f"backend/{self.primary}"):
-                return self._backends[self.primary].solve(graph)
-        except BackendError:
-            return None
-
-    def _run(self, name: str, backend: Backend, graph: PoseGraph, *, final: bool) -> None:
-        try:
-            with self._clock.stage(f"backend/{name}"):
-                self.solutions[name] = backend.finish(graph) if final else backend.update(graph)
-            self.failures.pop(name, None)
-        except BackendError as error:
-            if name not in self.failures:
-                log.warning("%s failed at node %d and keeps its last poses: %s", name, graph.n_nodes - 1, error)
-            self.failures[name] = str(error)

@@ -85,10 +85,20 @@ def create(backend: str | Backend, config: BackendsConfig | None = None) -> Back
     if not isinstance(backend, str):
         return backend
     config = config or BackendsConfig()
-    made = _TABLE[backend](config)
-    if made.name != backend:
-        raise BackendError(f"back-end {backend!r}: has the name {made.name!r}; expected the name under which it is registered")
+    made = unfiltered(backend, config)
     return ConsistentBackend(made, config) if config.consistency.enabled and backend != ODOMETRY else made
+
+
+def unfiltered(name: str, config: BackendsConfig) -> Backend:
+    """Make a back-end by its name, in its initial state, without the pre-filter.
+
+    Raises:
+        BackendError: no such name; the message lists the known names.
+    """
+    made = _TABLE[name](config)
+    if made.name != name:
+        raise BackendError(f"back-end {name!r}: has the name {made.name!r}; expected the name under which it is registered")
+    return made
 
 
 def is_sequential(name: str) -> bool:

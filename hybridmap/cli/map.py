@@ -10,7 +10,7 @@ import typer
 
 from hybridmap.cli.options import OUT, SEED, AsJson, OdometryFile, SensorSetting, Source, Topic, sensor_settings
 from hybridmap.cli.show import emit, progress
-from hybridmap.errors import EvaluationError
+from hybridmap.errors import ConfigError, EvaluationError
 
 log = logging.getLogger(__name__)
 
@@ -35,8 +35,16 @@ _SkipDamaged = Annotated[
     bool,
     typer.Option(
         "--skip-damaged",
-        help="Skip damaged scans and pictures, and count them as lost. Without it the first one is an error, and no session is"
-        " written.",
+        help="Skip damaged scans and pictures, and count them as lost. Without it the first one is an error, which breaks the"
+        " session off.",
+    ),
+]
+_Resume = Annotated[
+    bool,
+    typer.Option(
+        "--resume",
+        help="Go on with the session of a run that was killed or broken off, from its last checkpoint, to the same map as an"
+        " unbroken run. Give the same source and options as before.",
     ),
 ]
 _Onto = Annotated[
@@ -74,16 +82,21 @@ def map_source(
     strict: _Strict = False,
     onto: _Onto = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
+    resume: _Resume = False,
     as_json: AsJson = False,
 ) -> None:
     """Map a recording or a simulated world into a session folder.
 
     The folder holds the map (map.db), the trajectories, the resolved configuration, metrics.json with the verdict on the map,
     and the page report.html. Messages that the recording states to hold but that cannot be read are left out, warned of, and
-    counted in metrics.json (`lost`). On an error nothing is written, and a session that was to be replaced stays. Ctrl-C does
-    the same, but in a new folder the map so far is kept.
+    counted in metrics.json (`lost`). On an error what was mapped is kept, and a session that was to be replaced lies in
+    DIR/.previous; an error before the first node changes nothing. Ctrl-C keeps the map in a new folder, and restores a
+    session that was to be replaced.
     """
     from hybridmap.cli.choose import choose, parse_settings
+
+    if resume and overwrite:
+        raise ConfigError("--resume and --overwrite: one goes on with the session that the other replaces; give one")
 
     topics = sensor_settings(
         source,
@@ -105,7 +118,7 @@ def map_source(
             joined = map_onto(chosen.stream, chosen.config, onto, out, overwrite=overwrite, progress=advance)
         head, metrics = joined.head, joined.metrics
     else:
-        head, metrics = map_and_report(chosen.stream, chosen.config, out, overwrite=overwrite)
+        head, metrics = map_and_report(chosen.stream, chosen.config, out, overwrite=overwrite, resume=resume)
     emit(head, metrics, as_json=as_json, title=f"{out}: {chosen.stream.name}")
     if not as_json and onto is None:
         typer.echo(f"page: {out / 'report.html'}")
@@ -113,11 +126,13 @@ def map_source(
         raise typer.Exit(LOST)
 
 
-def map_and_report(stream: Any, config: Any, out: Path, *, overwrite: bool) -> tuple[dict[str, Any], list[Any]]:
+def map_and_report(
+    stream: Any, config: Any, out: Path, *, overwrite: bool, resume: bool = False
+) -> tuple[dict[str, Any], list[Any]]:
     """Map a stream into the session folder `out`, evaluate the map if ground truth is known, and write the page.
 
-    With `overwrite` a session that exists is replaced. What `session.run` raises is passed on; that the map could not be
-    evaluated is only logged.
+    With `overwrite` a session that exists is replaced, with `resume` one that did not end is gone on with. What `session.run`
+    raises is passed on; that the map could not be evaluated is only logged.
 
     Returns:
         The two parts of `metrics.json`: the facts about the run, and the list of metrics.
@@ -127,7 +142,7 @@ def map_and_report(stream: Any, config: Any, out: Path, *, overwrite: bool) -> t
     from hybridmap.report import write_report
 
     with progress(f"mapping {stream.name}") as advance:
-        finished = session.run(stream, config, out, overwrite=overwrite, progress=advance)
+        finished = session.run(stream, config, out, overwrite=overwrite, resume=resume, progress=advance)
     if stream.groundtruth is not None:
         try:
             evaluate_session(finished.folder.path)

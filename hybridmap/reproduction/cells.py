@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from hybridmap import provenance
 from hybridmap.config import Config
 from hybridmap.geometry import Array, between
 from hybridmap.metrics import Metric
@@ -18,7 +19,6 @@ from hybridmap.neural import PathIntegrator
 from hybridmap.output import write_text
 from hybridmap.simulation import SimulatedStream
 from hybridmap.simulation.stream import ODOMETRY_RATE_HZ
-from hybridmap.study import provenance
 from hybridmap.verification import Scale, rows_of, verification
 from hybridmap.verification.page import figures_of
 from hybridmap.verification.rows import recurrence_verdict

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +28,7 @@ ODOMETRY_RATE_HZ = 30.0
 """Odometry messages a second."""
 _START_NS = 1_700_000_000 * NS_PER_S
 _WHEELS, _CAMERA, _LASER = range(3)
+_COUNTED = ("odometry", "frames", "scans")
 _CARRIED_SHARE = 0.95  # of the distance that was asked for; a shorter carry is said
 
 
@@ -127,20 +129,29 @@ class SimulatedStream:
 
     def __iter__(self) -> Iterator[Sample]:
         """Yield odometry, frames and scans by stamp; at equal stamps in this order."""
-        self._report = StreamReport(remarks=self._remarks())
-        observations = self._observations()
-        waiting = next(observations, None)
-        for stamp, pose in zip(self._odometry.stamps_ns, self._odometry.poses, strict=True):
-            while waiting is not None and waiting.stamp_ns < stamp:
-                yield waiting
-                waiting = next(observations, None)
-            self._report.count("odometry")
-            yield SelfMotion(int(stamp), pose.copy())
-        while waiting is not None:
-            yield waiting
-            waiting = next(observations, None)
+        return self.onward(0, StreamReport(remarks=self._remarks()))
 
-    def _observations(self) -> Iterator[Observation]:
+    def onward(self, taken: int, report: StreamReport) -> Iterator[Sample]:
+        """Iterate without the first `taken` samples, which are not rendered; see `SeekableStream`."""
+        self._report = report
+        make = self._sensors()
+        for kind, stamp, index in islice(self._in_order(), taken, None):
+            report.count(_COUNTED[kind])
+            if kind == _WHEELS:
+                yield SelfMotion(stamp, self._odometry.poses[index].copy())
+            else:
+                yield make(kind, stamp, index)
+
+    def _in_order(self) -> Iterator[tuple[int, int, int]]:
+        """Sensor, stamp and number of each sample."""
+        due = [(int(stamp), _CAMERA, index) for index, stamp in enumerate(self._frame_stamps)]
+        due += [(int(stamp), _LASER, index) for index, stamp in enumerate(self._scan_stamps)]
+        due += [(int(stamp), _WHEELS, index) for index, stamp in enumerate(self._odometry.stamps_ns)]
+        for stamp, kind, index in sorted(due):
+            yield kind, stamp, index
+
+    def _sensors(self) -> Callable[[int, int, int], Observation]:
+        """What makes an observation from its sensor, its stamp and its number."""
         from hybridmap.simulation.sensor_models import CameraModel, LaserModel
 
         generators = self._generators()
@@ -148,16 +159,14 @@ class SimulatedStream:
         laser = LaserModel(self._scene, self._config.laser, self._config.noise)
         frame_noise = generators[_CAMERA].spawn(len(self._frame_stamps))
         scan_noise = generators[_LASER].spawn(len(self._scan_stamps))
-        due = [(int(stamp), 0, index) for index, stamp in enumerate(self._frame_stamps)]
-        due += [(int(stamp), 1, index) for index, stamp in enumerate(self._scan_stamps)]
-        for stamp, kind, index in sorted(due):
+
+        def make(kind: int, stamp: int, index: int) -> Observation:
             pose, time_s = self._true_pose(stamp), (stamp - _START_NS) / NS_PER_S
-            if kind == 0:
-                self._report.count("frames")
-                yield camera.frame(stamp, time_s, pose, frame_noise[index])
-            else:
-                self._report.count("scans")
-                yield laser.scan(stamp, time_s, pose, scan_noise[index])
+            if kind == _CAMERA:
+                return camera.frame(stamp, time_s, pose, frame_noise[index])
+            return laser.scan(stamp, time_s, pose, scan_noise[index])
+
+        return make
 
     def _true_pose(self, stamp_ns: int) -> Array:
         return np.asarray(self._truth.at([stamp_ns])[0])

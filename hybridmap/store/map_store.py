@@ -18,8 +18,8 @@ from hybridmap.errors import GeometryError, GraphError, StoreError, quoted
 from hybridmap.geometry import Array, RelativePose, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node
-from hybridmap.store import schema
-from hybridmap.store.tables import Tables, floats, marks
+from hybridmap.store import records, schema
+from hybridmap.store.tables import BROKEN_OFF, Tables, floats, marks
 from hybridmap.store.track import Track
 from hybridmap.streams.base import Rig
 from hybridmap.trajectory import Anchors, Trajectory
@@ -94,7 +94,7 @@ class MapStore(Tables):
         path = _file_of(folder)
         store = cls(path, schema.create(path), writable=True)
         store.write_rows("sessions", [(0, 0, source, source, 0.0, 0.0, 0.0)])
-        for key, value in (("config_yaml", config_yaml), ("rig", schema.rig_to_json(rig)), ("source", source)):
+        for key, value in (("config_yaml", config_yaml), ("rig", records.rig_to_json(rig)), ("source", source)):
             store.put_info(key, value)
         store.commit()
         return store
@@ -109,24 +109,15 @@ class MapStore(Tables):
         path = _file_of(folder_or_db)
         return cls(path, schema.open_read_only(path), writable=False)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Commit what was written and close; it may be called twice.
+    @classmethod
+    def resume(cls, folder: Path) -> Self:
+        """Open the map of a session whose run did not end, to write on.
 
         Raises:
-            StoreError: the file cannot be written.
+            StoreError: the file is missing, is not a map, is damaged, or is of another version.
         """
-        if self._writable:
-            self._writable = False
-            with self.named_errors("write"):
-                schema.finish(self._connection)
-        else:
-            self._connection.close()
+        path = _file_of(folder)
+        return cls(path, schema.open_to_write(path), writable=True)
 
     # ------------------------------------------------------------------ writing
 
@@ -176,7 +167,7 @@ class MapStore(Tables):
         if edge.relative is not None:
             measured = (*floats(edge.relative.delta), schema.pack_floats(edge.relative.covariance))
         ends, kind = (int(edge.source), int(edge.target)), EdgeKind(edge.kind).name.lower()
-        record = schema.record_to_json(edge)
+        record = records.record_to_json(edge)
         row = (number, *ends, kind, str(edge.status), edge.reason, *measured, record, int(edge.since_node))
         self.write(f"INSERT OR REPLACE INTO edges VALUES ({marks(len(row))})", row)
 
@@ -223,21 +214,12 @@ class MapStore(Tables):
         position = self.one("SELECT position FROM solutions WHERE session = ? AND backend = ?", (schema.WHOLE, backend))
         if position is None:
             position = self.one("SELECT COUNT(*) FROM solutions WHERE session = ?", (schema.WHOLE,))
-        row = (schema.WHOLE, backend, position, schema.pack_floats(poses), schema.report_to_json(report))
+        row = (schema.WHOLE, backend, position, schema.pack_floats(poses), records.report_to_json(report))
         self.write("INSERT OR REPLACE INTO solutions VALUES (?, ?, ?, ?, ?)", row)
 
     def put_info(self, key: str, value: Any) -> None:
         """Write a value that JSON can hold under a key; `primary_backend` is the key of the primary back-end's name."""
         self.write("INSERT OR REPLACE INTO info VALUES (?, ?, ?)", (schema.WHOLE, key, json.dumps(value)))
-
-    def commit(self) -> None:
-        """Make everything written so far survive a killed process.
-
-        Raises:
-            StoreError: the file cannot be written.
-        """
-        with self.named_errors("write"):
-            self._connection.commit()
 
     # ------------------------------------------------------------------ reading
 
@@ -259,7 +241,7 @@ class MapStore(Tables):
     @_reading
     def rig(self) -> Rig:
         """The sensors of the run."""
-        return schema.rig_from_json(self.info("rig"))
+        return records.rig_from_json(self.info("rig"))
 
     @property
     def source(self) -> str:
@@ -281,6 +263,11 @@ class MapStore(Tables):
         """Whether the run that wrote the file came to its end."""
         return self.info("graph_hash") is not None
 
+    @property
+    def broken_off(self) -> str:
+        """Why the run that wrote the file was broken off, in words; empty if it ended, was killed, or is going on."""
+        return str(self.info(BROKEN_OFF) or "")
+
     @_reading
     def info(self, key: str) -> Any:
         """The value that was written under a key; None if the key is not there."""
@@ -301,7 +288,7 @@ class MapStore(Tables):
                 raise ValueError(f"node {number} is missing")
         for number, row in enumerate(self.rows("SELECT * FROM edges ORDER BY number")):
             relative = None if row[9] is None else RelativePose(_pose(row[6:9]), schema.covariance_from_bytes(row[9]))
-            kind, status, record = EdgeKind[row[3].upper()], Status(row[4]), schema.record_from_json(row[10], row[5], version)
+            kind, status, record = EdgeKind[row[3].upper()], Status(row[4]), records.record_from_json(row[10], row[5], version)
             edge = Edge(int(row[1]), int(row[2]), kind, status, relative, since_node=int(row[11]), **record)
             if experiences.add_edge(edge) != row[0]:
                 raise ValueError(f"edge {number} is missing")
@@ -381,7 +368,8 @@ class MapStore(Tables):
         rows = self.rows("SELECT backend, poses, report FROM solutions WHERE session = ? ORDER BY position", (schema.WHOLE,))
         nodes = self.one("SELECT COUNT(*) FROM nodes", ())
         found = {
-            str(name): Solution(schema.unpack_floats(poses, 3), schema.report_from_json(report)) for name, poses, report in rows
+            str(name): Solution(schema.unpack_floats(poses, 3), records.report_from_json(report))
+            for name, poses, report in rows
         }
         fit = {name: solution for name, solution in found.items() if len(schema.near(solution.poses)) == nodes}
         if self.ended and len(fit) < len(found):

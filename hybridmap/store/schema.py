@@ -6,22 +6,16 @@ import json
 import math
 import sqlite3
 import zlib
-from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
-from hybridmap.backends.base import SolveReport, SolveStatus
 from hybridmap.errors import StoreError
-from hybridmap.graph.edges import Check, Edge, Lack, Method, Need, Proposer, Search
-from hybridmap.streams.base import Rig
 from hybridmap.streams.cameras import decode_picture
-from hybridmap.streams.sensors import kinds
 from hybridmap.trajectory import FARTHEST_M
 
 VERSION = 4
@@ -100,8 +94,7 @@ def create(path: Path) -> sqlite3.Connection:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         connection = sqlite3.connect(path)
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = NORMAL")
+        _set_up(connection)
         connection.executescript(TABLES)
         connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         connection.execute(f"PRAGMA user_version = {VERSION}")
@@ -117,10 +110,47 @@ def open_read_only(path: Path) -> sqlite3.Connection:
     Raises:
         StoreError: the file is missing, is not a map, or is of another version.
     """
+    connection = _opened(path, "ro", READABLE)
+    _see_as_newest(connection)
+    return connection
+
+
+def open_to_write(path: Path) -> sqlite3.Connection:
+    """Open a map file of this version to write on, and check that it is whole.
+
+    Raises:
+        StoreError: the file is missing, is not a map, is damaged, or is of another version.
+    """
+    connection = _opened(path, "rw", (VERSION,))
+    try:
+        check(connection, path)
+        _set_up(connection)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def check(connection: sqlite3.Connection, path: Path) -> None:
+    """Check that a map file is whole; this reads all of it.
+
+    Raises:
+        StoreError: it is damaged.
+    """
+    try:
+        found = str(connection.execute("PRAGMA quick_check(1)").fetchone()[0])
+    except sqlite3.Error as error:
+        found = str(error)
+    if found != "ok":
+        raise StoreError(f"{path}: damaged: {' '.join(found.split())}; map the source again")
+
+
+def _opened(path: Path, mode: str, versions: tuple[int, ...]) -> sqlite3.Connection:
+    """Open a map file of one of these versions in a mode of SQLite."""
     if not path.is_file():
         raise StoreError(f"{path}: no such map file; expected a session folder, as `hybridmap map SOURCE --out DIR` writes it")
     try:
-        connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
+        connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode={mode}", uri=True)
         application = connection.execute("PRAGMA application_id").fetchone()[0]
         version = connection.execute("PRAGMA user_version").fetchone()[0]
     except sqlite3.Error as error:
@@ -128,11 +158,17 @@ def open_read_only(path: Path) -> sqlite3.Connection:
     if application != APPLICATION_ID:
         connection.close()
         raise StoreError(f"{path}: an SQLite file, but not a map of hybridmap; expected the one in a session folder")
-    if version not in READABLE:
+    if version not in versions:
         connection.close()
-        raise StoreError(f"{path}: map of version {version}, expected {VERSION}; map the source again with this hybridmap")
-    _see_as_newest(connection)
+        newer = "a newer hybridmap wrote it: use that one" if version > VERSION else "map the source again with this hybridmap"
+        raise StoreError(f"{path}: map of version {version}, expected {VERSION}; {newer}")
     return connection
+
+
+def _set_up(connection: sqlite3.Connection) -> None:
+    """Set how a map is written: see `create`."""
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute("PRAGMA synchronous = NORMAL")
 
 
 def _see_as_newest(connection: sqlite3.Connection) -> None:
@@ -278,114 +314,3 @@ def covariance_from_bytes(data: bytes) -> NDArray[np.float64]:
     if covariance.shape != (3, 3) or not np.isfinite(covariance).all() or not (np.diagonal(covariance) > 0.0).all():
         raise ValueError("a covariance that is none")
     return covariance
-
-
-def rig_to_json(rig: Rig) -> dict[str, Any]:
-    """The sensors of a source as nested plain values that JSON can hold."""
-    return {name: _plain(asdict(sensor)) for name, sensor in rig.sensors.items()}
-
-
-def rig_from_json(tree: dict[str, Any]) -> Rig:
-    """Make the sensors that `rig_to_json` wrote; sensors of unknown kinds are left out."""
-    types = {kind.sensor_name: kind.sensor for kind in kinds()}
-    found = {name: fields for name, fields in tree.items() if fields is not None and name in types}
-    return Rig(**{name: types[name](**{key: _array(value) for key, value in found[name].items()}) for name in found})
-
-
-def _array(value: Any) -> Any:
-    numbers = _NUMBERS.validate_python(value)
-    return np.array(numbers) if isinstance(numbers, list) else value
-
-
-def _plain(fields: dict[str, Any]) -> dict[str, Any]:
-    return {key: value.tolist() if isinstance(value, np.ndarray | np.generic) else value for key, value in fields.items()}
-
-
-def record_to_json(edge: Edge) -> str:
-    """The checks, lack, method and other reasons of an edge's status as one JSON object; empty fields are left out."""
-    fields = {
-        "checks": [_row(check) for check in edge.checks],
-        "lack": edge.lack,
-        "method": edge.method,
-        "search": edge.search,
-        "proposed_by": edge.proposed_by,
-        "figures": {name: float(value) for name, value in edge.figures.items()},
-        "shift": edge.shift,
-        "carried_m": edge.kidnapped_m,
-        "broken_by": [_row(check) for check in edge.broken_by],
-        "contradicts_odometry": edge.contradicts_odometry,
-    }
-    return json.dumps({name: value for name, value in fields.items() if value})
-
-
-def record_from_json(text: str, reason: str, version: int = VERSION) -> dict[str, Any]:
-    """The fields of an edge that `record_to_json` wrote, by name.
-
-    Args:
-        text: the JSON object.
-        reason: the reason in words. A file of a version before 3 has only this and measured values.
-        version: of the file.
-    """
-    fields: dict[str, Any] = json.loads(text)
-    carried_m = fields.pop("carried_m", None)
-    fields["kidnapped_m"] = None if carried_m is None else float(carried_m)
-    if version < 3:
-        kidnapped_m = fields.pop("kidnapped_m")
-        return {"figures": _figures(fields), "kidnapped_m": kidnapped_m, "note": str(reason)}
-    for name in ("checks", "broken_by"):
-        fields[name] = tuple(_check(*row) for row in fields.get(name, ()))
-    for name, kind in _OF_EDGES.items():
-        if name in fields:
-            fields[name] = kind(fields[name])
-    return fields
-
-
-def _figures(fields: dict[str, Any]) -> dict[str, float]:
-    return {name: float(value) for name, value in fields.items()}
-
-
-def _check(figure: str, value: float, needs: str, limit: float, setting: str | None = None) -> Check:
-    return Check(str(figure), float(value), Need(needs), float(limit), None if setting is None else str(setting))
-
-
-_OF_EDGES: dict[str, Callable[[Any], Any]] = {
-    "lack": Lack,
-    "method": Method,
-    "search": Search,
-    "proposed_by": Proposer,
-    "figures": _figures,
-    "shift": int,
-    "contradicts_odometry": bool,
-}
-"""Field of an edge's record -> its value from that in the file."""
-
-
-def _row(check: Check) -> list[Any]:
-    return [check.figure, check.value, check.needs, check.limit, check.setting]
-
-
-def report_to_json(report: SolveReport) -> str:
-    """A solver's report as one JSON object."""
-    fields = asdict(report)
-    fields["status"] = str(report.status)
-    for name in ("rejected_edge_ids", "inconsistent_edge_ids"):
-        fields[name] = [int(number) for number in fields[name]]
-    for name in ("weights", "weak_edges"):
-        fields[name] = {str(number): float(weight) for number, weight in fields[name].items()}
-    return json.dumps(_plain(fields))
-
-
-def report_from_json(text: str) -> SolveReport:
-    """The report that `report_to_json` wrote."""
-    fields = json.loads(text)
-    fields["status"] = SolveStatus(fields["status"])
-    for name in ("rejected_edge_ids", "inconsistent_edge_ids"):
-        fields[name] = tuple(fields.get(name, ()))
-    for name in ("weights", "weak_edges"):
-        fields[name] = {int(number): weight for number, weight in fields.get(name, {}).items()}
-    fields["rejected_clusters"] = tuple(tuple(cluster) for cluster in fields.get("rejected_clusters", ()))
-    return _REPORT.validate_python(fields)
-
-
-_REPORT = TypeAdapter(SolveReport)
-_NUMBERS = TypeAdapter(float | list[float] | list[list[float]])

@@ -15,7 +15,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from hybridmap.errors import OutputError, StoreError, quoted
 from hybridmap.metrics import Metric, to_json
-from hybridmap.output import PREVIOUS, Kind, held, holds_only, is_held, write_text
+from hybridmap.output import PREVIOUS, Kind, Unfinished, held, holds_only, is_held, write_text
 from hybridmap.store.map_store import MapStore
 from hybridmap.store.schema import MAP_NAME
 from hybridmap.trajectory import Trajectory, read_tum, write_tum
@@ -31,6 +31,7 @@ _FILES = (
     "trajectory",
     "reference",
     "report.html",
+    "checkpoint",
 )
 
 
@@ -114,19 +115,37 @@ class SessionFolder:
         """Path of the HTML report."""
         return self.path / "report.html"
 
-    @contextmanager
-    def writing(self, *, overwrite: bool = False) -> Iterator[None]:
-        """Context in which a new session is written, locked against other runs.
+    @property
+    def checkpoint(self) -> Path:
+        """Path of the state from which a run that did not end can be resumed; it exists only until its end."""
+        return self.path / "checkpoint"
 
-        On an error what was written is removed, and a session that was there before is restored. Ctrl-C restores one too; if
-        there was none, what is written so far stays.
+    @contextmanager
+    def writing(self, *, overwrite: bool = False, resume: bool = False) -> Iterator[Unfinished]:
+        """Context in which a session is written, locked against other runs.
+
+        On an error what was written is removed and a session that was there before is restored, unless the new one is worth
+        keeping (`Unfinished`): then it stays, and the one before lies in `.previous`. Ctrl-C restores one too; if there was
+        none, what is written so far stays.
+
+        Args:
+            overwrite: replace a session that is there.
+            resume: go on with the one that is there; what is written stays on any error.
 
         Raises:
-            OutputError: the folder holds a session and `overwrite` is not set, holds something else, is written by another run,
-                or cannot be written to.
+            OutputError: the folder holds a session and neither argument is set, holds something else, is written by another
+                run, or cannot be written to.
         """
-        with held(self.path, SESSION, overwrite=overwrite) as place, place.replaced():
-            yield
+        with (
+            held(self.path, SESSION, overwrite=overwrite, resume=resume) as place,
+            place.resumed() if resume else place.replaced() as unfinished,
+        ):
+            yield unfinished
+
+    @property
+    def ended(self) -> bool:
+        """Whether the folder holds a session whose run came to its end."""
+        return _ended(self.path)
 
     def require(self) -> None:
         """Check that the folder holds a session, and warn if its run did not end.
@@ -136,9 +155,11 @@ class SessionFolder:
         """
         self.require_map()
         with MapStore.open(self.path) as store:
-            ended = store.ended
-        if not ended:
-            log.warning("%s: %s", self.path, self._why_unended())
+            if store.ended:
+                return
+            store.check()
+            reason = store.broken_off
+        log.warning("%s: %s", self.path, self._why_unended(reason))
 
     def require_map(self) -> None:
         """Check that the folder holds a session, whether or not its run ended. The map is not opened.
@@ -161,14 +182,20 @@ class SessionFolder:
         if file.is_relative_to(folder) and {*file.relative_to(folder).parts[:1]} & {*_FILES}:
             raise OutputError(f"{target}: is a file of the session that is read; choose another name")
 
-    def _why_unended(self) -> str:
+    def _why_unended(self, reason: str) -> str:
         if is_held(self.path):
             return "is still being written: this is the map so far"
-        broken_off = "its run was broken off: this is the map up to there"
+        because = f" ({reason})" if reason else ""
+        return f"its run was broken off{because}: this is the map up to there; {self.what_to_do}"
+
+    @property
+    def what_to_do(self) -> str:
+        """How to go on with a session whose run was broken off, and how to have the one before it back, if there is one."""
+        onward = "`hybridmap map` with --resume goes on with it"
         previous = self.path / PREVIOUS
         if not _ended(previous):
-            return broken_off
-        return f"{broken_off}; the finished session that it was to replace is {previous}: move it elsewhere to have it back"
+            return onward
+        return f"{onward}; the finished session that it was to replace is {previous}: move it elsewhere to have it back"
 
     def write_config(self, config_yaml: str) -> None:
         """Write the resolved configuration."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,19 +17,124 @@ from hybridmap.errors import StoreError
 from hybridmap.geometry import Array
 from hybridmap.store import schema
 
+BROKEN_OFF = "broken_off"
+"""Key of why a run was broken off."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """How far a map file of one session is written.
+
+    Attributes:
+        nodes: number of nodes.
+        last_ns: newest stamp of the track, ns; -1 if there is none.
+        info: rows of the table `info`.
+    """
+
+    nodes: int
+    last_ns: int
+    info: tuple[tuple[Any, ...], ...]
+
 
 class Tables:
-    """The tables of a map file, through one connection. Errors of SQLite become a StoreError that names the file."""
+    """The tables of a map file, through one connection. Errors of SQLite become a StoreError that names the file.
+
+    Usable as a context manager.
+    """
 
     def __init__(self, path: Path, connection: sqlite3.Connection, *, writable: bool) -> None:
         self._path = path
         self._connection = connection
         self._writable = writable
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Commit what was written and close; it may be called twice.
+
+        Raises:
+            StoreError: the file cannot be written.
+        """
+        if self._writable:
+            self._writable = False
+            with self.named_errors("write"):
+                schema.finish(self._connection)
+        else:
+            self._connection.close()
+
     @property
     def path(self) -> Path:
         """Path of the map file."""
         return self._path
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes."""
+        last = self.one("SELECT MAX(number) FROM nodes")
+        return 0 if last is None else int(last) + 1
+
+    def commit(self) -> None:
+        """Make everything written so far survive a killed process.
+
+        Raises:
+            StoreError: the file cannot be written.
+        """
+        with self.named_errors("write"):
+            self._connection.commit()
+
+    def sync(self) -> None:
+        """Commit, and make everything written so far survive a power loss, as far as readers leave the log free.
+
+        Raises:
+            StoreError: the file cannot be written.
+        """
+        self.commit()
+        self.rows("PRAGMA wal_checkpoint(PASSIVE)")
+
+    def break_off(self, reason: str) -> None:
+        """Forget what was written since the last `commit`, and write why the run was broken off.
+
+        Raises:
+            StoreError: the file cannot be written.
+        """
+        with self.named_errors("write"):
+            self._connection.rollback()
+        self.write("INSERT OR REPLACE INTO info VALUES (?, ?, ?)", (schema.WHOLE, BROKEN_OFF, json.dumps(reason)))
+        self.commit()
+
+    def check(self) -> None:
+        """Check that the file is whole; this reads all of it.
+
+        Raises:
+            StoreError: it is damaged.
+        """
+        schema.check(self._connection, self._path)
+
+    def mark(self) -> Mark:
+        """What there is now, to which `rewind` comes back."""
+        last_ns = self.one("SELECT MAX(stamp_ns) FROM track")
+        return Mark(self.nodes, -1 if last_ns is None else int(last_ns), tuple(self.rows("SELECT * FROM info ORDER BY 1, 2")))
+
+    def rewind(self, mark: Mark) -> None:
+        """Come back to what there was at a mark, but for the edges: they are removed, to be written again.
+
+        Raises:
+            StoreError: the file cannot be written.
+        """
+        for table, column, first in (
+            ("nodes", "number", mark.nodes),
+            ("arrays", "node", mark.nodes),
+            ("track", "stamp_ns", mark.last_ns + 1),
+            ("online", "stamp_ns", mark.last_ns + 1),
+        ):
+            self.write(f"DELETE FROM {table} WHERE {column} >= ?", (first,))
+        for table in ("edges", "anchors", "solutions", "info"):
+            self.write(f"DELETE FROM {table}", ())
+        self.write_rows("info", mark.info)
 
     def write(self, statement: str, row: tuple[Any, ...]) -> None:
         """Run a statement that writes one row."""

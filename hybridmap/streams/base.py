@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 from numpy.typing import NDArray
 
@@ -251,6 +251,7 @@ class StreamReport:
             messages that cannot be read, or damaged ones were skipped.
         skipped: what was skipped as damaged, in words with stamp and place, in the order of reading.
         dropped: kind of observation (`scans`) -> number of those that a live mapper left out, as it was too slow for them.
+        irregular: name of an irregularity -> number so far, as decoding counts them; they are added to `counts` at the end.
     """
 
     counts: dict[str, int] = field(default_factory=dict)
@@ -258,6 +259,7 @@ class StreamReport:
     lost: dict[str, tuple[int, int]] = field(default_factory=dict)
     skipped: list[str] = field(default_factory=list)
     dropped: dict[str, int] = field(default_factory=dict)
+    irregular: dict[str, int] = field(default_factory=dict)
 
     def skip(self, name: str, total: int, stamp_ns: int, why: str) -> None:
         """Count a damaged observation as a lost message of a topic or list that has `total` messages in all.
@@ -311,6 +313,20 @@ class Stream(Protocol):
 
     def __iter__(self) -> Iterator[Sample]:
         """Yield the samples.
+
+        Raises:
+            StreamError: the source is damaged; the message says where.
+        """
+
+
+@runtime_checkable
+class SeekableStream(Stream, Protocol):
+    """A stream that can leave out its first samples without the work of making them."""
+
+    def onward(self, taken: int, report: StreamReport) -> Iterator[Sample]:
+        """Iterate as always, but without the first `taken` samples.
+
+        `report` is what the iteration that gave these had found right after the last of them; it is continued.
 
         Raises:
             StreamError: the source is damaged; the message says where.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,7 +114,22 @@ def _span(stamps_ns: Stamps) -> str:
     return f"{format_stamp(int(stamps_ns[0]))} to {format_stamp(int(stamps_ns[-1]))} s"
 
 
-def sort_key(sample: Sample) -> tuple[int, int]:
+class Stamped(Protocol):
+    """A sample, or what one will be made of."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp, ns."""
+
+    @property
+    def precedence(self) -> int:
+        """Order among those of equal stamps."""
+
+
+S = TypeVar("S", bound=Stamped)
+
+
+def sort_key(sample: Stamped) -> tuple[int, int]:
     """Key that sorts samples by stamp, then by precedence, so that motion comes first."""
     return sample.stamp_ns, sample.precedence
 
@@ -150,6 +166,6 @@ class ReorderBuffer:
         return ready
 
 
-def merge(*sources: Iterable[Sample]) -> Iterator[Sample]:
+def merge(*sources: Iterable[S]) -> Iterator[S]:
     """Merge sorted streams, lazily, by stamp, then by precedence, so that motion comes first."""
     return heapq.merge(*sources, key=sort_key)

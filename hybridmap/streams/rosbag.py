@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -19,7 +20,6 @@ from hybridmap.streams.base import (
     InBag,
     MessageKey,
     Observation,
-    Planned,
     Sample,
     SelfMotion,
     SensorPlan,
@@ -33,6 +33,15 @@ from hybridmap.trajectory import Trajectory
 
 _MOST_DAMAGED_FIRST = 10
 """How many damaged messages at the beginning of a topic are skipped until its layout is known."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Due:
+    """An observation whose messages are read and not yet decoded."""
+
+    precedence: ClassVar[int] = Observation.precedence
+    stamp_ns: int
+    messages: list[RawMessage]
 
 
 class BagStream:
@@ -105,51 +114,62 @@ class BagStream:
         Raises:
             StreamError: a message is damaged; the message names topic and place.
         """
-        self.report = StreamReport(dict(self.losses), list(self.remarks), dict(self.lost))
-        for sample in merge(self._motions(), self._observations()):
-            self.report.count(kind_of(sample).counted if isinstance(sample, Observation) else "odometry")
-            yield sample
-        if self._plan_made.decode is not None:
-            irregular = self._plan_made.decode.counts
-            self.report.counts |= irregular
-            self.report.remarks += [f"{name}: {number} of {len(self._planned)}" for name, number in irregular.items() if number]
+        return self.onward(0, StreamReport(dict(self.losses), list(self.remarks), dict(self.lost)))
 
-    def _motions(self) -> Iterator[Sample]:
+    def onward(self, taken: int, report: StreamReport) -> Iterator[Sample]:
+        """Iterate without the first `taken` samples, whose messages are read and not decoded; see `SeekableStream`.
+
+        Raises:
+            StreamError: a message is damaged; the message names topic and place.
+        """
+        self.report, decode = report, self._plan_made.decode
+        if decode is not None:
+            decode.counts.clear()
+            decode.counts.update(report.irregular)
+            report.irregular = decode.counts
+        due: Iterator[SelfMotion | _Due] = merge(self._motions(), self._observations())
+        for item in islice(due, taken + len(report.skipped), None):
+            sample = self._decoded(item, decode) if isinstance(item, _Due) and decode is not None else item
+            if isinstance(sample, _Due | None):
+                continue
+            report.count(kind_of(sample).counted if isinstance(sample, Observation) else "odometry")
+            yield sample
+        report.counts |= report.irregular
+        report.remarks += [f"{name}: {number} of {len(self._planned)}" for name, number in report.irregular.items() if number]
+
+    def _motions(self) -> Iterator[SelfMotion]:
         for stamp, pose in zip(self._motion_ns, self._motion_poses, strict=True):
             yield SelfMotion(int(stamp), pose)
 
-    def _observations(self) -> Iterator[Sample]:
+    def _observations(self) -> Iterator[_Due]:
         """Second pass: read until all messages of the next planned observation are there."""
         needed = {key for planned in self._planned for key in planned.needs}
         waiting: dict[MessageKey, Any] = {}
         upcoming = iter(self._planned)
-        planned, decode = next(upcoming, None), self._plan_made.decode
-        if planned is None or decode is None:
+        planned = next(upcoming, None)
+        if planned is None or self._plan_made.decode is None:
             return
-        decode.counts.clear()
         for message in self._bag.raw(sorted({topic for topic, _ in needed})):
             key = (message.topic, message.number)
             if key in needed:
                 self._check_unchanged(message)
                 waiting[key] = message
             while planned is not None and all(key in waiting for key in planned.needs):
-                observation = self._decoded(planned, [waiting.pop(key) for key in planned.needs], decode)
-                if observation is not None:
-                    yield observation
+                yield _Due(planned.stamp_ns, [waiting.pop(key) for key in planned.needs])
                 planned = next(upcoming, None)
             if planned is None:
                 return
         raise StreamError(f"{self._bag.path}: holds fewer messages than at the first reading; was it changed meanwhile?")
 
-    def _decoded(self, planned: Planned, messages: list[RawMessage], decode: Decoder) -> Observation | None:
+    def _decoded(self, due: _Due, decode: Decoder) -> Observation | None:
         """The observation; None if it is damaged and damaged ones are skipped."""
         try:
-            return decode(planned.stamp_ns, tuple(self._bag.decode(message) for message in messages))
+            return decode(due.stamp_ns, tuple(self._bag.decode(message) for message in due.messages))
         except StreamError as error:
             if not self._skip_damaged:
                 raise
-            topic, why = messages[0].topic, str(error).removeprefix(f"{self._bag.path}: ")
-            self.report.skip(topic, len(self._index.stamps_ns[topic]), planned.stamp_ns, why)
+            topic, why = due.messages[0].topic, str(error).removeprefix(f"{self._bag.path}: ")
+            self.report.skip(topic, len(self._index.stamps_ns[topic]), due.stamp_ns, why)
             return None
 
     def _check_unchanged(self, message: RawMessage) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,7 @@ from hybridmap.trajectory import Trajectory, read_stamp_ns, read_tum
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
+    precedence: ClassVar[int] = RgbdFrame.precedence
     stamp_ns: int
     color: Path
     depth: Path
@@ -75,7 +76,9 @@ class TumStream:
         for path in (path for pair in self._pairs for path in (pair.color, pair.depth)):
             if not path.is_file() and not skip_damaged:
                 raise StreamError(f"{path}: no such picture, though the folder's lists name it")
-        if self._pairs and not any(islice(self._frames(), 1)):  # sizes and kinds that contradict each other show at once
+        if self._pairs and all(
+            self._readable(pair) is None for pair in self._pairs
+        ):  # sizes and kinds that contradict each other show at once
             raise StreamError(f"{folder}: none of its {counted(len(self._pairs), 'picture')} can be read")
         frame_ns = np.array([pair.stamp_ns for pair in self._pairs], dtype=np.int64)
         check_overlap(self._odometry.stamps_ns, frame_ns, str(folder))
@@ -94,10 +97,21 @@ class TumStream:
         Raises:
             StreamError: an image is damaged, or of another size or kind than expected.
         """
-        self.report = StreamReport(dict(self.losses), list(self.remarks))
-        for sample in merge(self._motions(), self._frames()):
-            self.report.count("odometry" if isinstance(sample, SelfMotion) else RGBD.counted)
-            yield sample
+        return self.onward(0, StreamReport(dict(self.losses), list(self.remarks)))
+
+    def onward(self, taken: int, report: StreamReport) -> Iterator[Sample]:
+        """Iterate without the first `taken` samples, whose pictures are not read; see `SeekableStream`.
+
+        Raises:
+            StreamError: an image is damaged, or of another size or kind than expected.
+        """
+        self.report = report
+        due: Iterator[SelfMotion | _Pair] = merge(self._motions(), self._pairs)
+        for item in islice(due, taken + len(report.skipped), None):
+            sample = self._readable(item) if isinstance(item, _Pair) else item
+            if sample is not None:
+                report.count("odometry" if isinstance(sample, SelfMotion) else RGBD.counted)
+                yield sample
 
     @property
     def uses(self) -> dict[str, str]:
@@ -108,21 +122,20 @@ class TumStream:
         found = {"odometry": self._sensors.odometry_file or "odometry.txt"} | (lists if self._pairs else {})
         return found | ({"groundtruth": truths[0]} if truths else {})
 
-    def _motions(self) -> Iterator[Sample]:
+    def _motions(self) -> Iterator[SelfMotion]:
         for stamp, pose in zip(self._odometry.stamps_ns, self._odometry.poses, strict=True):
             yield SelfMotion(int(stamp), pose)
 
-    def _frames(self) -> Iterator[Sample]:
-        name = next(name for role, name in self.uses.items() if role in ("frames", "color")) if self._pairs else ""
-        for pair in self._pairs:
-            try:
-                frame = self._frame(pair)
-            except StreamError as error:
-                if not self._skip_damaged:
-                    raise
-                self.report.skip(name, len(self._pairs), pair.stamp_ns, str(error).removeprefix(f"{self._folder}/"))
-                continue
-            yield frame
+    def _readable(self, pair: _Pair) -> RgbdFrame | None:
+        """The frame of a pair; None if it is damaged and damaged ones are skipped."""
+        try:
+            return self._frame(pair)
+        except StreamError as error:
+            if not self._skip_damaged:
+                raise
+            name = next(name for role, name in self.uses.items() if role in ("frames", "color"))
+            self.report.skip(name, len(self._pairs), pair.stamp_ns, str(error).removeprefix(f"{self._folder}/"))
+            return None
 
     def _frame(self, pair: _Pair) -> RgbdFrame:
         color, depth = _read_color(pair.color), _read_depth(pair.depth)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hybridmap import provenance
 from hybridmap.backends.base import ODOMETRY, Solution, SolveStatus
 from hybridmap.backends.driver import Driver, replay
 from hybridmap.backends.gtsam.initial import angular_start
@@ -20,7 +21,6 @@ from hybridmap.errors import BackendError, HybridMapError, counted
 from hybridmap.geometry import Array, align, between, compose
 from hybridmap.graph.paths import chain
 from hybridmap.graph.pose_graph import PoseGraph
-from hybridmap.study import provenance
 from hybridmap.study.false_loops import Kind, with_drift, with_false_loops
 from hybridmap.study.frozen import Frozen
 from hybridmap.study.measures import KEPT, NEAR_M, OF_ODOMETRY

@@ -6,10 +6,11 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
+from hybridmap import provenance
 from hybridmap.backends.base import SolveStatus
 from hybridmap.errors import StudyError
 from hybridmap.study import cell as cells
-from hybridmap.study import provenance, sources
+from hybridmap.study import sources
 from hybridmap.study.cell import UNMAPPED, CellResult
 from hybridmap.study.cells import Grid
 from hybridmap.study.folder import StudyFolder

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hybridmap import provenance
 from hybridmap.backends.base import SolveStatus
 from hybridmap.backends.registry import LEAST_SQUARES, create
 from hybridmap.config import Config
@@ -20,7 +21,7 @@ from hybridmap.graph.edges import EdgeKind
 from hybridmap.graph.io import read_graph
 from hybridmap.graph.paths import chain
 from hybridmap.graph.pose_graph import PoseGraph, prefix
-from hybridmap.study import disturb, provenance
+from hybridmap.study import disturb
 from hybridmap.study.drive import MappedDrive, truth_at
 from hybridmap.study.frozen import Frozen
 from hybridmap.study.model import SettingConfig, SourceConfig, SyntheticConfig

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hybridmap import provenance
 from hybridmap.errors import counted
 from hybridmap.metrics import Metric, to_json
 from hybridmap.output import held, write_text
-from hybridmap.study import bars, provenance, tables
+from hybridmap.study import bars, tables
 from hybridmap.study.bars import Verdict
 from hybridmap.study.cell import CellResult
 from hybridmap.study.cells import Cell, Grid, lay_out

@@ -16,7 +16,7 @@ from hybridmap.geometry import adjoint, align, inverse, transform_points
 from hybridmap.graph.agreement import ring
 from hybridmap.graph.paths import chain_of
 from hybridmap.graph.pose_graph import prefix
-from hybridmap.store.schema import report_from_json, report_to_json
+from hybridmap.store.records import report_from_json, report_to_json
 from hybridmap.study.false_loops import inject
 from tests.backends.graphs_for_tests import laps
 

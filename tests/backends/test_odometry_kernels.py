@@ -16,7 +16,7 @@ from hybridmap.config.backends import BackendsConfig, RobustConfig
 from hybridmap.errors import GraphError
 from hybridmap.geometry import align, transform_points
 from hybridmap.graph.edges import EdgeKind
-from hybridmap.store.schema import report_from_json, report_to_json
+from hybridmap.store.records import report_from_json, report_to_json
 from hybridmap.study.false_loops import drop_out, inject
 from tests.backends.graphs_for_tests import laps
 from tests.narrowing import known

@@ -6,13 +6,14 @@ import pytest
 from hybridmap import backends
 from hybridmap.backends.base import Outcome
 from hybridmap.backends.comparison import compare, metrics_of
-from hybridmap.backends.driver import Driver, Ensemble
+from hybridmap.backends.driver import Driver
+from hybridmap.backends.ensemble import Ensemble
 from hybridmap.config import Config
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import BackendError
 from hybridmap.mapper import Mapper
 from hybridmap.metrics import StageClock
-from hybridmap.store.schema import report_from_json, report_to_json
+from hybridmap.store.records import report_from_json, report_to_json
 from tests.backends.graphs_for_tests import laps
 
 

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridmap.store.schema import pack, rig_from_json, unpack
+from hybridmap.store.records import rig_from_json
+from hybridmap.store.schema import pack, unpack
 
 DTYPES = ("|b1", "|u1", "|i1", "<u2", ">u2", "<i4", "<i8", "<f4", ">f4", "<f8")
 

@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import pytest
 
+from hybridmap import provenance
 from hybridmap.errors import OutputError, StudyError
 from hybridmap.output import held
 from hybridmap.report.study_page import write_study_page
 from hybridmap.study import cell as cells
-from hybridmap.study import provenance, runner
+from hybridmap.study import runner
 from hybridmap.study.folder import STUDY_FOLDER
 from hybridmap.study.pools import LocalProcesses, Lost, ThisProcess
 from hybridmap.study.study import run_study

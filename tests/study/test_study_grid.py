@@ -6,9 +6,9 @@ from importlib import resources
 import numpy as np
 import pytest
 
+from hybridmap import provenance
 from hybridmap.errors import GraphError
 from hybridmap.graph.io import write_g2o
-from hybridmap.study import provenance
 from hybridmap.study.cells import lay_out
 from hybridmap.study.false_loops import inject
 from hybridmap.study.model import SyntheticConfig

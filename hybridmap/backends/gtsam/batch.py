@@ -11,7 +11,17 @@ import numpy as np
 
 from hybridmap.backends.base import Outcome, SolveStatus
 from hybridmap.backends.driver import Driver
-from hybridmap.backends.gtsam.factors import NoiseModels, anchor, collected, factor_graph, factors, poses_of, values
+from hybridmap.backends.gtsam.factors import (
+    NoiseModels,
+    anchor,
+    collected,
+    exact_poses,
+    exact_values,
+    factor_graph,
+    factors,
+    poses_of,
+    values,
+)
 from hybridmap.backends.gtsam.initial import best_start
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.errors import counted
@@ -47,7 +57,7 @@ def create(name: str, config: BackendsConfig, method: str) -> Driver:
         return outcome if start is initial else replace(outcome, message=f"{outcome.message} (start: rotation averaging)")
 
     warm = WarmStart(method, NoiseModels(), config.max_iterations)
-    return Driver(name, config, solve, follow=warm, given=given, most_rise=1e-9)
+    return Driver(name, config, solve, follow=warm, given=given, most_rise=1e-9, remembers=warm)
 
 
 def run(
@@ -120,6 +130,20 @@ class WarmStart:
         self._graph: PoseGraph | None = None
         self._factors: dict[int, Any] = {}
         self._values: Any = None
+
+    def memory(self) -> tuple[PoseGraph | None, Array | None]:
+        """The graph, and each pose as (N, 4): x, y, cosine and sine; see `Remembering`."""
+        if self._graph is None:
+            return None, None
+        return self._graph, exact_poses(self._values, self._graph.n_nodes)
+
+    def remember(self, memory: tuple[PoseGraph | None, Array | None]) -> None:
+        """Take over what `memory` returned."""
+        self._graph, exact = memory
+        if self._graph is not None and exact is not None:
+            made = factors(self._graph, self._models)
+            self._factors = dict(zip(self._graph.edge_ids.tolist(), made, strict=True))
+            self._values = exact_values(exact)
 
     def __call__(self, graph: PoseGraph, start: Array) -> Outcome:
         """Run the optimiser once; for a graph seen before, `start` (N, 3) must continue the last outcome.

@@ -117,3 +117,18 @@ def values(poses: Array, first: int = 0) -> Any:
 def poses_of(result: Any) -> Array:
     """`gtsam.Values` with keys 0..N-1 as `(N, 3)`."""
     return np.array(gtsam.utilities.extractPose2(result), dtype=np.float64).reshape(-1, 3)
+
+
+def exact_poses(result: Any, n_nodes: int) -> Array:
+    """`gtsam.Values` with keys 0..N-1 as (N, 4): x, y, cosine and sine of the yaw, without rounding."""
+    poses = [result.atPose2(key) for key in range(n_nodes)]
+    rows = [(pose.x(), pose.y(), pose.rotation().c(), pose.rotation().s()) for pose in poses]
+    return np.array(rows, dtype=np.float64).reshape(-1, 4)
+
+
+def exact_values(exact: Array) -> Any:
+    """The `gtsam.Values` that `exact_poses` read, to the bit; of a yaw alone the cosine would differ in its last bit."""
+    out = gtsam.Values()
+    for key, (x, y, cos, sin) in enumerate(exact.tolist()):
+        out.insert(key, gtsam.Pose2(gtsam.Rot2.fromCosSin(cos, sin), gtsam.Point2(x, y)))
+    return out

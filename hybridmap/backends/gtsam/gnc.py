@@ -272,7 +272,8 @@ def create(name: str, config: BackendsConfig, whole: Whole | None = None) -> Dri
         found = _without_lone(graph, found, config) if found.kept.all() else _tested(graph, found, config)
         return _cheapest(graph, {"given": found}, config)
 
-    return Driver(name, config, anew, follow=WarmKernel("cauchy", config), onward=onward, given=given, softens=True)
+    warm = WarmKernel("cauchy", config)
+    return Driver(name, config, anew, follow=warm, onward=onward, given=given, softens=True, remembers=warm)
 
 
 def best(graph: PoseGraph, config: BackendsConfig, driven: Array | None) -> Outcome:

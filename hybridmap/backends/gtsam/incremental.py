@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridmap.backends.base import Outcome, SolveStatus
 from hybridmap.backends.driver import Driver
@@ -59,7 +59,9 @@ def create(name: str, config: BackendsConfig) -> Driver:
         return Isam2(config).conclude(graph, start)
 
     follow, last = isam2.follow, isam2.conclude
-    return Driver(name, config, solve, follow=follow, last=last, given=given, most_rise=most_rise, softens=True)
+    return Driver(
+        name, config, solve, follow=follow, last=last, given=given, most_rise=most_rise, softens=True, remembers=isam2
+    )
 
 
 class Isam2:
@@ -81,6 +83,17 @@ class Isam2:
     def is_robust(self) -> bool:
         """Whether loops or odometry edges have a robust kernel."""
         return self._kernel is not None or self._config.robust.odometry != "none"
+
+    def memory(self) -> Any:
+        """Weights, rejected loops, and all that the smoother was told; see `Remembering`."""
+        return self._weights, self._rejected, None if self._smoother is None else self._smoother.told()
+
+    def remember(self, memory: Any) -> None:
+        """Take over what `memory` returned, by telling a new smoother the same again: ISAM2 gives its state to nobody."""
+        self._weights, self._rejected, told = memory
+        if told is not None:
+            self._smoother = self._empty(orthogonal=told.orthogonal)
+            self._smoother.tell(told)
 
     def follow(self, graph: PoseGraph, start: Array) -> Outcome:
         """Solve a grown graph from poses `start` (N, 3); loop closures that would hardly move the map may be delayed."""
@@ -177,6 +190,38 @@ def _closing_nodes(graph: PoseGraph) -> list[int]:
     return sorted({*(newest[graph.is_loop] + 1).tolist(), graph.n_nodes})
 
 
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One update of a smoother with something new.
+
+    Attributes:
+        first: (3,) pose of node 0, m and rad.
+        edges: the new edges, without nodes.
+        poses: (M, 3) poses of the new nodes.
+        removed: numbers of the edges that are removed.
+    """
+
+    first: Array
+    edges: PoseGraph
+    poses: Array
+    removed: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What a smoother was told, from which another one comes to the same state.
+
+    Attributes:
+        orthogonal: by which factorisation.
+        graph: the graph that it holds.
+        steps: its updates; None: one without anything new.
+    """
+
+    orthogonal: bool
+    graph: PoseGraph | None
+    steps: tuple[Step | None, ...]
+
+
 class Smoother:
     """An ISAM2 object that follows a graph. After an exception it may be half changed and must be discarded.
 
@@ -201,6 +246,8 @@ class Smoother:
         params.enablePartialRelinearizationCheck = True
         self.isam = gtsam.ISAM2(params)
         self._models = models
+        self._orthogonal = orthogonal
+        self._steps: list[Step | None] = []
         self._slots: dict[int, int] = {}
         self._point: Array = np.zeros((0, 3))
         self._marked: set[int] = set()
@@ -223,19 +270,25 @@ class Smoother:
             start: (N, 3) poses; those of new nodes are used.
             change: the difference between the graph and the edges that the smoother holds (`lacks`).
         """
-        known = len(self._point)
-        new = graph.with_edges(change.added)
-        held = [anchor(graph.initial[0])] if known == 0 else []
-        gone = self._forget(change.removed)
-        result = self._update(collected([*held, *factors(new, self._models)]), values(start[known:], known), gone)
-        slots = list(result.getNewFactorsIndices())[-new.n_edges :] if new.n_edges else []
-        self._slots.update(zip(new.edge_ids.tolist(), slots, strict=True))
-        self._point = np.concatenate([self._point, start[known:]])
+        new, known = graph.with_edges(change.added), len(self._point)
+        gone = () if self._graph is None else tuple(self._graph.edge_ids[change.removed].tolist())
+        self._take(Step(graph.initial[0], replace(new, initial=new.initial[:0]), start[known:].copy(), gone))
         self._graph = graph
+
+    def told(self) -> Told:
+        """All that it was told so far; it grows with the updates."""
+        return Told(self._orthogonal, self._graph, tuple(self._steps))
+
+    def tell(self, told: Told) -> None:
+        """Come to the state of the smoother that was told this; this one must be empty."""
+        for step in told.steps:
+            self._update() if step is None else self._take(step)
+        self._graph = told.graph
 
     def settle(self) -> int:
         """Run updates without new factors until nothing is relinearised, at most `SETTLE_UPDATES`; returns their number."""
         for done in range(1, SETTLE_UPDATES + 1):
+            self._steps.append(None)
             if self._update().getVariablesRelinearized() == 0:
                 return done
         return SETTLE_UPDATES
@@ -252,13 +305,19 @@ class Smoother:
         self._marked = set()
         return compose(self._point, exp(self.isam.getDelta().vector(range(n)).reshape(-1, 3)))
 
+    def _take(self, step: Step) -> None:
+        """Run one update with something new."""
+        self._steps.append(step)
+        known, new = len(self._point), step.edges
+        held = [anchor(step.first)] if known == 0 else []
+        gone = [self._slots.pop(edge) for edge in step.removed]
+        result = self._update(collected([*held, *factors(new, self._models)]), values(step.poses, known), gone)
+        slots = list(result.getNewFactorsIndices())[-new.n_edges :] if new.n_edges else []
+        self._slots.update(zip(new.edge_ids.tolist(), slots, strict=True))
+        self._point = np.concatenate([self._point, step.poses])
+
     def _update(self, *given: Any) -> Any:
         """Run one update and mark the nodes that may have been relinearised."""
         result = self.isam.update(*given)
         self._marked.update(result.getMarkedKeys())
         return result
-
-    def _forget(self, removed: NDArray[np.int64]) -> list[int]:
-        if self._graph is None:
-            return []
-        return [self._slots.pop(int(edge)) for edge in self._graph.edge_ids[removed]]

@@ -29,7 +29,8 @@ def create(name: str, config: BackendsConfig, kernel: str) -> Driver:
         outcome = given(graph, start)
         return outcome if start is initial else replace(outcome, message=f"{outcome.message} (start: consecutive edges)")
 
-    return Driver(name, config, solve, follow=WarmKernel(kernel, config), given=given, softens=True)
+    warm = WarmKernel(kernel, config)
+    return Driver(name, config, solve, follow=warm, given=given, softens=True, remembers=warm)
 
 
 def judged(outcome: Outcome, kernel: Any, graph: PoseGraph, gate: float) -> Outcome:
@@ -53,6 +54,14 @@ class WarmKernel:
     def __init__(self, name: str, config: BackendsConfig) -> None:
         self._kernel, self._gate = loop_kernel(name, config.robust), gate_of(config)
         self._warm = WarmStart("lm", noise_models(config.robust, self._kernel), config.max_iterations)
+
+    def memory(self) -> Any:
+        """See `WarmStart.memory`."""
+        return self._warm.memory()
+
+    def remember(self, memory: Any) -> None:
+        """See `WarmStart.remember`."""
+        self._warm.remember(memory)
 
     def __call__(self, graph: PoseGraph, start: Array) -> Outcome:
         """See `WarmStart`; the outcome also has weights and rejected loops."""

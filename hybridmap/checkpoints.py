@@ -1,0 +1,202 @@
+"""Checkpoints of a run: the whole state of a drive, written now and then, so that a run that died can be resumed."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from itertools import islice
+from typing import Any
+
+from pydantic import BaseModel
+
+from hybridmap import provenance
+from hybridmap.config import Config
+from hybridmap.errors import OutputError, StoreError
+from hybridmap.mapper import Mapper
+from hybridmap.output import is_held
+from hybridmap.recorder import Recorder
+from hybridmap.store import MapStore, checkpoint
+from hybridmap.store.checkpoint import Origin, UnusableError
+from hybridmap.store.session_folder import SessionFolder
+from hybridmap.store.tables import Mark
+from hybridmap.streams.base import Observation, Sample, SeekableStream, Stream, StreamReport
+
+log = logging.getLogger(__name__)
+
+LEAST_S = 0.25
+"""Least time between two checkpoints, s."""
+TIMES_ITS_COST = 40.0
+"""Least time between two checkpoints in units of what the last one took: they take 2.5 % of the time at most."""
+_SOON = 5.0  # the same before the end of the drive, which is long and cannot be broken into pieces
+_FIRST = 3  # samples whose stamps tell one recording from another
+
+
+@dataclass(slots=True)
+class Drive:
+    """A drive under way: all that is needed to go on with it.
+
+    Attributes:
+        mapper: with all samples so far.
+        recorder: writes what the mapper did.
+        taken: number of samples so far.
+        observations: how many of them are observations.
+        first_ns: stamps of the first few samples, ns.
+        report: what reading the stream has found so far.
+        mark: how far the map file was written at the last checkpoint.
+    """
+
+    mapper: Mapper
+    recorder: Recorder
+    taken: int = 0
+    observations: int = 0
+    first_ns: tuple[int, ...] = ()
+    report: StreamReport = field(default_factory=StreamReport)
+    mark: Mark | None = None
+
+    def rewind(self, store: MapStore) -> None:
+        """Take on a map file that is written to the mark or farther: what came after it is removed.
+
+        Raises:
+            StoreError: the file cannot be written.
+        """
+        assert self.mark is not None
+        self.recorder.store = store
+        store.rewind(self.mark)
+        for number, edge in enumerate(self.mapper.map.edges):
+            store.put_edge(number, edge)
+        store.commit()
+
+    def samples(self, stream: Stream) -> Iterator[Sample]:
+        """The samples of the stream that are still to come, counted as they are taken."""
+        if self.taken and isinstance(stream, SeekableStream):
+            coming = stream.onward(self.taken, self.report)
+        else:
+            coming = islice(stream, self.taken, None)
+        for sample in coming:
+            self.taken += 1
+            self.observations += isinstance(sample, Observation)
+            if len(self.first_ns) < _FIRST:
+                self.first_ns = (*self.first_ns, sample.stamp_ns)
+            yield sample
+
+
+class Checkpoints:
+    """Writes checkpoints of a run, so far apart that they cost little, and removes them at its end.
+
+    A checkpoint that cannot be written, because the disk is full or a front-end is not ours, is only warned of, once.
+    """
+
+    def __init__(self, folder: SessionFolder, stream: Stream, config: Config) -> None:
+        """Begin before the first checkpoint."""
+        self._folder, self._stream, self._config = folder, stream, config
+        self._cpu_s, self._wall_s = time.process_time(), time.perf_counter()
+        self._cost_cpu_s = self._cost_wall_s = 0.0
+        self._warned = False
+
+    def follow(self, drive: Drive) -> None:
+        """Write a checkpoint if one is due."""
+        self._write_if_due(drive, TIMES_ITS_COST)
+
+    def before_the_end(self, drive: Drive) -> None:
+        """Write a checkpoint after the last sample, unless the last one is new."""
+        self._write_if_due(drive, _SOON)
+
+    def remove(self) -> None:
+        """Remove the checkpoint: the run came to its end."""
+        self._folder.checkpoint.unlink(missing_ok=True)
+
+    def _write_if_due(self, drive: Drive, times: float) -> None:
+        cpu_s, wall_s = time.process_time(), time.perf_counter()
+        if cpu_s - self._cpu_s < max(LEAST_S, times * self._cost_cpu_s) or wall_s - self._wall_s < times * self._cost_wall_s:
+            return
+        try:
+            self._write(drive)
+        except (UnusableError, OutputError) as error:
+            if not self._warned:
+                log.warning("%s; the run cannot be resumed", error)
+            self._warned = True
+        self._cpu_s, self._wall_s = time.process_time(), time.perf_counter()
+        self._cost_cpu_s, self._cost_wall_s = self._cpu_s - cpu_s, self._wall_s - wall_s
+
+    def _write(self, drive: Drive) -> None:
+        store = drive.recorder.store
+        store.sync()
+        drive.mark, drive.report = store.mark(), self._stream.report
+        origin = _origin(self._stream, self._config, drive.first_ns)
+        size = checkpoint.write(self._folder.checkpoint, origin, drive, {"store": store, **_sections(self._config)})
+        log.info("checkpoint at node %d: %.1f MB", len(drive.mapper.map) - 1, size / 1e6)
+
+
+def resumable(folder: SessionFolder, stream: Stream, config: Config) -> Drive | None:
+    """The drive of a session whose run did not end, as of its last checkpoint.
+
+    Its recorder has no map file yet.
+
+    Returns:
+        None if there is no checkpoint that can be used; a warning says why.
+
+    Raises:
+        OutputError: the session is being written.
+        StoreError: the session is of another source, another configuration or another version of hybridmap.
+    """
+    if folder.path.is_dir() and is_held(folder.path):
+        raise OutputError(f"{folder.path}: is being written by another run; wait for it")
+    try:
+        return _last(folder, stream, config)
+    except UnusableError as error:
+        log.warning("%s; mapping from the beginning", error)
+        return None
+
+
+def _last(folder: SessionFolder, stream: Stream, config: Config) -> Drive:
+    if not folder.map_db.is_file():
+        raise UnusableError(f"{folder.path}: there is no session to resume")
+    with MapStore.open(folder.path) as store:
+        if store.config_yaml != config.to_yaml():
+            raise _another(folder, f"configuration; its own is {folder.config_yaml}")
+        if store.source != stream.name:
+            raise _another(folder, f"source: found {stream.name}, expected {store.source}")
+        origin = checkpoint.read_origin(folder.checkpoint)
+        if origin.code != provenance.mapping():
+            raise _another(
+                folder, f"hybridmap: found {version('hybridmap')}, expected the same code as before ({origin.version})"
+            )
+        here = _origin(stream, config, tuple(sample.stamp_ns for sample in islice(stream, len(origin.first_ns))))
+        if here != origin:
+            raise _another(folder, f"source: {stream.name} has other samples than before")
+        drive = checkpoint.read(folder.checkpoint, {"store": None, **_sections(config)})
+        if not isinstance(drive, Drive) or drive.mark is None:
+            raise UnusableError(f"{folder.checkpoint}: damaged: holds no drive")
+        store.check()
+        now = store.mark()
+        if now.nodes < drive.mark.nodes or now.last_ns < drive.mark.last_ns:
+            raise UnusableError(f"{folder.map_db}: ends at node {now.nodes - 1}, before the checkpoint")
+    return drive
+
+
+def _another(folder: SessionFolder, what: str) -> StoreError:
+    return StoreError(f"{folder.path}: cannot be resumed with another {what}; map again with --overwrite")
+
+
+def _origin(stream: Stream, config: Config, first_ns: tuple[int, ...]) -> Origin:
+    return Origin(
+        code=provenance.mapping(),
+        version=version("hybridmap"),
+        config=config.to_yaml(),
+        source=stream.name,
+        expected=stream.expected_observations,
+        first_ns=first_ns,
+    )
+
+
+def _sections(section: BaseModel, name: str = "config") -> dict[str, Any]:
+    """The configuration and its sections, by name: a state refers to them."""
+    found: dict[str, Any] = {name: section}
+    for field_name in type(section).model_fields:
+        value = getattr(section, field_name)
+        if isinstance(value, BaseModel):
+            found |= _sections(value, f"{name}.{field_name}")
+    return found

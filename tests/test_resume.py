@@ -1,0 +1,231 @@
+"""A run that was killed or broken off is gone on with, and ends as an unbroken one."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hybridmap import checkpoints, session
+from hybridmap.config import Config
+from hybridmap.errors import OutputError, StoreError, StreamError
+from hybridmap.store import SessionFolder
+from hybridmap.streams import open_stream
+from tests.streams_for_tests import RoomDrive
+
+CONFIG = Config.load("laser", {"backends.names": ["gtsam-gnc", "relaxation-ratslam"]})
+SCRIPT = """
+import sys, time
+from pathlib import Path
+from hybridmap import checkpoints, session
+from tests.streams_for_tests import RoomDrive
+from tests.test_resume import CONFIG
+class Stops(RoomDrive):
+    def __iter__(self):
+        for number, sample in enumerate(super().__iter__()):
+            if number > 300:
+                print("there", flush=True)
+                time.sleep(60)
+            yield sample
+session.run(Stops(laps=2.2), CONFIG, Path(sys.argv[1]))
+"""
+
+
+class Breaks(RoomDrive):
+    """A drive whose sensors fail after so many samples."""
+
+    after = 300
+
+    def __iter__(self):
+        for number, sample in enumerate(super().__iter__()):
+            if number == self.after:
+                raise StreamError("the cable is loose")
+            yield sample
+
+
+def contents(folder: Path) -> dict[str, object]:
+    """All that a session holds, but for the times that it took."""
+    with sqlite3.connect(folder / "map.db") as connection:
+        tables = [row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        found: dict[str, object] = {
+            table: sorted(connection.execute(f"SELECT * FROM {table}").fetchall(), key=repr)
+            for table in tables
+            if table != "solutions"
+        }
+        found["solutions"] = connection.execute("SELECT backend, position, poses FROM solutions ORDER BY 1").fetchall()
+    trajectories = sorted((folder / "trajectory").iterdir())
+    return found | {path.name: path.read_bytes() for path in [*trajectories, folder / "config.yaml"]}
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory):
+    out = tmp_path_factory.mktemp("unbroken") / "s"
+    session.run(RoomDrive(laps=2.2), CONFIG, out)
+    return contents(out)
+
+
+@pytest.fixture
+def often(monkeypatch):
+    """Checkpoints at every node."""
+    monkeypatch.setattr(checkpoints, "LEAST_S", 0.0)
+    monkeypatch.setattr(checkpoints, "TIMES_ITS_COST", 0.0)
+
+
+def broken_off(out: Path, after: int = 300) -> None:
+    stream = Breaks(laps=2.2)
+    stream.after = after
+    with pytest.raises(StreamError, match="cable"):
+        session.run(stream, CONFIG, out)
+
+
+@pytest.mark.usefixtures("often")
+@pytest.mark.parametrize("after", [120, 300])
+def test_a_broken_off_run_is_resumed_to_the_same_session(unbroken, tmp_path, after):
+    broken_off(tmp_path / "s", after)
+    seen: list[int] = []
+    session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "s", resume=True, progress=lambda done, _: seen.append(done))
+    assert seen[0] > after // 4  # it does not begin anew
+    assert contents(tmp_path / "s") == unbroken
+    assert not (tmp_path / "s" / "checkpoint").exists()
+
+
+def test_a_killed_run_is_resumed_to_the_same_session(unbroken, tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, str(tmp_path / "s")], stdout=subprocess.PIPE, cwd=Path(__file__).parents[1]
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"there\n"
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert (tmp_path / "s" / "checkpoint").is_file()
+    session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "s", resume=True)
+    assert contents(tmp_path / "s") == unbroken
+
+
+@pytest.mark.usefixtures("often")
+def test_a_resumed_run_that_breaks_off_again_is_resumed_again(unbroken, tmp_path):
+    broken_off(tmp_path / "s", 120)
+    stream = Breaks(laps=2.2)
+    with pytest.raises(StreamError, match="cable"):
+        session.run(stream, CONFIG, tmp_path / "s", resume=True)
+    session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "s", resume=True)
+    assert contents(tmp_path / "s") == unbroken
+
+
+def test_a_run_that_fails_at_its_very_end_is_resumed_there(unbroken, tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoints, "LEAST_S", 0.0)
+
+    def full(*_: object) -> None:
+        raise OutputError("no space left on device")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(SessionFolder, "write_metrics", full)
+        with pytest.raises(OutputError):
+            session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "s")
+    seen: list[int] = []
+    session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "s", resume=True, progress=lambda done, _: seen.append(done))
+    assert seen == []
+    assert contents(tmp_path / "s") == unbroken
+
+
+def test_without_a_checkpoint_the_drive_is_mapped_from_its_beginning(unbroken, tmp_path, caplog):
+    for spoil in (Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:-9]), lambda path: path.write_text("{}")):
+        broken_off(tmp_path / "s")
+        spoil(tmp_path / "s" / "checkpoint")
+        caplog.clear()
+        session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "s", resume=True)
+        assert "mapping from the beginning" in caplog.text
+        assert contents(tmp_path / "s") == unbroken
+        (tmp_path / "s").rename(tmp_path / f"done{len(list(tmp_path.iterdir()))}")
+
+
+def test_a_checkpoint_names_nothing_but_what_a_state_is_made_of(tmp_path):
+    broken_off(tmp_path / "s")
+    path = tmp_path / "s" / "checkpoint"
+    head = json.loads(path.read_bytes().partition(b"\n")[0])
+    harm = b"cposix\nsystem\n(S'touch harm'\ntR."
+    for content in (harm, harm.replace(b"posix\nsystem", b"hybridmap.output\nwrite_text")):
+        path.write_bytes(json.dumps(head | {"crc32": zlib.crc32(content)}).encode() + b"\n" + content)
+        with pytest.raises(checkpoints.UnusableError, match="not among what a state may hold"):
+            checkpoints.checkpoint.read(path, {})
+
+
+@pytest.mark.usefixtures("often")
+def test_it_is_refused_with_another_source_or_configuration_or_code(tmp_path, monkeypatch):
+    broken_off(tmp_path / "s")
+    before = (tmp_path / "s" / "map.db").read_bytes()
+    other = Config.load("laser", {"backends.names": ["odometry"]})
+    with pytest.raises(StoreError, match="another configuration"):
+        session.run(RoomDrive(laps=2.2), other, tmp_path / "s", resume=True)
+    with pytest.raises(StoreError, match="another source: found hall, expected room"):
+        session.run(RoomDrive(laps=2.2, name="hall"), CONFIG, tmp_path / "s", resume=True)
+
+    class Later(RoomDrive):
+        def __iter__(self):
+            stream = super().__iter__()
+            next(stream)
+            return stream
+
+    with pytest.raises(StoreError, match="room has other samples"):
+        session.run(Later(laps=2.2), CONFIG, tmp_path / "s", resume=True)
+    monkeypatch.setattr(checkpoints.provenance, "mapping", lambda: "other")
+    with pytest.raises(StoreError, match="another hybridmap"):
+        session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "s", resume=True)
+    assert (tmp_path / "s" / "map.db").read_bytes() == before
+
+
+def test_a_finished_session_or_one_that_is_written_is_not_resumed(tmp_path, caplog):
+    config = Config.load("laser", {"vision.sensor": "none"})
+    done = session.run(RoomDrive(laps=0.2, with_scans=False), config, tmp_path / "s")
+    again = session.run(RoomDrive(laps=0.2, with_scans=False), config, tmp_path / "s", resume=True)
+    assert again.head == done.head
+    assert "nothing to resume" in caplog.text
+    broken_off(tmp_path / "held")
+    with SessionFolder(tmp_path / "held").writing(resume=True), pytest.raises(OutputError, match="is being written"):
+        session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "held", resume=True)
+
+
+def test_a_resumed_overwrite_ends_with_one_session(unbroken, tmp_path):
+    session.run(RoomDrive(laps=0.3), CONFIG, tmp_path / "s")
+    with pytest.raises(StreamError, match="cable"):
+        session.run(Breaks(laps=2.2), CONFIG, tmp_path / "s", overwrite=True)
+    assert (tmp_path / "s" / ".previous" / "map.db").is_file()
+    session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "s", resume=True)
+    assert contents(tmp_path / "s") == unbroken
+    assert not (tmp_path / "s" / ".previous").exists()
+
+
+@pytest.mark.parametrize("name", ["gtsam-isam2", "gtsam-lm", "relaxation-weighted", "gtsam-cauchy", "odometry"])
+@pytest.mark.usefixtures("often")
+def test_every_kind_of_back_end_comes_to_the_same_map(name, tmp_path):
+    config = Config.load("laser", {"backends.names": [name]})
+    session.run(RoomDrive(laps=1.3), config, tmp_path / "whole")
+    stream = Breaks(laps=1.3)
+    stream.after = 200
+    with pytest.raises(StreamError, match="cable"):
+        session.run(stream, config, tmp_path / "s")
+    session.run(RoomDrive(laps=1.3), config, tmp_path / "s", resume=True)
+    assert contents(tmp_path / "s") == contents(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("taken", [1, 7, 40])
+def test_a_stream_goes_on_with_the_same_samples(taken):
+    config = Config.load("lab", {"simulation.duration_s": 1.0, "simulation.sensors": "both", "simulation.camera.rate_hz": 5.0})
+    stream = open_stream("lab", config)
+    whole = list(stream)
+    counts = dict(stream.report.counts)
+    samples = iter(stream)
+    for _ in range(taken):
+        next(samples)
+    onward = list(stream.onward(taken, stream.report))
+    assert [sample.stamp_ns for sample in onward] == [sample.stamp_ns for sample in whole[taken:]]
+    assert all(np.array_equal(a.color, b.color) for a, b in zip(onward, whole[taken:], strict=True) if hasattr(a, "color"))
+    assert stream.report.counts == counts
