@@ -89,8 +89,9 @@ class Checkpoints:
     A checkpoint that cannot be written, because the disk is full or a front-end is not ours, is only warned of, once.
     """
 
-    def __init__(self, folder: SessionFolder, stream: Stream, config: Config) -> None:
-        """Begin before the first checkpoint."""
+    def __init__(self, folder: SessionFolder, stream: Stream, config: Config, *, wanted: bool = True) -> None:
+        """Begin before the first checkpoint; none is written unless they are wanted."""
+        self._wanted = wanted
         self._folder, self._stream, self._config = folder, stream, config
         self._cpu_s, self._wall_s = time.process_time(), time.perf_counter()
         self._cost_cpu_s = self._cost_wall_s = 0.0
@@ -110,7 +111,11 @@ class Checkpoints:
 
     def _write_if_due(self, drive: Drive, times: float) -> None:
         cpu_s, wall_s = time.process_time(), time.perf_counter()
-        if cpu_s - self._cpu_s < max(LEAST_S, times * self._cost_cpu_s) or wall_s - self._wall_s < times * self._cost_wall_s:
+        if (
+            not self._wanted
+            or cpu_s - self._cpu_s < max(LEAST_S, times * self._cost_cpu_s)
+            or wall_s - self._wall_s < times * self._cost_wall_s
+        ):
             return
         try:
             self._write(drive)

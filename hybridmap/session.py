@@ -58,6 +58,7 @@ def run(
     resume: bool = False,
     progress: Progress | None = None,
     opened: Opened | None = None,
+    repeatable: bool = True,
 ) -> Session:
     """Map a stream into a session folder.
 
@@ -75,6 +76,7 @@ def run(
             that can be used. A session that ended is returned as it is.
         progress: called with (observations done, observations expected; None if unknown).
         opened: called with the mapper and the map file before the first sample, for a stream that shows what is mapped.
+        repeatable: whether the stream gives the same samples another time; a live one does not, and cannot be resumed.
 
     Raises:
         StreamError: the stream is damaged or unordered, or has no odometry and views to map.
@@ -104,7 +106,7 @@ def run(
                 log.info("%s: resumed at node %d", out, len(mapper.map) - 1)
             if opened is not None:
                 opened(mapper, store)
-            checkpoints = Checkpoints(folder, stream, config)
+            checkpoints = Checkpoints(folder, stream, config, wanted=repeatable)
             _drive(stream, drive, checkpoints, progress)
             session = _conclude(stream, mapper, drive.recorder, folder)
             store.close()

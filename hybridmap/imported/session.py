@@ -10,7 +10,7 @@ import numpy as np
 
 from hybridmap.backends import objective
 from hybridmap.backends.base import ODOMETRY, SolveReport, SolveStatus
-from hybridmap.backends.driver import Ensemble
+from hybridmap.backends.ensemble import Ensemble
 from hybridmap.config import Config
 from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, Array, RelativePose, compose_relative

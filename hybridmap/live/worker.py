@@ -177,7 +177,7 @@ def work(pipe: Connection) -> None:
     while True:
         stream = PipedStream(pipe, begin)
         try:
-            finished = session.run(stream, begin.config, begin.out, overwrite=overwrite, opened=stream.opened)
+            finished = session.run(stream, begin.config, begin.out, overwrite=overwrite, opened=stream.opened, repeatable=False)
         except _RestartError:
             overwrite = True
             continue

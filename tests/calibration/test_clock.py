@@ -121,7 +121,8 @@ class LateRoom(RoomDrive):
             )
             for i in range(0, len(poses), 2)
         ]
-        yield from merge(motions, scans)
+        samples: Iterator[Sample] = merge(motions, scans)
+        yield from samples
 
 
 def mapped(late_s: float, **settings: object) -> Mapper:

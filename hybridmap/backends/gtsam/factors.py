@@ -130,5 +130,5 @@ def exact_values(exact: Array) -> Any:
     """The `gtsam.Values` that `exact_poses` read, to the bit; of a yaw alone the cosine would differ in its last bit."""
     out = gtsam.Values()
     for key, (x, y, cos, sin) in enumerate(exact.tolist()):
-        out.insert(key, gtsam.Pose2(gtsam.Rot2.fromCosSin(cos, sin), gtsam.Point2(x, y)))
+        out.insert(key, gtsam.Pose2(gtsam.Rot2.fromCosSin(cos, sin), np.array([x, y])))
     return out
