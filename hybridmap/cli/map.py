@@ -95,9 +95,6 @@ def map_source(
     """
     from hybridmap.cli.choose import choose, parse_settings
 
-    if resume and overwrite:
-        raise ConfigError("--resume and --overwrite: one goes on with the session that the other replaces; give one")
-
     topics = sensor_settings(
         source,
         odometry_topic=odometry_topic,
@@ -111,19 +108,24 @@ def map_source(
     chosen_here = {key: value for key, value in named.items() if value is not None}
     overrides = {**topics, **chosen_here, **parse_settings(setting)}
     chosen = choose(source, config, overrides, start_s=start, end_s=end, skip_damaged=skip_damaged)
-    if onto is not None:
-        from hybridmap.sessions.joining import map_onto
-
-        with progress(f"mapping {chosen.stream.name}") as advance:
-            joined = map_onto(chosen.stream, chosen.config, onto, out, overwrite=overwrite, progress=advance)
-        head, metrics = joined.head, joined.metrics
-    else:
-        head, metrics = map_and_report(chosen.stream, chosen.config, out, overwrite=overwrite, resume=resume)
+    head, metrics = _mapped(chosen, out, onto, overwrite=overwrite, resume=resume)
     emit(head, metrics, as_json=as_json, title=f"{out}: {chosen.stream.name}")
     if not as_json and onto is None:
         typer.echo(f"page: {out / 'report.html'}")
     if strict and chosen.stream.report.lost:
         raise typer.Exit(LOST)
+
+
+def _mapped(chosen: Any, out: Path, onto: Path | None, *, overwrite: bool, resume: bool) -> tuple[dict[str, Any], list[Any]]:
+    if resume and (overwrite or onto is not None):
+        raise ConfigError("--resume goes on with a session as it is; give it without --overwrite and --onto")
+    if onto is None:
+        return map_and_report(chosen.stream, chosen.config, out, overwrite=overwrite, resume=resume)
+    from hybridmap.sessions.joining import map_onto
+
+    with progress(f"mapping {chosen.stream.name}") as advance:
+        joined = map_onto(chosen.stream, chosen.config, onto, out, overwrite=overwrite, progress=advance)
+    return joined.head, joined.metrics
 
 
 def map_and_report(
