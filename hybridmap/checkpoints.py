@@ -19,7 +19,7 @@ from hybridmap.mapper import Mapper
 from hybridmap.output import is_held
 from hybridmap.recorder import Recorder
 from hybridmap.store import MapStore, checkpoint
-from hybridmap.store.checkpoint import Origin, UnusableError
+from hybridmap.store.checkpoint import Origin, Parts, UnusableError
 from hybridmap.store.session_folder import SessionFolder
 from hybridmap.store.tables import Mark
 from hybridmap.streams.base import Observation, Sample, SeekableStream, Stream, StreamReport
@@ -27,9 +27,10 @@ from hybridmap.streams.base import Observation, Sample, SeekableStream, Stream, 
 log = logging.getLogger(__name__)
 
 LEAST_S = 0.25
-"""Least time between two checkpoints, s."""
+"""Least CPU time between two checkpoints, s."""
 TIMES_ITS_COST = 40.0
-"""Least time between two checkpoints in units of what the last one took: they take 2.5 % of the time at most."""
+"""Least CPU time between two checkpoints in units of what the last one took: they take 2.5 % of it at most."""
+_TIMES_ITS_WAIT = 8.0  # the same for time by the clock: a slow disk may not hold up a drive
 _SOON = 5.0  # the same before the end of the drive, which is long and cannot be broken into pieces
 _FIRST = 3  # samples whose stamps tell one recording from another
 
@@ -83,15 +84,25 @@ class Drive:
             yield sample
 
 
+@dataclass(frozen=True, slots=True)
+class Resumable:
+    """A drive as of its last checkpoint, and the parts of it that need not be written again."""
+
+    drive: Drive
+    parts: Parts
+
+
 class Checkpoints:
     """Writes checkpoints of a run, so far apart that they cost little, and removes them at its end.
 
     A checkpoint that cannot be written, because the disk is full or a front-end is not ours, is only warned of, once.
     """
 
-    def __init__(self, folder: SessionFolder, stream: Stream, config: Config, *, wanted: bool = True) -> None:
-        """Begin before the first checkpoint; none is written unless they are wanted."""
-        self._wanted = wanted
+    def __init__(
+        self, folder: SessionFolder, stream: Stream, config: Config, parts: Parts | None = None, *, wanted: bool = True
+    ) -> None:
+        """Begin before the first checkpoint, or with the parts of earlier ones; none is written unless they are wanted."""
+        self._wanted, self._parts = wanted, parts or Parts(folder.checkpoint)
         self._folder, self._stream, self._config = folder, stream, config
         self._cpu_s, self._wall_s = time.process_time(), time.perf_counter()
         self._cost_cpu_s = self._cost_wall_s = 0.0
@@ -107,7 +118,7 @@ class Checkpoints:
 
     def remove(self) -> None:
         """Remove the checkpoint: the run came to its end."""
-        self._folder.checkpoint.unlink(missing_ok=True)
+        checkpoint.remove(self._folder.checkpoint)
 
     def _write_if_due(self, drive: Drive, times: float) -> None:
         cpu_s, wall_s = time.process_time(), time.perf_counter()
@@ -117,6 +128,8 @@ class Checkpoints:
             or wall_s - self._wall_s < times * self._cost_wall_s
         ):
             return
+        provenance.mapping()  # takes its time once
+        cpu_s, wall_s = time.process_time(), time.perf_counter()
         try:
             self._write(drive)
         except (UnusableError, OutputError) as error:
@@ -131,11 +144,12 @@ class Checkpoints:
         store.sync()
         drive.mark, drive.report = store.mark(), self._stream.report
         origin = _origin(self._stream, self._config, drive.first_ns)
-        size = checkpoint.write(self._folder.checkpoint, origin, drive, {"store": store, **_sections(self._config)})
+        known = {"store": store, **_sections(self._config)}
+        size = checkpoint.write(self._folder.checkpoint, origin, drive, known, self._parts)
         log.info("checkpoint at node %d: %.1f MB", len(drive.mapper.map) - 1, size / 1e6)
 
 
-def resumable(folder: SessionFolder, stream: Stream, config: Config) -> Drive | None:
+def resumable(folder: SessionFolder, stream: Stream, config: Config) -> Resumable | None:
     """The drive of a session whose run did not end, as of its last checkpoint.
 
     Its recorder has no map file yet.
@@ -156,7 +170,7 @@ def resumable(folder: SessionFolder, stream: Stream, config: Config) -> Drive | 
         return None
 
 
-def _last(folder: SessionFolder, stream: Stream, config: Config) -> Drive:
+def _last(folder: SessionFolder, stream: Stream, config: Config) -> Resumable:
     if not folder.map_db.is_file():
         raise UnusableError(f"{folder.path}: there is no session to resume")
     with MapStore.open(folder.path) as store:
@@ -172,14 +186,15 @@ def _last(folder: SessionFolder, stream: Stream, config: Config) -> Drive:
         here = _origin(stream, config, tuple(sample.stamp_ns for sample in islice(stream, len(origin.first_ns))))
         if here != origin:
             raise _another(folder, f"source: {stream.name} has other samples than before")
-        drive = checkpoint.read(folder.checkpoint, {"store": None, **_sections(config)})
+        found = checkpoint.read(folder.checkpoint, {"store": None, **_sections(config)})
+        drive = found.state
         if not isinstance(drive, Drive) or drive.mark is None:
             raise UnusableError(f"{folder.checkpoint}: damaged: holds no drive")
         store.check()
         now = store.mark()
         if now.nodes < drive.mark.nodes or now.last_ns < drive.mark.last_ns:
             raise UnusableError(f"{folder.map_db}: ends at node {now.nodes - 1}, before the checkpoint")
-    return drive
+    return Resumable(drive, found.parts)
 
 
 def _another(folder: SessionFolder, what: str) -> StoreError:

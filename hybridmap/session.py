@@ -90,7 +90,7 @@ def run(
         read = folder.read_metrics()
         return Session(folder, read.head, read.metrics)
     before = resumable(folder, stream, config) if resume else None
-    mapper = Mapper(config, stream.rig) if before is None else before.mapper
+    mapper = Mapper(config, stream.rig) if before is None else before.drive.mapper
     with folder.writing(overwrite=overwrite or (resume and before is None), resume=before is not None) as unfinished:
         if before is None:
             folder.write_config(config.to_yaml())
@@ -100,13 +100,14 @@ def run(
         else:
             store = MapStore.resume(folder.path)
         with store, _kept(folder, store, mapper, unfinished):
-            drive = before or Drive(mapper, Recorder(mapper, store))
+            drive = Drive(mapper, Recorder(mapper, store)) if before is None else before.drive
             if before is not None:
-                before.rewind(store)
+                drive.rewind(store)
                 log.info("%s: resumed at node %d", out, len(mapper.map) - 1)
             if opened is not None:
                 opened(mapper, store)
-            checkpoints = Checkpoints(folder, stream, config, wanted=repeatable)
+            parts = None if before is None else before.parts
+            checkpoints = Checkpoints(folder, stream, config, parts, wanted=repeatable)
             _drive(stream, drive, checkpoints, progress)
             session = _conclude(stream, mapper, drive.recorder, folder)
             store.close()

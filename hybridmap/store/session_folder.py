@@ -32,6 +32,7 @@ _FILES = (
     "reference",
     "report.html",
     "checkpoint",
+    "checkpoint.parts",
 )
 
 
