@@ -172,7 +172,7 @@ class PartWriter(Writer):
 def _slots(kind: Any) -> tuple[str, ...]:
     """Names of the fields of a frozen dataclass with slots; empty for other classes."""
     params = getattr(kind, "__dataclass_params__", None)
-    frozen = params is not None and params.frozen and not hasattr(kind, "__dict__")
+    frozen = params is not None and params.frozen and kind.__dictoffset__ == 0
     return tuple(one.name for one in fields(kind)) if frozen else ()
 
 
