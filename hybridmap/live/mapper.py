@@ -20,8 +20,9 @@ from hybridmap.errors import HybridMapError, LiveError
 from hybridmap.export.keyframes import OccupancyGrid
 from hybridmap.geometry import Array, compose, inverse
 from hybridmap.live import doctor
+from hybridmap.live.drawing import Artist
 from hybridmap.live.inbox import Inbox, LiveLimits
-from hybridmap.live.messages import Answer, Ask, Begin, Done, Dropped, End, Ready, Reset, Snapshot, empty_snapshot
+from hybridmap.live.messages import Begin, Done, Dropped, End, Ready, Reset, Save, Saved, Snapshot, empty_snapshot
 from hybridmap.live.odometry import ReceivedOdometry, SmoothedCorrection, Smoother
 from hybridmap.live.process import MappingProcess
 from hybridmap.live.samples import check, used
@@ -117,12 +118,13 @@ class LiveMapper:
         self._changed = threading.Condition()
         self._outgoing: list[Any] = []  # messages that go before any sample
         self._told: Counter[tuple[str, str]] = Counter()  # what the child knows of samples that were left out
-        self._asked: dict[int, Future[Any]] = {}
+        self._saved: dict[int, Future[None]] = {}
         self._numbers = 0
         self._ready: Future[None] = Future()
         self._result: Future[Session] = Future()
         self._ended_s: float | None = None  # when `finish` was called
         self._drive = _Drive(self._rig, self._limits)
+        self._artist = Artist(out)
         self._process = process or MappingProcess()
         self._process.begin(Begin(config, self._rig, out, name, overwrite), self._receive, self._fail)
         try:
@@ -243,17 +245,23 @@ class LiveMapper:
         Raises:
             LiveError: no answer in this time, or the mapping process has ended.
         """
-        self._ask("save", timeout_s=timeout_s)
+        self._require_running()
+        saved: Future[None] = Future()
+        with self._changed:
+            number = self._numbers = self._numbers + 1
+            self._saved[number] = saved
+            self._outgoing.append(Save(number))
+            self._changed.notify()
+        _waited(saved, timeout_s)
 
     def grid(self, resolution_m: float = 0.05, timeout_s: float | None = None) -> OccupancyGrid:
-        """Wait for the occupancy grid of the map so far.
+        """Draw the occupancy grid of the newest snapshot and wait for it. A third process does it, so mapping goes on.
 
         Raises:
             ExportError: the map shows no obstacle yet.
-            LiveError: no answer in this time, or the mapping process has ended.
+            LiveError: it is not there in this time, or its process has ended.
         """
-        grid: OccupancyGrid = self._ask("grid", resolution_m, timeout_s=timeout_s)
-        return grid
+        return self._artist.grid(self._drive.snapshot.poses, resolution_m, timeout_s)
 
     def reset(self) -> None:
         """Leave the map and begin a new one in its place; waits until the step that is being done has ended."""
@@ -283,6 +291,7 @@ class LiveMapper:
         """Let go of the mapping process without waiting; what was not finished it concludes by itself."""
         self._fail(LiveError("the live mapper was closed"))
         self._process.close()
+        self._artist.close()
 
     def __enter__(self) -> Self:
         return self
@@ -310,16 +319,6 @@ class LiveMapper:
         if self._ended_s is not None:
             raise LiveError("the session is finished; make a new LiveMapper")
 
-    def _ask(self, what: str, *arguments: Any, timeout_s: float | None) -> Any:
-        self._require_running()
-        answer: Future[Any] = Future()
-        with self._changed:
-            number = self._numbers = self._numbers + 1
-            self._asked[number] = answer
-            self._outgoing.append(Ask(number, what, arguments))
-            self._changed.notify()
-        return _waited(answer, timeout_s)
-
     def _feed(self) -> None:
         """Send what has to be sent, in a thread of its own, until the end."""
         while not self._result.done():
@@ -333,21 +332,21 @@ class LiveMapper:
 
     def _next(self) -> list[Any]:
         """The messages to send now."""
-        now_s, asked, ending = time.monotonic(), self._outgoing, self._ended_s is not None
+        now_s, orders, ending = time.monotonic(), self._outgoing, self._ended_s is not None
         self._outgoing = []
         samples = self._drive.inbox.flush(now_s) if ending else self._drive.inbox.take(now_s)
         left_out = self._drive.inbox.left_out
         news = [Dropped(*key, number) for key, number in (left_out - self._told).items()]
         self._told = left_out
-        return [*asked, *news, *samples, *([End()] if ending else [])]
+        return [*orders, *news, *samples, *([End()] if ending else [])]
 
     def _receive(self, message: Any) -> None:
         """Take in a message of the mapping process."""
         with self._changed:
             if isinstance(message, Ready):
                 self._ready.set_result(None)
-            elif isinstance(message, Answer):
-                _settle(self._asked.pop(message.number), message.value)
+            elif isinstance(message, Saved):
+                self._saved.pop(message.number).set_result(None)
             elif not self._ready.done():
                 return  # of the map that was left
             elif isinstance(message, Done):
@@ -362,18 +361,11 @@ class LiveMapper:
     def _fail(self, error: HybridMapError) -> None:
         """End everything that waits for the mapping process, by an error."""
         with self._changed:
-            waiting: list[Future[Any]] = [self._ready, self._result, *self._asked.values()]
+            waiting: list[Future[Any]] = [self._ready, self._result, *self._saved.values()]
             for future in waiting:
                 if not future.done():
                     future.set_exception(error)
             self._changed.notify()
-
-
-def _settle(future: Future[Any], value: Any) -> None:
-    if isinstance(value, HybridMapError):
-        future.set_exception(value)
-    else:
-        future.set_result(value)
 
 
 def _waited(future: Future[Any], timeout_s: float | None) -> Any:

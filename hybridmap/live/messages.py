@@ -35,12 +35,10 @@ class Dropped:
 
 
 @dataclass(frozen=True, slots=True)
-class Ask:
-    """To the child: do something between two samples and answer with the same number; `what` is a method of the worker."""
+class Save:
+    """To the child: write everything so far, and answer with the same number."""
 
     number: int
-    what: str
-    arguments: tuple[Any, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,11 +74,10 @@ class Done:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """To the robot: what was asked for by `Ask`, or the error in place of it."""
+class Saved:
+    """To the robot: what `Save` asked for is done."""
 
     number: int
-    value: Any
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,14 +22,17 @@ from hybridmap.session import Session
 _PACKAGE = str(Path(hybridmap.__file__).parents[1])
 
 
-class MappingProcess:
-    """A process that runs `hybridmap.live.worker`, with a pipe in both directions.
+class PipedProcess:
+    """A process that runs a module of this package, with a pipe in both directions; its number is the only argument.
 
     It is started anew and not forked, as a robot's program has threads. It gets no Ctrl-C, as that is for the robot's
-    program. Until `begin` it only loads what mapping needs, which takes some seconds: start it early.
+    program, and ends when the pipe is closed.
+
+    Attributes:
+        pipe: this end of the pipe.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, module: str) -> None:
         """Start the process.
 
         Raises:
@@ -38,24 +41,52 @@ class MappingProcess:
         self._socket, theirs = socket.socketpair()
         for end in (self._socket, theirs):
             end.setblocking(True)  # whatever `socket.setdefaulttimeout` says: rospy sets it
-        self._pipe = Connection(os.dup(self._socket.fileno()))
+        self.pipe = Connection(os.dup(self._socket.fileno()))
         paths = [_PACKAGE, *filter(None, [os.environ.get("PYTHONPATH")])]
         with theirs:
             try:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", "hybridmap.live.worker", str(theirs.fileno())],
+                    [sys.executable, "-m", module, str(theirs.fileno())],
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
                     start_new_session=True,
                     env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
                 )
             except OSError as error:
-                raise LiveError(f"the mapping process cannot be started: {error}") from None
+                raise LiveError(f"a process cannot be started: {error}") from None
 
     @property
     def pid(self) -> int:
         """Number of the process."""
         return self._process.pid
+
+    def send(self, messages: Iterable[Any]) -> None:
+        """Write messages; it waits while the pipe is full. That the process has gone is seen when reading, and not here."""
+        with suppress(OSError):
+            for message in messages:
+                self.pipe.send(message)
+
+    def close(self) -> None:
+        """Close the pipe. It may be called twice."""
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+
+    def end(self) -> str:
+        """Wait for the end of the process, and say in words how it was."""
+        code = self._process.wait()
+        self._socket.close()
+        return f"by signal {-code}" if code < 0 else f"with exit code {code}"
+
+
+class MappingProcess(PipedProcess):
+    """The process that maps.
+
+    Until `begin` it only loads what mapping needs, which takes some seconds: start it early. When the pipe is closed it
+    concludes its session.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("hybridmap.live.worker")
 
     def begin(self, begin: Begin, receive: Callable[[Any], None], ended: Callable[[HybridMapError], None]) -> None:
         """Begin to map.
@@ -68,31 +99,18 @@ class MappingProcess:
         self.send([begin])
         threading.Thread(target=self._listen, args=(receive, ended), name="hybridmap-listen", daemon=True).start()
 
-    def send(self, messages: Iterable[Any]) -> None:
-        """Write messages; it waits while the pipe is full. That the process has gone is told by `ended`, and not here."""
-        with suppress(OSError):
-            for message in messages:
-                self._pipe.send(message)
-
-    def close(self) -> None:
-        """Close the pipe; the process then concludes its session. It may be called twice."""
-        with suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
-
     def _listen(self, receive: Callable[[Any], None], ended: Callable[[HybridMapError], None]) -> None:
         """Pass on messages until the process ends."""
         error: HybridMapError | None = None
         finished = False
         with suppress(EOFError, OSError):
             while True:
-                message = self._pipe.recv()
+                message = self.pipe.recv()
                 if isinstance(message, Failed):
                     error = getattr(errors, message.error, LiveError)(message.words)
                 else:
                     finished |= isinstance(message, Session)
                     receive(message)
-        code = self._process.wait()
+        how = self.end()
         if not finished:
-            how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
             ended(error or LiveError(f"the mapping process ended {how}; what it had mapped is in the session folder"))
-        self._socket.close()

@@ -19,11 +19,9 @@ import numpy as np
 
 from hybridmap import session
 from hybridmap.errors import HybridMapError
-from hybridmap.export.formats import ExportOptions, SessionView
-from hybridmap.export.keyframes import OccupancyGrid, build_grid
 from hybridmap.graph.io import graph_hash
 from hybridmap.live.inbox import SLOW, source_of
-from hybridmap.live.messages import Answer, Ask, Begin, Done, Dropped, End, Failed, Ready, Reset, Snapshot
+from hybridmap.live.messages import Begin, Done, Dropped, End, Failed, Ready, Reset, Save, Saved, Snapshot
 from hybridmap.mapper import Mapper
 from hybridmap.store import MapStore
 from hybridmap.streams.base import Observation, Sample, StreamReport
@@ -76,8 +74,9 @@ class PipedStream:
                 return
             if isinstance(message, Reset):
                 raise _RestartError("a new map was asked for")
-            if isinstance(message, Ask):
-                self._send(self._answer(message))
+            if isinstance(message, Save):
+                self._save()
+                self._send(Saved(message.number))
             elif isinstance(message, Dropped):
                 self._note(message)
             else:
@@ -93,20 +92,13 @@ class PipedStream:
             self._taken += 1
             self._unmapped.append(sample.stamp_ns)
 
-    def save(self) -> None:
+    def _save(self) -> None:
         """Write the maps of all back-ends, and everything else so far, so that readers find a whole session."""
         mapper, store = self._parts
         for name, solution in mapper.backends.solutions.items():
             store.put_solution(name, solution.poses, solution.report)
         store.put_info("primary_backend", mapper.backends.primary)
         store.commit()
-
-    def grid(self, resolution_m: float) -> OccupancyGrid:
-        """The occupancy grid of the map so far."""
-        mapper, store = self._parts
-        view = SessionView(store, mapper.backends.primary, ExportOptions(resolution_m=resolution_m))
-        view.poses = mapper.poses()
-        return build_grid(view)
 
     def show(self, *, ended: bool = False) -> None:
         """Send a snapshot of the map as it is now."""
@@ -138,13 +130,6 @@ class PipedStream:
             self._taken, self._busy_s = 0, 0.0 if mapped else self._busy_s
         if len(mapper.map) > self._shown and (time.monotonic() >= self._show_after_s or not self._pipe.poll()):
             self.show()
-
-    def _answer(self, asked: Ask) -> Answer:
-        methods = {method.__name__: method for method in (self.save, self.grid)}
-        try:
-            return Answer(asked.number, methods[asked.what](*asked.arguments))
-        except HybridMapError as error:
-            return Answer(asked.number, error)
 
     def _note(self, dropped: Dropped) -> None:
         """Count what the robot's process has left out, for the figures and the verdict."""

@@ -12,7 +12,7 @@ import pytest
 
 from hybridmap import session
 from hybridmap.config import Config
-from hybridmap.errors import LiveError, OutputError, StreamError
+from hybridmap.errors import ExportError, LiveError, OutputError, StreamError
 from hybridmap.export.formats import ExportOptions, open_view
 from hybridmap.geometry import compose, inverse
 from hybridmap.live import LiveLimits, LiveMapper
@@ -52,6 +52,8 @@ def recorded(drive, tmp_path_factory):
 def test_the_map_is_that_of_the_recording_whatever_the_order_across_sources(drive, recorded, tmp_path):
     samples = as_they_arrive(drive)
     with LiveMapper(CONFIG, drive.rig, tmp_path / "s", limits=PATIENT) as mapper:
+        with pytest.raises(ExportError, match="no node yet"):
+            mapper.grid()
         for sample in samples[:100]:
             mapper.add(sample)
         until(lambda: mapper.report.nodes > 3)
@@ -65,7 +67,6 @@ def test_the_map_is_that_of_the_recording_whatever_the_order_across_sources(driv
         with MapStore.open(tmp_path / "s") as store:
             assert store.primary in store.solutions()
             assert not store.ended
-        assert (mapper.grid(0.1).log_odds > 0.0).sum() > 50
         finished = mapper.finish()
         assert mapper.report.dropped == {}
         assert mapper.report.state == "finished"
@@ -100,6 +101,7 @@ def test_everything_answers_while_the_mapper_does_not_and_what_is_left_out_is_sa
             time.sleep(0.01)
         assert slowest_s < 0.25  # on a machine that does much else
         report = mapper.report
+        assert (mapper.grid(0.1, 60.0).log_odds > 0.0).sum() > 50
         with pytest.raises(LiveError, match=r"no answer in 0\.1 s"):
             mapper.save(0.1)
         os.kill(mapper.pid, signal.SIGCONT)
