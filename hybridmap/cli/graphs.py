@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from hybridmap.backends.pieces import pieces_of
 from hybridmap.cli.choose import parse_settings
 from hybridmap.config import Config
 from hybridmap.config.backends import BackendsConfig
@@ -55,6 +56,8 @@ def open_graph(path: Path) -> GraphSource:
     graph = experiences.pose_graph()
     if graph.n_edges == 0:
         raise GraphError(f"{path}: the map has no accepted edge; there is nothing to optimise")
+    if len(pieces := pieces_of(graph)) > 1:
+        raise GraphError(f"{path}: the map is {len(pieces)} pieces that are not joined; expected one, see `edit`")
     head = _head(path, graph) | {"graph_hash": graph_hash(experiences), "remarks": _doubts(SessionFolder(path))}
     return GraphSource(path, graph, is_session=True, start="dead reckoning", head=head, kidnapped=kidnappings(experiences))
 

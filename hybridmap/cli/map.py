@@ -110,7 +110,7 @@ def map_source(
     chosen = choose(source, config, overrides, start_s=start, end_s=end, skip_damaged=skip_damaged)
     head, metrics = _mapped(chosen, out, onto, overwrite=overwrite, resume=resume)
     emit(head, metrics, as_json=as_json, title=f"{out}: {chosen.stream.name}")
-    if not as_json and onto is None:
+    if not as_json:
         typer.echo(f"page: {out / 'report.html'}")
     if strict and chosen.stream.report.lost:
         raise typer.Exit(LOST)
@@ -121,10 +121,12 @@ def _mapped(chosen: Any, out: Path, onto: Path | None, *, overwrite: bool, resum
         raise ConfigError("--resume goes on with a session as it is; give it without --overwrite and --onto")
     if onto is None:
         return map_and_report(chosen.stream, chosen.config, out, overwrite=overwrite, resume=resume)
+    from hybridmap.report import write_report
     from hybridmap.sessions.joining import map_onto
 
     with progress(f"mapping {chosen.stream.name}") as advance:
         joined = map_onto(chosen.stream, chosen.config, onto, out, overwrite=overwrite, progress=advance)
+    write_report(joined.folder)
     return joined.head, joined.metrics
 
 

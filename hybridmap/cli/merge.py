@@ -24,7 +24,9 @@ def merge(
     Then both are solved as one map. If the second is not found, the new map holds both, each in a frame of its own, and the
     verdict says `not joined`. Both maps stay as they are; nodes and edges of each are kept bit for bit.
     """
+    from hybridmap.report import write_report
     from hybridmap.sessions.joining import merge as merge_maps
 
     joined = merge_maps(base, other, out, overwrite=overwrite)
+    write_report(joined.folder)
     emit(joined.head, joined.metrics, as_json=as_json, title=f"{out}: {joined.head['source']}")

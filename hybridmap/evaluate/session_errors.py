@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from hybridmap.backends.base import ODOMETRY
 from hybridmap.errors import EvaluationError, counted
 from hybridmap.evaluate.association import associate
@@ -101,19 +103,22 @@ def session_trajectories(session: SessionFolder, store: MapStore) -> dict[str, T
 
 
 def _judge_closures(store: MapStore, truth: Trajectory) -> dict[str, ClosureErrors]:
-    experiences = store.map()
+    experiences, numbers = store.map().newest_session()
     judged = {"graph": closure_errors(experiences, truth)}
     for name, solution in store.solutions().items():
         if name != ODOMETRY:
-            judged[name] = closure_errors(experiences, truth, rejected=frozenset(solution.report.rejected_edge_ids))
+            rejected = np.flatnonzero(np.isin(numbers, solution.report.rejected_edge_ids))
+            judged[name] = closure_errors(experiences, truth, rejected=frozenset(rejected.tolist()))
     return judged
 
 
 def _judge_edges(store: MapStore, truth: Trajectory) -> list[Metric]:
     solution = store.solutions().get(store.primary)
-    weights = {} if solution is None else solution.report.weights
+    experiences, numbers = store.map().newest_session()
+    given = {} if solution is None else solution.report.weights
+    weights = {place: given[number] for place, number in enumerate(numbers.tolist()) if number in given}
     metrics = []
-    for kind, errors in edge_errors(store.map(), truth, weights).items():
+    for kind, errors in edge_errors(experiences, truth, weights).items():
         metrics += _edge_metrics(kind.name.lower(), errors)
     return metrics
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from hybridmap.backends import Solution, create, names
 from hybridmap.backends.base import ODOMETRY
+from hybridmap.backends.pieces import pieces_of
 from hybridmap.config import Config
 from hybridmap.errors import ExportError
 from hybridmap.export import FORMATS, Format
@@ -166,10 +167,22 @@ def export_session(
     with staged(*targets, overwrite=overwrite) as work:
         view = open_view(folder, backend, options or ExportOptions())
         try:
+            if not chosen.of_pieces:
+                _require_one_piece(folder, view)
             metrics = writer(view, work / targets[0].name)
         finally:
             view.store.close()
     return Exported(targets, view.backend, metrics)
+
+
+def _require_one_piece(folder: Path, view: SessionView) -> None:
+    """Refuse a map in pieces: drawn together they would look joined."""
+    count = len(pieces_of(view.experiences.pose_graph()))
+    if count > 1:
+        raise ExportError(
+            f"{folder}: the map is {count} pieces that are not joined, each in its own frame; take out the others first, by "
+            f"`hybridmap edit {folder} --remove-session N --out DIR`"
+        )
 
 
 def _targets(out: Path, chosen: Format) -> tuple[Path, ...]:

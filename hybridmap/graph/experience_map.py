@@ -68,6 +68,21 @@ class ExperienceMap:
         if len(self) > self._sessions[-1]:
             self._sessions.append(len(self))
 
+    def newest_session(self) -> tuple[ExperienceMap, NDArray[np.int64]]:
+        """The last session by itself: its nodes, numbered from 0, and the edges between them, with their numbers here (E,)."""
+        session = self.sessions[-1]
+        if session.start == 0:
+            return self, np.arange(len(self._edges))
+        out, numbers = ExperienceMap(), []
+        for node in session:
+            out.add_node(self._nodes[node], self.initial[node])
+        for number, edge in enumerate(self._edges):
+            if edge.source in session and edge.target in session:
+                source, target = edge.source - session.start, edge.target - session.start
+                out.add_edge(replace(edge, source=source, target=target, since_node=max(edge.since_node - session.start, 0)))
+                numbers.append(number)
+        return out, np.array(numbers, dtype=np.int64)
+
     @property
     def nodes(self) -> tuple[Node, ...]:
         """All nodes, by number."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from hybridmap.backends.base import ODOMETRY, SolveReport
+from hybridmap.backends.pieces import pieces_of
 from hybridmap.errors import EvaluationError, HybridMapError
 from hybridmap.evaluate.association import PosePairs, associate
 from hybridmap.evaluate.session_errors import session_trajectories
@@ -31,6 +32,10 @@ class Correction:
     shift_m: float
     before: Array
     after: Array
+
+
+BESIDE_M = 10.0
+"""Distance at which pieces of a map that are not joined are drawn beside each other, m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +93,7 @@ def load_scene(folder: SessionFolder, store: MapStore) -> SessionScene:
     followed = [name for name in (*solutions, *store.online_backends()) if name != ODOMETRY]
     backends = tuple(dict.fromkeys((ODOMETRY, *(name for name in followed if name == primary), *followed)))
     experiences = store.map()
+    poses = solutions[primary].poses if primary in solutions else experiences.initial
     place = alignments.get(primary, alignments.get(ODOMETRY, IDENTITY))
     figures = folder.read_metrics()
     return SessionScene(
@@ -97,7 +103,7 @@ def load_scene(folder: SessionFolder, store: MapStore) -> SessionScene:
         truth=truth,
         estimates=estimates,
         pairs={} if truth is None else _pairs(estimates, truth),
-        nodes=compose(place, solutions[primary].poses if primary in solutions else experiences.initial),
+        nodes=compose(place, _side_by_side(poses, experiences)),
         experiences=experiences,
         reports={name: solution.report for name, solution in solutions.items()},
         correction=_correction(store.info("largest_correction"), place),
@@ -105,6 +111,21 @@ def load_scene(folder: SessionFolder, store: MapStore) -> SessionScene:
         metrics=figures.metrics,
         config_yaml=store.config_yaml,
     )
+
+
+def _side_by_side(poses: Array, experiences: ExperienceMap) -> Array:
+    """Poses (N, 3) of a map in pieces that are not joined: that of the newest session stays, the others are put beside it.
+
+    What they show of where the pieces lie relative to each other is nothing, and looks like it.
+    """
+    pieces, out = pieces_of(experiences.pose_graph()), poses.copy()
+    shown = next(nodes for nodes in pieces if nodes[-1] == len(poses) - 1)
+    right_m = poses[shown, 0].max()
+    for nodes in pieces:
+        if nodes is not shown:
+            out[nodes, 0] += right_m + BESIDE_M - poses[nodes, 0].min()
+            right_m = out[nodes, 0].max()
+    return out
 
 
 def _truth(folder: SessionFolder, odometry: Trajectory) -> Trajectory | None:

@@ -11,10 +11,14 @@ import pytest
 
 from hybridmap.backends.pieces import pieces_of, solve_by_piece
 from hybridmap.backends.registry import create
+from hybridmap.cli.graphs import open_graph
 from hybridmap.config import Config
-from hybridmap.errors import StoreError
+from hybridmap.errors import ExportError, GraphError, StoreError
+from hybridmap.evaluate import evaluate_session
+from hybridmap.export.formats import export_session
 from hybridmap.geometry import align, between, compose
 from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.report.session_scene import load_scene
 from hybridmap.session import run
 from hybridmap.sessions.editing import Measured, add_edge, remove_edge, remove_session
 from hybridmap.sessions.joining import merge
@@ -138,6 +142,32 @@ def test_what_is_not_found_stays_apart_and_says_so(drives, tmp_path):
         poses, own = store.solutions()["gtsam-gnc"].poses[list(nodes)], alone.solutions()["gtsam-gnc"].poses
     assert between(poses[0], poses) == pytest.approx(between(own[0], own), abs=1e-3)
     assert not any((edge.source in nodes) != (edge.target in nodes) for edge in accepted(apart.folder.path))
+
+
+def test_pieces_do_not_look_joined(drives, tmp_path):
+    """Not on the page, where they are drawn beside each other, and in no export or solution that puts them in one frame."""
+    apart = merge(drives[0], drives[2], tmp_path / "apart").folder
+    with MapStore.open(apart.path) as store:
+        scene = load_scene(apart, store)
+        here, there = store.map().sessions
+    assert scene.nodes[list(there), 0].max() + 5.0 < scene.nodes[list(here), 0].min()
+    with pytest.raises(ExportError, match="2 pieces that are not joined"):
+        export_session(apart.path, "grid", tmp_path / "grid")
+    with pytest.raises(GraphError, match="2 pieces that are not joined"):
+        open_graph(apart.path)
+    export_session(apart.path, "tum", tmp_path / "newest.tum")
+
+
+def test_a_map_of_several_sessions_is_evaluated_by_its_newest(drives, joined):
+    """The stamps of two sessions may be the same, and what was true of one says nothing of the other."""
+    with MapStore.open(joined.folder.path) as store, MapStore.open(drives[1]) as alone:
+        newest, numbers = store.map().newest_session()
+        own = alone.map()
+    assert len(newest) == len(own)
+    assert [(e.source, e.target, e.status) for e in newest.edges] == [(e.source, e.target, e.status) for e in own.edges]
+    assert len(numbers) == len(own.edges)
+    figures = {metric.name: metric.value for metric in evaluate_session(joined.folder.path)}
+    assert figures["ate_rmse/gtsam-gnc"] < 0.03
 
 
 def accepted(folder):
