@@ -23,7 +23,7 @@ from hybridmap.sessions.joint_map import JointMap, joined_sessions
 from hybridmap.sessions.part import Part
 from hybridmap.store import MapStore
 from hybridmap.store.parts import copy_sessions
-from hybridmap.store.schema import rig_to_json
+from hybridmap.store.records import rig_to_json
 from hybridmap.store.session_folder import SessionFolder
 from hybridmap.store.track import trajectory_of
 from hybridmap.streams.base import Rig, Stream
