@@ -42,6 +42,8 @@ _SHARE = 0.05
 _GRID_WAIT_S = 30.0
 _LONGEST_S = 1.0
 """For how long the stamp of `map -> odom` goes on with the clock when no odometry comes, s."""
+_CLOCK_BACK_S = 3.0
+"""Stamps that go back by more are those of a clock that was set back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +98,7 @@ class RobotNode:
         self._starter: threading.Thread | None = None
         self._threads: list[threading.Thread] = []
         self._told_s = 0.0
+        self._corrected_ns = 0  # stamp of the last `map -> odom`
         self._map_shown = _Shown(options.map_every_s)
         self._graph_shown = _Shown(_PUBLISH_S)
 
@@ -127,12 +130,12 @@ class RobotNode:
             self._process.close()
 
     def _concluded(self) -> Session:
+        if self._error is None and self._incoming is not None:
+            self._incoming.flush()
         if self._starter is not None:
             self._starter.join()
         if self._error is not None:
             raise self._error
-        if self._incoming is not None:
-            self._incoming.flush()
         if self._mapper is None:
             raise StreamError(f"{self._ros.source}: nothing was mapped: {'; '.join(self.missing)}")
         return self._mapper.finish()
@@ -158,6 +161,8 @@ class RobotNode:
                 time.sleep(_LOOK_S)
                 if self._choose(self._ros.topics()).subscriptions == chosen.subscriptions:
                     self._subscribe(chosen)
+        else:
+            self._incoming.look()
         now_s = time.monotonic()
         if now_s - self._told_s > _TELL_S and self.missing:
             self._told_s = now_s
@@ -260,6 +265,9 @@ class RobotNode:
         now_s = time.monotonic()
         since_s = min(now_s - newest[1], _LONGEST_S)
         stamp_ns = newest[0] + round((since_s + self._options.ahead_s) * NS_PER_S)
+        if 0 <= self._corrected_ns - stamp_ns < _CLOCK_BACK_S * NS_PER_S:
+            return  # odometry was late: what was published is still ahead of it
+        self._corrected_ns = stamp_ns
         frames = self._options.map_frame, incoming.frames[0]
         smoothed = mapper.smoothed_map_odom(now_s).pose_map_odom
         self._ros.publish(ros.TF, {"transforms": [contents.transform(stamp_ns, *frames, smoothed)]})
@@ -304,7 +312,7 @@ class RobotNode:
                 self._fail(error)
 
     def _fail(self, error: HybridMapError) -> None:
-        if self._error is None and not self.ended.is_set():
+        if self._error is None:
             self._error = error
         self.ended.set()
 

@@ -144,8 +144,16 @@ class Incoming:
                         return
             self._pass_on(message)
 
+    def look(self) -> None:
+        """Begin if everything has come meanwhile; for when no message comes after the time for further transforms."""
+        with self._start:
+            if self.rig is None:
+                self._try_to_start()
+
     def flush(self) -> None:
-        """The end: give out what the messages that wait make."""
+        """The end: give out what the messages that wait make. No transform is waited for any longer."""
+        self._settle_s = 0.0
+        self.look()
         with self._observe:
             if self._gatherer is not None:
                 self._make(self._gatherer.flush())

@@ -52,19 +52,21 @@ class PlayedRobot:
     def stop(self) -> None:
         """Nothing to leave."""
 
-    def wait_for(self, there: Callable[[], bool], timeout_s: float = 60.0) -> None:
+    def wait_for(self, there: Callable[[], bool], timeout_s: float = 30.0) -> None:
         """Wait until the node has published what makes `there` true."""
         with self.told:
             assert self.told.wait_for(there, timeout_s)
 
-    def play(self, times_real_time: float = 1e9, until_s: float = 1e9) -> None:
-        """Send the messages of the bag, in order of their recording."""
+    def play(self, times_real_time: float, from_s: float = -1e9, until_s: float = 1e9) -> None:
+        """Send the messages of the bag that are stamped between two times after its first, in order of their recording."""
         began_s, first_ns = time.monotonic(), None
         for message in self.bag.raw(set(self.takers) & set(self.bag.types)):
-            if not message.topic.endswith("tf_static"):
-                stamp_ns = self.bag.stamp_ns(message)
-                first_ns = stamp_ns if first_ns is None else first_ns
-                if (stamp_ns - first_ns) / 1e9 > until_s:
-                    return
-                time.sleep(max(0.0, (stamp_ns - first_ns) / 1e9 / times_real_time - (time.monotonic() - began_s)))
-            self.takers[message.topic](message.data, None)
+            if message.topic.endswith("tf_static"):
+                self.takers[message.topic](message.data, None)
+                continue
+            stamp_ns = self.bag.stamp_ns(message)
+            first_ns = stamp_ns if first_ns is None else first_ns
+            after_s = (stamp_ns - first_ns) / 1e9
+            if from_s < after_s <= until_s:
+                time.sleep(max(0.0, (after_s - max(from_s, 0.0)) / times_real_time - (time.monotonic() - began_s)))
+                self.takers[message.topic](message.data, None)

@@ -139,6 +139,16 @@ def test_it_waits_for_a_late_transform_and_says_so(tmp_path: Path) -> None:
     assert len(robot.samples) == 12
 
 
+def test_a_drive_that_ends_before_the_time_for_transforms_is_not_lost(tmp_path: Path) -> None:
+    bag = laser_drive(True).write(tmp_path / "drive.bag")
+    robot = Robot(bag, settle_s=1e6)
+    robot.say()
+    robot.incoming.look()
+    assert robot.samples == []
+    robot.incoming.flush()
+    assert_same(bag, robot)
+
+
 def test_a_damaged_message_is_refused_and_the_next_taken(tmp_path: Path) -> None:
     robot = Robot(laser_drive(True).write(tmp_path / "drive.bag"))
     robot.say()
