@@ -25,13 +25,12 @@ from hybridmap.live.inbox import Inbox, LiveLimits
 from hybridmap.live.messages import Begin, Done, Dropped, End, Ready, Reset, Save, Saved, Snapshot, empty_snapshot
 from hybridmap.live.odometry import ReceivedOdometry, SmoothedCorrection, Smoother
 from hybridmap.live.process import MappingProcess
-from hybridmap.live.samples import check, used
+from hybridmap.live.samples import check, check_kind, stamp_ns_of, used
 from hybridmap.session import Session
 from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
 from hybridmap.streams.sensors import carried
-from hybridmap.trajectory import stamp_ns_from_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,24 +137,24 @@ class LiveMapper:
 
     def add_odometry(self, stamp_s: float, pose_odom_robot: ArrayLike) -> None:
         """Take in a pose (3,) of `base_link` in `odom`, m and rad. Errors are those of `add`."""
-        self.add(SelfMotion(stamp_ns_from_s(stamp_s), np.array(pose_odom_robot, dtype=np.float64)))
+        self.add(SelfMotion(stamp_ns_of(stamp_s), np.array(pose_odom_robot, dtype=np.float64)))
 
     def add_velocity(self, stamp_s: float, v_m_s: float, omega_rad_s: float) -> None:
         """Take in a forward speed and a turn rate that hold until the next call. Errors are those of `add`."""
-        self.add(Velocity(stamp_ns_from_s(stamp_s), float(v_m_s), float(omega_rad_s)))
+        self.add(Velocity(stamp_ns_of(stamp_s), float(v_m_s), float(omega_rad_s)))
 
     def add_rgbd(self, stamp_s: float, color: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> None:
         """Take in a frame: color (H, W, 3) uint8 RGB, depth (H, W) float32 in m, 0 where invalid. Errors are those of `add`.
 
         The arrays must not be changed afterwards.
         """
-        self.add(RgbdFrame(stamp_ns_from_s(stamp_s), color, depth_m))
+        self.add(RgbdFrame(stamp_ns_of(stamp_s), color, depth_m))
 
     def add_scan(self, stamp_s: float, ranges_m: ArrayLike) -> None:
         """Take in a scan (B,), m, NaN or Inf where there is no return. Errors are those of `add`."""
         ranges = np.array(ranges_m, dtype=np.float32)
         ranges[~np.isfinite(ranges)] = np.nan
-        self.add(LaserScan(stamp_ns_from_s(stamp_s), ranges))
+        self.add(LaserScan(stamp_ns_of(stamp_s), ranges))
 
     def add(self, sample: Sample) -> None:
         """Take in any sample, in any order across the sources; those of one source should come in order of stamp.
@@ -165,10 +164,11 @@ class LiveMapper:
                 odometry is mixed with velocities. The sample is left out, and mapping goes on.
             LiveError, or the mapper's own error: the mapping process has ended.
         """
-        self._require_running()
-        check(sample, self._rig, self._drive.odometry.kind)
+        check(sample, self._rig)
         now_s = time.monotonic()
         with self._changed:
+            self._require_running()
+            check_kind(sample, self._drive.odometry.kind)
             if not isinstance(sample, Observation):
                 self._drive.odometry.add(sample)
             self._drive.inbox.add(sample, now_s)
@@ -194,7 +194,7 @@ class LiveMapper:
             StreamError: the stamp lies before the odometry that is kept, some 4000 messages.
         """
         drive = self._drive
-        pose = drive.odometry.newest if stamp_s is None else drive.odometry.at(stamp_ns_from_s(stamp_s))
+        pose = drive.odometry.newest if stamp_s is None else drive.odometry.at(stamp_ns_of(stamp_s))
         return compose(drive.pose_map_odom, pose)
 
     @property
@@ -245,9 +245,9 @@ class LiveMapper:
         Raises:
             LiveError: no answer in this time, or the mapping process has ended.
         """
-        self._require_running()
         saved: Future[None] = Future()
         with self._changed:
+            self._require_running()
             number = self._numbers = self._numbers + 1
             self._saved[number] = saved
             self._outgoing.append(Save(number))
@@ -265,8 +265,8 @@ class LiveMapper:
 
     def reset(self) -> None:
         """Leave the map and begin a new one in its place; waits until the step that is being done has ended."""
-        self._require_running()
         with self._changed:
+            self._require_running()
             self._ready = Future()
             self._drive = _Drive(self._rig, self._limits)
             self._told.clear()
@@ -354,7 +354,7 @@ class LiveMapper:
                 self._drive.correction = message.pose_map_odom
             elif isinstance(message, Snapshot):
                 self._drive.snapshot, self._drive.correction = message, message.pose_map_odom
-            elif isinstance(message, Session):
+            elif isinstance(message, Session) and not self._result.done():
                 self._result.set_result(message)
             self._changed.notify()
 

@@ -128,6 +128,7 @@ def test_a_bad_sample_costs_itself_and_a_killed_mapping_process_is_one_clear_err
         (lambda: mapper.add_odometry(0.1, (0.0, 0.0)), "shape"),
         (lambda: mapper.add_velocity(0.1, 0.0, 0.0), "mixed"),
         (lambda: mapper.add_scan(0.1, [1.0, 2.0]), "expected"),
+        (lambda: mapper.add_scan(np.nan, drive.rig.sensors["laser"].bearings_rad), "stamp nan"),
         (lambda: mapper.add_rgbd(0.1, np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.float32)), "no camera"),
     ):
         with pytest.raises(StreamError, match=said):
