@@ -21,10 +21,10 @@ from hybridmap.edge_book import EdgeBook
 from hybridmap.errors import ConfigError
 from hybridmap.geometry import Array, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
-from hybridmap.graph.experience_map import ExperienceMap
+from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.graph.paths import covariances_from
 from hybridmap.metrics import StageClock
-from hybridmap.sessions.part import Part
+from hybridmap.sessions.part import Arrays, Part
 from hybridmap.streams.base import Rig
 from hybridmap.trajectory import NS_PER_S
 from hybridmap.vision import create_front_end
@@ -65,10 +65,11 @@ class JointMap:
         self.map = ExperienceMap()
         self.poses: Array = np.zeros((0, 3))
         self._book = EdgeBook(self.map, config.edges)
-        self._stamps_s: Array = np.zeros(0)
-        self._travel_m: Array = np.zeros(0)
+        self._stamps_s: list[float] = []
+        self._travel_m: list[float] = []
+        self._shift_s, self._shift_m = 0.0, 0.0  # of the session that is taken up
         self._covariance_from: Callable[[int], Array] | None = None
-        self._solved_m = -np.inf
+        self._solved_m = float("-inf")
 
     def take_up(self, part: Part) -> range:
         """Add a finished map as a piece, or pieces, of its own; returns its node numbers.
@@ -79,18 +80,48 @@ class JointMap:
         first, own = len(self.map), part.experiences
         begins = {session.start for session in own.sessions}
         broken = {edge.target for edge in own.edges if edge.status is Status.ACCEPTED and edge.kidnapped_m is not None}
-        stamps_s, travel_m = own.stamps_ns / NS_PER_S, own.travel_m
         for number, node in enumerate(own.nodes):
             if number in begins:
-                self.map.begin_session()
-                self._stamps_s, self._travel_m = self._apart(stamps_s, travel_m, range(number, _end(own, number)))
-            self.map.add_node(node, own.initial[number])
-            self._vision.restore(first + number, part.keyframe(number), part.state(number), number in begins | broken)
+                self._begin(node)
+            self.add_node(node, own.initial[number], part.keyframe(number), part.state(number), number in begins | broken)
         for edge in own.edges:
-            self.map.add_edge(_moved(edge, first))
+            self.map.add_edge(moved(edge, first))
         self.poses = np.concatenate([self.poses, part.poses])
-        self._covariance_from = None
         return range(first, len(self.map))
+
+    def begin(self, node: Node) -> None:
+        """Let a new session begin with a node, which is added next; its place is looked for by `meet`."""
+        self._begin(node)
+        self._vision.arrive(len(self.map))
+
+    def add_node(self, node: Node, initial: Array, keyframe: Arrays, state: Arrays, begins: bool) -> None:
+        """Add a node of the session that began last; its pose must be appended to `poses`.
+
+        Args:
+            node: the node.
+            initial: (3,) its pose along the chain of odometry edges, m and rad.
+            keyframe, state, begins: as for `MeetingFrontEnd.restore`.
+        """
+        number = self.map.add_node(node, initial)
+        self._vision.restore(number, keyframe, state, begins)
+        self._stamps_s.append(node.stamp_ns / NS_PER_S + self._shift_s)
+        self._travel_m.append(node.travel_m + self._shift_m)
+        self._covariance_from = None
+
+    def put_edge(self, number: int | None, edge: Edge) -> int:
+        """Add an edge of the session that began last (None), or replace the one of a number; returns its number."""
+        self._covariance_from = None
+        if number is None:
+            return self.map.add_edge(edge)
+        self.map.update_edge(number, edge)
+        return number
+
+    def meet(self, node: int) -> list[Edge]:
+        """Look for loops of a node to the sessions before its own; returns those that were accepted.
+
+        With the first ones comes a loose edge to the first node of the session, a registration.
+        """
+        return self._enter(self._vision.meet(node, self._belief(node)))
 
     def join(self, nodes: range) -> float | None:
         """Look for the place of the map that was taken up last, which has these nodes, on those before it.
@@ -103,13 +134,13 @@ class JointMap:
         self._vision.arrive(nodes.start)
         found_m: float | None = None
         for node in nodes:
-            accepted = self._enter(self._vision.meet(node, self._belief(node)))
+            accepted = self.meet(node)
             if accepted and found_m is None:
                 self._place(nodes, accepted)
-                found_m = float(self._travel_m[node] - self._travel_m[nodes.start])
+                found_m = self._travel_m[node] - self._travel_m[nodes.start]
             if accepted and self._travel_m[node] - self._solved_m > SOLVED_EVERY_M:
                 self._solve()
-                self._solved_m = float(self._travel_m[node])
+                self._solved_m = self._travel_m[node]
         if found_m is not None:
             self._solve()
         while self._enter(self._vision.meet_again(self._belief(nodes.stop - 1))):
@@ -120,20 +151,17 @@ class JointMap:
         """The map by each back-end of these names; pieces that are not joined are solved by themselves."""
         return solutions_of(self.map, self.poses, names, self._config)
 
-    def _apart(self, stamps_s: Array, travel_m: Array, session: range) -> tuple[Array, Array]:
-        """All stamps and travel so far, and those of a session, which begin well after those before it."""
-        rows = slice(session.start, session.stop)
-        last_s, last_m = (self._stamps_s[-1], self._travel_m[-1]) if len(self._stamps_s) else (-APART_S, -APART_M)
-        return (
-            np.concatenate([self._stamps_s, last_s + APART_S + stamps_s[rows] - stamps_s[session.start]]),
-            np.concatenate([self._travel_m, last_m + APART_M + travel_m[rows] - travel_m[session.start]]),
-        )
+    def _begin(self, node: Node) -> None:
+        """Begin a session with a node, well after those before it in stamps and travel."""
+        self.map.begin_session()
+        last_s, last_m = (self._stamps_s[-1], self._travel_m[-1]) if self._stamps_s else (-APART_S, -APART_M)
+        self._shift_s, self._shift_m = last_s + APART_S - node.stamp_ns / NS_PER_S, last_m + APART_M - node.travel_m
 
     def _belief(self, node: int) -> Belief:
         if self._covariance_from is None:
             self._covariance_from = covariances_from(self.map.pose_graph())
-        upto = slice(node + 1)
-        return Belief(self.poses, self._stamps_s[upto], self._travel_m[upto], self._covariance_from)
+        stamps_s, travel_m = np.array(self._stamps_s[: node + 1]), np.array(self._travel_m[: node + 1])
+        return Belief(self.poses, stamps_s, travel_m, self._covariance_from)
 
     def _enter(self, proposals: Sequence[Edge]) -> list[Edge]:
         """Write proposals into the map; returns those that were accepted."""
@@ -197,10 +225,6 @@ def joined_sessions(experiences: ExperienceMap) -> list[list[int]]:
     return [np.unique(of_node[nodes]).tolist() for nodes in pieces_of(experiences.pose_graph())]
 
 
-def _end(experiences: ExperienceMap, first: int) -> int:
-    return next(session.stop for session in experiences.sessions if session.start == first)
-
-
-def _moved(edge: Edge, by: int) -> Edge:
+def moved(edge: Edge, by: int) -> Edge:
     """An edge of a part with the node numbers of the joint map."""
     return replace(edge, source=edge.source + by, target=edge.target + by, since_node=edge.since_node + by, key=-1)

@@ -229,7 +229,7 @@ class MeetingFrontEnd(FrontEnd, Protocol):
         """From now on, `meet` looks for loops from the nodes from `first` on to those before it, whose place is known."""
 
     def meet(self, node: int, belief: Belief) -> list[Edge]:
-        """Look for loops of one node of the session that arrived, in the order of its nodes; all of them were restored.
+        """Look for loops of one node of the session that arrived, in the order of its nodes; all of them may be restored.
 
         Until several matches agree, the whole map is searched. Returns new and changed edges. The first accepted ones come with
         a loose edge to the first node of the session.

@@ -39,7 +39,7 @@ class ScanMeeting:
         self._arrive(0)
 
     def arrive(self, first: int) -> None:
-        """Look for the place of the nodes from `first` on; those before it are the map. All nodes are in the atlas."""
+        """Look for the place of the nodes from `first` on; those before it are the map."""
         self._panoramas.extend(to_the_end=True)
         self._arrive(first)
 
@@ -75,6 +75,7 @@ class ScanMeeting:
 
     def _probe(self, node: int, belief: Belief) -> list[Edge]:
         """Register the last metres to the submaps of earlier sessions that may be near."""
+        self._panoramas.extend()
         out = []
         for hypothesis in self._prober.probe(node, belief, before=self._first):
             key = self._new_key()
