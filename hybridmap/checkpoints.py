@@ -26,10 +26,10 @@ from hybridmap.streams.base import Observation, Sample, SeekableStream, Stream, 
 
 log = logging.getLogger(__name__)
 
-LEAST_S = 0.25
+LEAST_S = 0.2
 """Least CPU time between two checkpoints, s."""
-TIMES_ITS_COST = 40.0
-"""Least CPU time between two checkpoints in units of what the last one took: they take 2.5 % of it at most."""
+TIMES_ITS_COST = 33.0
+"""Least CPU time between two checkpoints in units of what the last one took: they take 3 % of it at most."""
 _TIMES_ITS_WAIT = 8.0  # the same for time by the clock: a slow disk may not hold up a drive
 _SOON = 5.0  # the same before the end of the drive, which is long and cannot be broken into pieces
 _FIRST = 3  # samples whose stamps tell one recording from another
@@ -104,6 +104,8 @@ class Checkpoints:
         """Begin before the first checkpoint, or with the parts of earlier ones; none is written unless they are wanted."""
         self._wanted, self._parts = wanted, parts or Parts(folder.checkpoint)
         self._folder, self._stream, self._config = folder, stream, config
+        self._sections = _sections(config)
+        self._origin: Origin | None = None
         self._cpu_s, self._wall_s = time.process_time(), time.perf_counter()
         self._cost_cpu_s = self._cost_wall_s = 0.0
         self._warned = False
@@ -143,9 +145,10 @@ class Checkpoints:
         store = drive.recorder.store
         store.sync()
         drive.mark, drive.report = store.mark(), self._stream.report
-        origin = _origin(self._stream, self._config, drive.first_ns)
-        known = {"store": store, **_sections(self._config)}
-        size = checkpoint.write(self._folder.checkpoint, origin, drive, known, self._parts)
+        if self._origin is None:
+            self._origin = _origin(self._stream, self._config, drive.first_ns)
+        known = {"store": store, **self._sections}
+        size = checkpoint.write(self._folder.checkpoint, self._origin, drive, known, self._parts)
         log.info("checkpoint at node %d: %.1f MB", len(drive.mapper.map) - 1, size / 1e6)
 
 

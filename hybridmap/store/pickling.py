@@ -269,7 +269,7 @@ def _array(array: NDArray[Any]) -> Any:
 
 def _shortened(array: NDArray[Any]) -> Any:
     """How to pickle an array: without the last rows that are all the same, if they are many."""
-    if array.dtype.hasobject or not array.flags.c_contiguous or len(array) < 4:
+    if array.ndim < 2 or array.dtype.hasobject or not array.flags.c_contiguous or len(array) < 4:
         return NotImplemented
     unit = np.uint64 if array.nbytes // len(array) % 8 == 0 else np.uint8
     rows = array.reshape(-1).view(unit).reshape(len(array), -1)
