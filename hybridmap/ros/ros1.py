@@ -7,9 +7,11 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from hybridmap.errors import HybridMapError, RosError
 from hybridmap.ros.contents import Contents, Stamp
-from hybridmap.ros.middleware import Output, Service
+from hybridmap.ros.middleware import OUTPUTS, Output, Service
 from hybridmap.streams.messages import Topic, full_type
 
 _PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -58,7 +60,7 @@ class Ros1:
         self._rospy.init_node(name, argv=["hybridmap", *remappings], disable_signals=True)
         logging.getLogger().handlers[:] = handlers  # rospy has its own ideas of what all other modules log
         self.source = f"ROS 1 at {uri}"
-        self._publishers: dict[Output, Any] = {}
+        self._publishers = {output: self._advertised(output) for output in OUTPUTS}
 
     def topics(self) -> list[Topic]:
         """The topics that others publish."""
@@ -77,14 +79,13 @@ class Ros1:
         size = {"buff_size": _PICTURE_BYTES} if msgtype in _PICTURES else {}
         self._rospy.Subscriber(topic, self._rospy.AnyMsg, received, queue_size=None, tcp_nodelay=True, **size)
 
+    def _advertised(self, output: Output) -> Any:
+        kind = _message_class(output.msgtype)
+        return self._rospy.Publisher(output.topic, kind, queue_size=_QUEUE, latch=output.latched, tcp_nodelay=True)
+
     def publish(self, output: Output, contents: Contents) -> None:
-        """Publish a message; the topic is advertised with the first one."""
-        publisher = self._publishers.get(output)
-        if publisher is None:
-            publisher = self._rospy.Publisher(
-                output.topic, _message_class(output.msgtype), queue_size=_QUEUE, latch=output.latched, tcp_nodelay=True
-            )
-            self._publishers[output] = publisher
+        """Publish a message."""
+        publisher = self._publishers[output]
         if output.latched or publisher.get_num_connections():
             publisher.publish(filled(publisher.data_class(), contents))
 
@@ -124,14 +125,12 @@ class Ros1:
 
 
 def _message_class(msgtype: str) -> Any:
-    """The class of a message type; arrays of its numbers may be numpy's."""
     import roslib.message
-    from rospy.numpy_msg import numpy_msg
 
     found = roslib.message.get_message_class(msgtype.replace("/msg/", "/"))
     if found is None:
         raise RosError(f"ROS 1 has no message type {msgtype.replace('/msg/', '/')}: install its package")
-    return numpy_msg(found) if msgtype.endswith("/OccupancyGrid") else found
+    return found
 
 
 def filled(message: Any, contents: Contents) -> Any:
@@ -147,6 +146,8 @@ def _field(now: Any, kind: str, value: Any) -> Any:
         return type(now)(*value.parts)
     if isinstance(value, Mapping):
         return filled(now, value)
+    if isinstance(value, np.ndarray):
+        return value.tolist()  # what rospy has for arrays of numpy calls a method that numpy 2.3 has no longer
     if isinstance(value, list) and value and isinstance(value[0], Mapping):
         import roslib.message
 
