@@ -3,8 +3,9 @@
 `LiveMapper` is what a robot's program uses.
 """
 
+from hybridmap.live.drive import LiveReport
 from hybridmap.live.inbox import LiveLimits
-from hybridmap.live.mapper import LiveMapper, LiveReport
+from hybridmap.live.mapper import LiveMapper
 from hybridmap.live.messages import Snapshot
 from hybridmap.live.odometry import SmoothedCorrection
 from hybridmap.live.process import MappingProcess

@@ -85,7 +85,3 @@ def main() -> None:
         while True:
             asked: tuple[Any, ...] = pipe.recv()
             pipe.send((asked[0], draw(*asked[1:])))
-
-
-if __name__ == "__main__":
-    main()

@@ -5,9 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -18,55 +16,20 @@ from numpy.typing import ArrayLike, NDArray
 from hybridmap.config import Config
 from hybridmap.errors import HybridMapError, LiveError
 from hybridmap.export.keyframes import OccupancyGrid
-from hybridmap.geometry import Array, compose, inverse
+from hybridmap.geometry import Array, compose
 from hybridmap.live import doctor
 from hybridmap.live.drawing import Artist
-from hybridmap.live.inbox import Inbox, LiveLimits
-from hybridmap.live.messages import Begin, Done, Dropped, End, Ready, Reset, Save, Saved, Snapshot, empty_snapshot
-from hybridmap.live.odometry import ReceivedOdometry, SmoothedCorrection, Smoother
+from hybridmap.live.drive import LiveDrive, LiveReport
+from hybridmap.live.inbox import LiveLimits
+from hybridmap.live.locating import Locator
+from hybridmap.live.messages import Begin, Done, Dropped, End, Ready, Reset, Save, Saved, Snapshot
+from hybridmap.live.odometry import SmoothedCorrection
 from hybridmap.live.process import MappingProcess
 from hybridmap.live.samples import check, check_kind, stamp_ns_of, used
 from hybridmap.session import Session
 from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
-from hybridmap.streams.sensors import carried
-
-
-@dataclass(frozen=True, slots=True)
-class LiveReport:
-    """How a live mapper is doing.
-
-    Attributes:
-        state: `mapping`, `paused`, `finishing`, `finished` or `failed`.
-        samples: source -> number of samples that came.
-        dropped: source -> reason -> number of them that the mapper did not get.
-        lag_s, largest_lag_s: time from the turn of the oldest view that is not on the map until now, and the largest so far.
-        nodes: nodes of the newest snapshot.
-    """
-
-    state: str
-    samples: Mapping[str, int]
-    dropped: Mapping[str, Mapping[str, int]]
-    lag_s: float
-    largest_lag_s: float
-    nodes: int
-
-
-class _Drive:
-    """What belongs to one map, so that `reset` replaces all of it at once."""
-
-    def __init__(self, rig: Rig, limits: LiveLimits) -> None:
-        self.inbox = Inbox((kind.counted for kind, _ in carried(rig)), limits, time.monotonic())
-        self.odometry = ReceivedOdometry()
-        self.smoother = Smoother(limits.correction_m_s, np.deg2rad(limits.correction_deg_s))
-        self.correction: Array | None = None
-        self.snapshot = empty_snapshot()
-
-    @property
-    def pose_map_odom(self) -> Array:
-        """(3,) the newest correction; before the first, the map begins where the robot did."""
-        return inverse(self.odometry.first) if self.correction is None else self.correction
 
 
 class LiveMapper:
@@ -122,8 +85,10 @@ class LiveMapper:
         self._ready: Future[None] = Future()
         self._result: Future[Session] = Future()
         self._ended_s: float | None = None  # when `finish` was called
-        self._drive = _Drive(self._rig, self._limits)
+        self._drive = LiveDrive(self._rig, self._limits)
+        self._out = out
         self._artist = Artist(out)
+        self._locator: Locator | None = None
         self._process = process or MappingProcess()
         self._process.begin(Begin(config, self._rig, out, name, overwrite), self._receive, self._fail)
         try:
@@ -198,6 +163,20 @@ class LiveMapper:
         return compose(drive.pose_map_odom, pose)
 
     @property
+    def pose_base_map(self) -> Array | None:
+        """(3,) pose of this drive's map in the frame of the map that `localise` was given, m and rad.
+
+        The robot is there at `compose(pose_base_map, pose_map_robot())`. None while its place is not known.
+
+        Raises:
+            HybridMapError: the search has ended by an error.
+        """
+        locator = self._locator
+        if locator is not None and locator.error is not None:
+            raise locator.error
+        return None if locator is None else locator.pose_base_map
+
+    @property
     def snapshot(self) -> Snapshot:
         """The newest map that the mapping process has sent, after about every node."""
         return self._drive.snapshot
@@ -208,16 +187,7 @@ class LiveMapper:
     def report(self) -> LiveReport:
         """Numbers of samples, what was left out, and the lag."""
         with self._changed:
-            inbox, now_s = self._drive.inbox, time.monotonic()
-            lag_s = inbox.lag_s(now_s)
-            return LiveReport(
-                self._state,
-                {name: source.count for name, source in inbox.sources.items()},
-                {name: dict(source.left_out) for name, source in inbox.sources.items() if source.left_out},
-                lag_s,
-                max(lag_s, inbox.largest_lag_s),
-                len(self._drive.snapshot.poses),
-            )
+            return self._drive.report(self._state, time.monotonic())
 
     @property
     def pid(self) -> int:
@@ -263,16 +233,36 @@ class LiveMapper:
         """
         return self._artist.grid(self._drive.snapshot.poses, resolution_m, timeout_s)
 
+    def localise(self, base: Path | None) -> None:
+        """Look for the robot on a finished map, in a further process, from now on; None: no longer.
+
+        The drive is mapped all the same, and the finished map is not changed.
+
+        Args:
+            base: its session folder.
+
+        Raises:
+            StoreError: the map is missing, damaged or not finished, or of other sensors.
+        """
+        locator = None if base is None else Locator(base, self._out, lambda: self._drive.snapshot.poses)
+        before, self._locator = self._locator, locator
+        if before is not None:
+            before.close()
+        if locator is not None:
+            locator.look()
+
     def reset(self) -> None:
         """Leave the map and begin a new one in its place; waits until the step that is being done has ended."""
         with self._changed:
             self._require_running()
             self._ready = Future()
-            self._drive = _Drive(self._rig, self._limits)
+            self._drive = LiveDrive(self._rig, self._limits)
             self._told.clear()
             self._outgoing.append(Reset())
             self._changed.notify()
         self._ready.result()
+        if self._locator is not None:
+            self.localise(self._locator.base)
 
     def finish(self, timeout_s: float | None = None) -> Session:
         """End of the drive: map what still waits, conclude the session as at the end of a recording, and wait for it.
@@ -292,6 +282,7 @@ class LiveMapper:
         self._fail(LiveError("the live mapper was closed"))
         self._process.close()
         self._artist.close()
+        self.localise(None)
 
     def __enter__(self) -> Self:
         return self
@@ -354,6 +345,8 @@ class LiveMapper:
                 self._drive.correction = message.pose_map_odom
             elif isinstance(message, Snapshot):
                 self._drive.snapshot, self._drive.correction = message, message.pose_map_odom
+                if self._locator is not None:
+                    self._locator.look()
             elif isinstance(message, Session) and not self._result.done():
                 self._result.set_result(message)
             self._changed.notify()

@@ -23,7 +23,7 @@ _PACKAGE = str(Path(hybridmap.__file__).parents[1])
 
 
 class PipedProcess:
-    """A process that runs a module of this package, with a pipe in both directions; its number is the only argument.
+    """A process that runs `main` of a module of this package, with a pipe in both directions; its number is the only argument.
 
     It is started anew and not forked, as a robot's program has threads. It gets no Ctrl-C, as that is for the robot's
     program, and ends when the pipe is closed.
@@ -46,7 +46,7 @@ class PipedProcess:
         with theirs:
             try:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", module, str(theirs.fileno())],
+                    [sys.executable, "-c", f"from {module} import main; main()", str(theirs.fileno())],
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
                     start_new_session=True,

@@ -197,7 +197,3 @@ def main() -> None:
 def _fail(pipe: Connection, error: str, words: str) -> None:
     with suppress(OSError):
         pipe.send(Failed(error, words))
-
-
-if __name__ == "__main__":
-    main()

@@ -78,7 +78,7 @@ def localize(
             nodes = joint.take_up(Part.of(drive))
             found_m, track = joint.join(nodes), drive.track()
         after = graph_hash(known.map())
-    poses, sure = _on_map(joint, nodes, config) if found_m is not None else (np.zeros((0, 3)), np.zeros(len(nodes), dtype=bool))
+    poses, sure = on_map(joint, nodes, config) if found_m is not None else (np.zeros((0, 3)), np.zeros(len(nodes), dtype=bool))
     rows = sure[track.nodes]
     if rows.any():
         way = trajectory_of(track, poses)
@@ -86,7 +86,7 @@ def localize(
     return _said(folder, base, (before, after), found_m, track, rows)
 
 
-def _on_map(joint: JointMap, nodes: range, config: Config) -> tuple[Array, NDArray[np.bool_]]:
+def on_map(joint: JointMap, nodes: range, config: Config) -> tuple[Array, NDArray[np.bool_]]:
     """Poses (N, 3) of the nodes of a drive on a map that is taken as exact, and which (N,) of them are known."""
     numbers, links = [], []
     for number, edge in enumerate(joint.map.edges):

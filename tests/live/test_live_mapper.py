@@ -12,13 +12,14 @@ import pytest
 
 from hybridmap import session
 from hybridmap.config import Config
-from hybridmap.errors import ExportError, LiveError, OutputError, StreamError
+from hybridmap.errors import ExportError, LiveError, OutputError, StoreError, StreamError
 from hybridmap.export.formats import ExportOptions, open_view
-from hybridmap.geometry import compose, inverse
+from hybridmap.geometry import between, compose, inverse
 from hybridmap.live import LiveLimits, LiveMapper
 from hybridmap.output import is_held
 from hybridmap.store import MapStore, SessionFolder
 from hybridmap.streams.base import Observation, Rig, SelfMotion
+from hybridmap.trajectory import read_tum
 from tests.streams_for_tests import RoomDrive
 
 CONFIG = Config.load("laser")
@@ -116,6 +117,30 @@ def test_everything_answers_while_the_mapper_does_not_and_what_is_left_out_is_sa
     assert finished.head["stream"] == {"odometry": 189, "scans": 95 - dropped, "scans left out (too slow)": dropped}
     (reason,) = [reason for reason in finished.head["reasons"] if reason["kind"] == "views dropped"]
     assert reason["value"] == pytest.approx(100.0 * dropped / 95)
+
+
+def test_a_robot_is_found_on_a_finished_map_which_stays_as_it_is(drive, recorded, tmp_path):
+    kept = recorded.folder.map_db.read_bytes()
+    begun = 60  # the robot begins elsewhere on the lap, with its odometry at zero
+    samples = [sample for sample in drive if sample.stamp_ns >= begun * 100_000_000]
+    with LiveMapper(CONFIG, drive.rig, tmp_path / "s", limits=PATIENT) as mapper:
+        with pytest.raises(StoreError, match="nowhere"):
+            mapper.localise(tmp_path / "nowhere")
+        assert mapper.pose_base_map is None
+        mapper.localise(recorded.folder.path)
+        for sample in samples:
+            mapper.add(sample)
+        until(lambda: mapper.pose_base_map is not None)
+        until(lambda: mapper.report.lag_s == 0.0)
+        pose_base_map = mapper.pose_base_map
+        assert pose_base_map is not None
+        there = compose(pose_base_map, mapper.pose_map_robot())
+        mapper.localise(None)
+        assert mapper.pose_base_map is None
+    off = between(read_tum(recorded.folder.trajectory / f"{recorded.head['primary_backend']}.tum").poses[-1], there)
+    assert np.hypot(off[0], off[1]) < 0.1
+    assert abs(off[2]) < 0.05
+    assert recorded.folder.map_db.read_bytes() == kept
 
 
 def test_a_bad_sample_costs_itself_and_a_killed_mapping_process_is_one_clear_error(drive, tmp_path):
