@@ -103,7 +103,7 @@ def session_trajectories(session: SessionFolder, store: MapStore) -> dict[str, T
 
 
 def _judge_closures(store: MapStore, truth: Trajectory) -> dict[str, ClosureErrors]:
-    experiences, numbers = store.map().newest_session()
+    experiences, _, numbers = store.map().of_sessions([-1])
     judged = {"graph": closure_errors(experiences, truth)}
     for name, solution in store.solutions().items():
         if name != ODOMETRY:
@@ -114,7 +114,7 @@ def _judge_closures(store: MapStore, truth: Trajectory) -> dict[str, ClosureErro
 
 def _judge_edges(store: MapStore, truth: Trajectory) -> list[Metric]:
     solution = store.solutions().get(store.primary)
-    experiences, numbers = store.map().newest_session()
+    experiences, _, numbers = store.map().of_sessions([-1])
     given = {} if solution is None else solution.report.weights
     weights = {place: given[number] for place, number in enumerate(numbers.tolist()) if number in given}
     metrics = []

@@ -68,20 +68,26 @@ class ExperienceMap:
         if len(self) > self._sessions[-1]:
             self._sessions.append(len(self))
 
-    def newest_session(self) -> tuple[ExperienceMap, NDArray[np.int64]]:
-        """The last session by itself: its nodes, numbered from 0, and the edges between them, with their numbers here (E,)."""
-        session = self.sessions[-1]
-        if session.start == 0:
-            return self, np.arange(len(self._edges))
-        out, numbers = ExperienceMap(), []
-        for node in session:
-            out.add_node(self._nodes[node], self.initial[node])
+    def of_sessions(self, numbers: Sequence[int]) -> tuple[ExperienceMap, NDArray[np.int64], NDArray[np.int64]]:
+        """Some sessions by themselves: their nodes, numbered from 0, and the edges between them.
+
+        Returns:
+            The map of these sessions, and the numbers here of its nodes (N,) and edges (E,).
+        """
+        sessions, out = self.sessions, ExperienceMap()
+        nodes = [node for number in numbers for node in sessions[number]]
+        there, kept = {node: place for place, node in enumerate(nodes)}, []
+        for place, node in enumerate(nodes):
+            if any(node == session.start for session in sessions):
+                out.begin_session()
+            assert out.add_node(self._nodes[node], self._initial.view()[node]) == place
         for number, edge in enumerate(self._edges):
-            if edge.source in session and edge.target in session:
-                source, target = edge.source - session.start, edge.target - session.start
-                out.add_edge(replace(edge, source=source, target=target, since_node=max(edge.since_node - session.start, 0)))
-                numbers.append(number)
-        return out, np.array(numbers, dtype=np.int64)
+            source, target = there.get(edge.source), there.get(edge.target)
+            if source is not None and target is not None:
+                since = there.get(edge.since_node, max(source, target))
+                out.add_edge(replace(edge, source=source, target=target, since_node=since))
+                kept.append(number)
+        return out, np.array(nodes, dtype=np.int64), np.array(kept, dtype=np.int64)
 
     @property
     def nodes(self) -> tuple[Node, ...]:

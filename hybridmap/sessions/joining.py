@@ -8,6 +8,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
+
 from hybridmap.backends.base import ODOMETRY, Solution
 from hybridmap.config import Config
 from hybridmap.config.gone import without_gone
@@ -68,21 +70,36 @@ def merge(base: Path, other: Path, out: Path, *, overwrite: bool = False) -> Joi
     with MapStore.open(base) as first, MapStore.open(other) as second:
         config = config_of(first)
         require_sensors(first, second.rig, str(second.path))
-        joint = JointMap(config, first.rig)
-        joint.take_up(Part.of(first))
-        joint.join(joint.take_up(Part.of(second)))
+        pieces = joined_sessions(first.map())
+        parts = [(base, first, pieces[0]), (other, second, None), *((base, first, piece) for piece in pieces[1:])]
+        joint = _joint_map(config, [Part.of(store, sessions) for _, store, sessions in parts], first.rig)
         folder = SessionFolder(out)
         with folder.writing(overwrite=overwrite):
             folder.write_config(config.to_yaml())
             with MapStore.create(folder.path, first.config_yaml, first.rig, "") as store:
-                for path, part in ((base, first), (other, second)):
+                for path, part, sessions in parts:
                     copied = len(store.sessions()) if store.one("SELECT COUNT(*) FROM nodes", ()) else 0
-                    copy_sessions(part, store)
-                    keep_files(SessionFolder(path), folder, store, copied)
+                    copy_sessions(part, store, sessions)
+                    keep_files(SessionFolder(path), part, sessions, folder, store, copied)
                 for number in range(int(store.one("SELECT COUNT(*) FROM edges", ())), len(joint.map.edges)):
                     store.put_edge(number, joint.map.edge(number))
                 describe(store, first, f"{first.source} + {second.source}")
                 return conclude(store, folder, joint.solutions(config.backends.names), config)
+
+
+def _joint_map(config: Config, parts: Sequence[Part], rig: Rig) -> JointMap:
+    """Take up all parts, and look for each on those before it; for the first on the second, if that is not found on it."""
+    joint = JointMap(config, rig)
+    nodes = [joint.take_up(part) for part in parts]
+    found = joint.join(nodes[1])
+    if found is None:
+        turned = JointMap(config, rig)
+        there, here = turned.take_up(parts[1]), turned.take_up(parts[0])
+        if turned.join(here) is not None:
+            joint.adopt(turned, np.concatenate([len(here) + np.arange(len(there)), np.arange(len(here))]))
+    for later in nodes[2:]:
+        joint.join(later)
+    return joint
 
 
 def map_onto(
@@ -163,21 +180,23 @@ def describe(store: MapStore, like: MapStore, source: str) -> None:
         store.put_info(key, value)
 
 
-def keep_files(part: SessionFolder, folder: SessionFolder, store: MapStore, first: int) -> None:
+def keep_files(
+    part: SessionFolder, source: MapStore, sessions: Sequence[int] | None, folder: SessionFolder, store: MapStore, first: int
+) -> None:
     """Keep what a part's folder has beside its map: the ground truth of its sessions, and the figures of a single one.
 
     Args:
-        part: the folder of the part.
+        part, source, sessions: the folder of the part, its map, and which of its sessions were taken; None: all.
         folder, store: the map that it became part of.
         first: number there of its first session.
     """
-    count = len(store.sessions()) - first
-    if count == 1 and part.metrics_json.is_file():
+    numbers = [one.number for one in source.sessions()]
+    if len(numbers) == 1 and part.metrics_json.is_file():
         store.write_rows("info", [(first, FIGURES, part.metrics_json.read_text(encoding="utf-8"))])
-    for number in range(count):
-        own = part.groundtruth_of(number, newest=number == count - 1)
+    for there, number in enumerate(numbers if sessions is None else sessions, start=first):
+        own = part.groundtruth_of(number, newest=number == numbers[-1])
         if own.is_file():
-            write_bytes(folder.groundtruth_of(first + number, newest=False), own.read_bytes())
+            write_bytes(folder.groundtruth_of(there, newest=False), own.read_bytes())
             write_bytes(folder.groundtruth, own.read_bytes())
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridmap.backends.base import Solution
 from hybridmap.backends.pieces import pieces_of, solve_by_piece
@@ -19,7 +20,7 @@ from hybridmap.config import Config
 from hybridmap.config.backends import BackendsConfig
 from hybridmap.edge_book import EdgeBook
 from hybridmap.errors import ConfigError
-from hybridmap.geometry import Array, between, compose
+from hybridmap.geometry import Array, RelativePose, between, compose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node
 from hybridmap.graph.paths import covariances_from
@@ -27,11 +28,14 @@ from hybridmap.metrics import StageClock
 from hybridmap.sessions.part import Arrays, Part
 from hybridmap.streams.base import Rig
 from hybridmap.trajectory import NS_PER_S
+from hybridmap.verdict import Facts, reasons_of
 from hybridmap.vision import create_front_end
 from hybridmap.vision.base import Belief, MeetingFrontEnd
 from hybridmap.vision.relocalising import SUPPORT
 
 log = logging.getLogger(__name__)
+
+Indices = NDArray[np.int64]
 
 APART_S, APART_M = 3600.0, 50.0
 """Time and travel that are put between two sessions where views are compared: none is too recent to be a loop."""
@@ -147,9 +151,42 @@ class JointMap:
             self._solve()
         return found_m if found_m is not None and self._settled(nodes) else None
 
+    def adopt(self, other: JointMap, number: Indices) -> None:
+        """Take over the loops that another joint map found between the same two maps, and where they lie on each other.
+
+        Args:
+            other: a joint map of the same nodes, in which the later map here is the earlier one.
+            number: (N,) its nodes -> those here.
+        """
+        first = int(np.flatnonzero(number == 0)[0])  # there: of the map that is the earlier one here
+        poses = self.poses.copy()
+        poses[number] = compose(self.poses[0], between(other.poses[first], other.poses))
+        for edge in other.map.edges:
+            if (edge.source < first) == (edge.target < first):
+                continue
+            ends = int(number[edge.source]), int(number[edge.target])
+            if edge.kind is EdgeKind.REGISTRATION and edge.relative is not None:
+                seen = next(loop for loop in other.map.edges if _joins(loop, first))
+                ends = int(number[seen.source]), int(number[0])
+                relative = RelativePose(between(poses[ends[0]], poses[ends[1]]), edge.relative.covariance)
+                edge = replace(edge, relative=relative)
+            self.map.add_edge(replace(edge, source=ends[0], target=ends[1], since_node=len(self.map) - 1, key=-1))
+        self.poses, self._covariance_from = poses, None
+        self._solve()
+
     def solutions(self, names: Sequence[str]) -> dict[str, Solution]:
         """The map by each back-end of these names; pieces that are not joined are solved by themselves."""
         return solutions_of(self.map, self.poses, names, self._config)
+
+    def _refused(self, nodes: range) -> int:
+        """How many loops of a map to others agree with each other and were refused all the same: rivals of its place."""
+        piece = next(piece for piece in pieces_of(self.map.pose_graph()) if nodes.start in piece)
+        session_of = np.repeat(np.arange(len(self.map.sessions)), [len(session) for session in self.map.sessions])
+        own, there, _ = self.map.of_sessions(np.unique(session_of[piece]).tolist())
+        name = self._config.names[0]
+        solution = solutions_of(own, self.poses[there], [name], self._config)[name]
+        reasons = reasons_of(Facts.of_drive(own, solution, name))
+        return max((reason.count for reason in reasons if reason.kind == "loops refused"), default=0)
 
     def _begin(self, node: Node) -> None:
         """Begin a session with a node, well after those before it in stamps and travel."""
@@ -187,9 +224,10 @@ class JointMap:
         return solution
 
     def _settled(self, nodes: range) -> bool:
-        """Take back the loops between the sessions that the back-end rejects; if too few are left, all of them.
+        """Take back the loops between the sessions that the back-end rejects; all of them, if too few are left.
 
-        Returns whether the map is joined still.
+        So are all, if as many that agree with each other were refused: the map may as well lie there. Returns whether the map
+        is joined still.
         """
         between_parts = [
             number
@@ -198,13 +236,19 @@ class JointMap:
         ]
         rejected = set(self._solve().report.rejected_edge_ids).intersection(between_parts)
         kept = [self.map.edge(number) for number in between_parts if number not in rejected]
-        joined = len({edge.source for edge in kept if edge.kind is EdgeKind.LOOP}) >= SUPPORT
+        loops = [edge for edge in kept if edge.kind is EdgeKind.LOOP]
+        joined = len({edge.source for edge in loops}) >= SUPPORT and self._refused(nodes) < len(loops)
         for number in rejected if joined else between_parts:
             self.map.update_edge(number, replace(self.map.edge(number).settled(lack=Lack.CONTRADICTED), since_node=-1))
         if rejected or not joined:
             self._covariance_from = None
             self._solve()
         return joined
+
+
+def _joins(edge: Edge, first: int) -> bool:
+    """Whether an edge is an accepted loop from a node from `first` on to one before it."""
+    return edge.kind is EdgeKind.LOOP and edge.status is Status.ACCEPTED and edge.source >= first > edge.target
 
 
 def solutions_of(experiences: ExperienceMap, poses: Array, names: Sequence[str], config: BackendsConfig) -> dict[str, Solution]:

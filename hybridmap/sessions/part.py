@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,13 +34,22 @@ class Part:
     state: Callable[[int], Arrays]
 
     @classmethod
-    def of(cls, store: MapStore) -> Part:
-        """The map of a file, which must stay open: keyframes are read as they are asked for.
+    def of(cls, store: MapStore, sessions: Sequence[int] | None = None) -> Part:
+        """Some sessions of a map file, all if None. The file must stay open: keyframes are read as they are asked for.
 
         Raises:
             StoreError: the run did not come to its end, its primary back-end has no map, or the file is damaged.
         """
-        solution = store.solutions().get(store.primary)
+        solution, experiences = store.solutions().get(store.primary), store.map()
         if not store.ended or solution is None:
             raise StoreError(f"{store.path}: has no finished map; expected one of a run that came to its end")
-        return cls(str(store.path), store.map(), solution.poses, store.keyframe, store.state)
+        chosen = range(len(experiences.sessions)) if sessions is None else sessions
+        own, nodes, _ = experiences.of_sessions(chosen)
+        number = nodes.tolist().__getitem__
+        return cls(
+            str(store.path),
+            own,
+            solution.poses[nodes],
+            lambda node: store.keyframe(number(node)),
+            lambda node: store.state(number(node)),
+        )

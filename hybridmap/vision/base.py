@@ -79,6 +79,13 @@ class Belief:
         return out
 
 
+def known_nodes(before: int, node: int, belief: Belief) -> NDArray[np.bool_]:
+    """Which (N,) of the nodes before `before` are joined to a node: the poses of all others are in frames of their own."""
+    joined = np.isfinite(belief.covariance_from(node)[:, 0, 0])
+    joined[before:] = False
+    return np.asarray(joined)
+
+
 @dataclass(frozen=True, slots=True)
 class View:
     """The profile and view template of one frame.

@@ -163,7 +163,7 @@ def test_pieces_do_not_look_joined(drives, tmp_path):
 def test_a_map_of_several_sessions_is_evaluated_by_its_newest(drives, joined):
     """The stamps of two sessions may be the same, and what was true of one says nothing of the other."""
     with MapStore.open(joined.folder.path) as store, MapStore.open(drives[1]) as alone:
-        newest, numbers = store.map().newest_session()
+        newest, _, numbers = store.map().of_sessions([-1])
         own = alone.map()
     assert len(newest) == len(own)
     assert [(e.source, e.target, e.status) for e in newest.edges] == [(e.source, e.target, e.status) for e in own.edges]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import IDENTITY, Array, RelativePose, between, invert_relative, wrap_angle
@@ -182,7 +183,7 @@ class Prober:
         self._laser = laser
         self._anchors: list[int] = []
 
-    def probe(self, node: int, belief: Belief, since: int = 0, before: int | None = None) -> list[Hypothesis]:
+    def probe(self, node: int, belief: Belief, since: int = 0, known: NDArray[np.bool_] | None = None) -> list[Hypothesis]:
         """Register the last metres before a node to the old submaps that may be nearby.
 
         The starts that profiles propose come first. Only if none of these passes all checks, the whole gate is searched.
@@ -191,7 +192,7 @@ class Prober:
             node: the newest node of the probe.
             belief: the map, which tells what may be nearby.
             since: old submaps around earlier nodes than this one are left out.
-            before: so are those around this node and later ones; None: none are.
+            known: (N,) around which nodes old submaps may lie instead.
 
         Returns:
             The most promising few, failed ones too, those whose start was likeliest first.
@@ -201,7 +202,7 @@ class Prober:
         recent = recent[recent <= node]
         middle = 0.5 * (atlas.travel_m[int(recent[0])] + atlas.travel_m[node])
         probe = atlas.submap(int(recent[np.searchsorted(np.asarray(atlas.travel_m)[recent], middle)]), recent)
-        gates = self._gates(probe.anchor, int(recent[0]), range(since, node if before is None else before), belief)
+        gates = self._gates(probe.anchor, int(recent[0]), np.arange(node) >= since if known is None else known, belief)
         by_profile = self._by_profile(gates, probe)
         found = self._verified(by_profile, probe)
         if not any(h.passed for h in found):
@@ -282,9 +283,9 @@ class Prober:
                 return
             self._anchors.append(after)
 
-    def _gates(self, center: int, oldest: int, among: range, belief: Belief) -> list[_Gate]:
+    def _gates(self, center: int, oldest: int, among: NDArray[np.bool_], belief: Belief) -> list[_Gate]:
         """Targets around some nodes, wholly before the probe, inside the gate, which follows the covariance without a cap."""
-        anchors = [a for a in self.anchors_before(oldest) if a in among]
+        anchors = [a for a in self.anchors_before(oldest) if among[a]]
         if not anchors:
             return []
         covariance = GATE_INFLATION**2 * np.nan_to_num(belief.covariance_from(center)[anchors], posinf=UNKNOWN)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from hybridmap.config.vision import VisionConfig
 from hybridmap.graph.edges import Edge, Lack, Status
-from hybridmap.vision.base import Belief
+from hybridmap.vision.base import Belief, known_nodes
 from hybridmap.vision.laser.commitment import Commitment
 from hybridmap.vision.laser.hypotheses import LENGTH_M, Prober
 from hybridmap.vision.laser.kidnapping import FROM_M, OFTEN_M, SPAN_M, GlobalLocalisation
@@ -77,7 +77,7 @@ class ScanMeeting:
         """Register the last metres to the submaps of earlier sessions that may be near."""
         self._panoramas.extend()
         out = []
-        for hypothesis in self._prober.probe(node, belief, before=self._first):
+        for hypothesis in self._prober.probe(node, belief, known=known_nodes(self._first, node, belief)):
             key = self._new_key()
             out.append(hypothesis.proposed(key, Lack.WAITING))
             self._commitment.add(key, hypothesis)
@@ -90,5 +90,6 @@ class ScanMeeting:
         out = [s.proposed() for s in self._commitment.flush(belief)]
         if any(edge.status is Status.ACCEPTED for edge in out):
             return out
-        near = self._reviser.round(belief, self._first, across=True)
+        known = known_nodes(self._first, len(belief.travel_m) - 1, belief)
+        near = self._reviser.round(belief, self._first, known=known)
         return out + [hypothesis.proposed(self._new_key()) for hypothesis in near]

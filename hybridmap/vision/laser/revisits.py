@@ -51,7 +51,7 @@ class Reviser:
         self._rounds = 0
         self._done: set[tuple[int, int]] = set()
 
-    def round(self, belief: Belief, since: int = 0, *, across: bool = False) -> list[Hypothesis]:
+    def round(self, belief: Belief, since: int = 0, *, known: NDArray[np.bool_] | None = None) -> list[Hypothesis]:
         """Register nodes with a panorama to one of each of up to three earlier passes; failed ones are returned too.
 
         Partners are what the panoramas propose out of the whole map, if that is near on this map; then, of passes without any,
@@ -60,7 +60,7 @@ class Reviser:
         Args:
             belief: the map, which gives the poses of the nodes.
             since: nodes from this one on are not paired with earlier ones.
-            across: instead, they are paired with earlier ones alone, and those with none.
+            known: (N,) nodes before `since` with which those from it on are paired instead; the others are with none.
         """
         if self._rounds >= self._most_rounds or len(self._atlas) == 0:
             return []
@@ -68,7 +68,7 @@ class Reviser:
         grid = np.array(self._panoramas.nodes)
         found = []
         for number, node in enumerate(grid.tolist()):
-            beside = ((grid < since) == (node < since)) ^ across
+            beside = (grid < since) == (node < since) if known is None else known[grid] & (node >= since)
             for other, proposed_by in self._partners(number, grid, beside, belief.poses_map_node):
                 self._done.add((node, other))
                 found.append(self.register(node, other, belief.poses_map_node, proposed_by))

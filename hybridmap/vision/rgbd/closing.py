@@ -12,7 +12,7 @@ from hybridmap.config.vision import VisionConfig
 from hybridmap.geometry import Array, RelativePose, between, wrap_angle
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Proposer, Search, Status
 from hybridmap.metrics import StageClock
-from hybridmap.vision.base import Belief
+from hybridmap.vision.base import Belief, known_nodes
 from hybridmap.vision.gating import MIN_AGE_S, Gate, nodes_within
 from hybridmap.vision.profile import Profile
 from hybridmap.vision.relocalising import ChainState, GlobalMatch, Relocaliser, Whereabouts
@@ -327,6 +327,7 @@ class LoopCloser:
         turned = np.abs(wrap_angle(poses[earlier, 2] - poses[node, 2]))
         old = belief.stamps_s[node] - belief.stamps_s[earlier] >= MIN_AGE_S
         near = old & (gap <= REPROPOSE_M) & (turned <= np.deg2rad(HEADING_DEG))
+        near &= True if before is None else known_nodes(before, node, belief)[earlier]
         cost = gap + turned
         order = np.argsort(np.where(near, cost, np.inf), kind="stable")[: int(near.sum())]
         left = np.array([target for target in order.tolist() if not self.support.has(node, target)], dtype=np.int64)
