@@ -38,7 +38,7 @@ class Artist:
             raise ExportError("grid: no node yet")
         end_s = None if timeout_s is None else time.monotonic() + timeout_s
         with self._turn:
-            self._process = self._process or PipedProcess("hybridmap.live.drawing")
+            self._process = self._process or PipedProcess("hybridmap.live.drawing", yields=True)
             self._number += 1
             self._process.send([(self._number, self._out, poses, resolution_m)])
             found = self._answer(self._process, end_s)

@@ -61,7 +61,7 @@ class Locator:
         self.error: HybridMapError | None = None
         self._folders, self._poses = (base, out), poses
         self._news, self._ended = threading.Event(), False
-        self._process = PipedProcess("hybridmap.live.locating")
+        self._process = PipedProcess("hybridmap.live.locating", yields=True)
         threading.Thread(target=self._run, name="hybridmap-locate", daemon=True).start()
 
     def look(self) -> None:

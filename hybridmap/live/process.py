@@ -19,6 +19,8 @@ from hybridmap.errors import HybridMapError, LiveError
 from hybridmap.live.messages import Begin, Failed
 from hybridmap.session import Session
 
+_BEHIND = 10
+"""By how much the priority of a process is lower that lets mapping go first."""
 _PACKAGE = str(Path(hybridmap.__file__).parents[1])
 
 
@@ -32,8 +34,12 @@ class PipedProcess:
         pipe: this end of the pipe.
     """
 
-    def __init__(self, module: str) -> None:
+    def __init__(self, module: str, *, yields: bool = False) -> None:
         """Start the process.
+
+        Args:
+            module: its name.
+            yields: whether it lets processes that map go first, where there are too few processors for all.
 
         Raises:
             LiveError: it cannot be started.
@@ -46,7 +52,12 @@ class PipedProcess:
         with theirs:
             try:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-c", f"from {module} import main; main()", str(theirs.fileno())],
+                    [
+                        sys.executable,
+                        "-c",
+                        f"import os; os.nice({_BEHIND * yields}); from {module} import main; main()",
+                        str(theirs.fileno()),
+                    ],
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
                     start_new_session=True,
