@@ -13,10 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from hybridmap import checkpoints, provenance, session
+from hybridmap.cli.app import app
 from hybridmap.config import Config
-from hybridmap.errors import OutputError, StoreError, StreamError
+from hybridmap.errors import ConfigError, OutputError, StoreError, StreamError
 from hybridmap.store import SessionFolder, checkpoint
 from hybridmap.store.checkpoint import UnusableError
 from hybridmap.streams import open_stream
@@ -52,6 +54,11 @@ class Breaks(RoomDrive):
             if number == self.after:
                 raise StreamError("the cable is loose")
             yield sample
+
+
+def full_disk(*_: object) -> None:
+    """What a file that cannot be written does."""
+    raise OutputError("no space left on device")
 
 
 def contents(folder: Path) -> dict[str, object]:
@@ -126,11 +133,8 @@ def test_a_resumed_run_that_breaks_off_again_is_resumed_again(unbroken, tmp_path
 @pytest.mark.usefixtures("often")
 def test_a_run_that_fails_at_its_very_end_is_resumed_there(unbroken, tmp_path, monkeypatch):
 
-    def full(*_: object) -> None:
-        raise OutputError("no space left on device")
-
     with monkeypatch.context() as broken:
-        broken.setattr(SessionFolder, "write_metrics", full)
+        broken.setattr(SessionFolder, "write_metrics", full_disk)
         with pytest.raises(OutputError):
             session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "s")
     seen: list[int] = []
@@ -234,3 +238,48 @@ def test_a_stream_goes_on_with_the_same_samples(taken):
     frames = [[one for one in samples if isinstance(one, RgbdFrame)] for samples in (onward, whole[taken:])]
     assert all(np.array_equal(a.color, b.color) for a, b in zip(*frames, strict=True))
     assert stream.report.counts == counts
+
+
+ROOM = ("laser", "scan-to-map", "bionic-laser", "campus")
+LAB = ("rgbd", "bionic", "ratslam", "paper")
+
+
+@pytest.mark.parametrize("name", [*ROOM, *LAB])
+def test_the_state_of_every_configuration_can_be_written_and_read(name, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(checkpoints, "LEAST_S", 0.0)
+    overrides = {"simulation.world": "lab", "simulation.sensors": "rgbd", "simulation.duration_s": 2.0}
+    config = Config.load(name, overrides if name in LAB else {})
+    stream = open_stream("lab", config) if name in LAB else RoomDrive(laps=0.4)
+    with monkeypatch.context() as broken:
+        broken.setattr(SessionFolder, "write_metrics", full_disk)
+        with pytest.raises(OutputError):
+            session.run(stream, config, tmp_path / "s")
+    assert "cannot be resumed" not in caplog.text
+    assert (tmp_path / "s" / "checkpoint").is_file()
+    assert checkpoints.resumable(SessionFolder(tmp_path / "s"), stream, config) is not None
+
+
+def test_the_command_resumes_a_finished_session_by_saying_so(tmp_path):
+    (tmp_path / "drive.csv").write_text("stamp_s,v_m_s,omega_rad_s\n" + "".join(f"{i},0.5,0.1\n" for i in range(20)))
+    arguments = ["map", str(tmp_path / "drive.csv"), "--out", str(tmp_path / "s"), "--json"]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    assert CliRunner().invoke(app, [*arguments, "--resume"]).exit_code == 0
+    refused = CliRunner().invoke(app, [*arguments, "--resume", "--overwrite"])
+    assert isinstance(refused.exception, ConfigError)
+
+
+@pytest.mark.slow
+def test_killed_runs_and_readers_are_proved_by_the_tool():
+    tool = Path(__file__).parents[1] / "tools" / "kill_proof.py"
+    command = [sys.executable, str(tool), "lab", "--config", "laser", "--end", "10"]
+    done = subprocess.run(
+        [*command, "--kills", "2", "--errors", "3", "--readers", "2", "--readers-end", "5", "--json"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=600,
+    )
+    figures = {row["name"]: row for row in json.loads(done.stdout)["metrics"]}
+    judged = [row for name, row in figures.items() if row.get("passed") is not None and not name.endswith("cpu_ratio")]
+    assert len(judged) >= 10
+    assert all(row["passed"] for row in judged)

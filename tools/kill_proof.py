@@ -197,7 +197,7 @@ def broken(case: Case, out: Path, kind: int, share: float, samples: int, nodes: 
                     raise StreamError(f"{case.source}: message {drive.taken} is damaged")
                 yield sample
 
-        checkpoints.Drive.samples = damaged  # type: ignore[method-assign]
+        checkpoints.Drive.samples = damaged  # type: ignore[method-assign, assignment]
     elif kind == 1:
         whole_update = Ensemble.update
 
@@ -206,7 +206,7 @@ def broken(case: Case, out: Path, kind: int, share: float, samples: int, nodes: 
                 raise BackendError(f"{ensemble.primary}: crashed at node {graph.n_nodes}")
             whole_update(ensemble, graph)
 
-        Ensemble.update = crashing  # type: ignore[method-assign]
+        Ensemble.update = crashing  # type: ignore[method-assign, assignment]
     case.run(out)
 
 
