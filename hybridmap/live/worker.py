@@ -7,6 +7,7 @@ concludes what it has, so that a robot whose own process died keeps its map.
 from __future__ import annotations
 
 import logging
+import signal
 import sys
 import time
 from collections import deque
@@ -181,7 +182,12 @@ def _load() -> None:
 
 
 def main() -> None:
-    """Run `work` on the pipe whose number is the first argument, and pass every error on to the robot's process."""
+    """Run `work` on the pipe whose number is the first argument, and pass every error on to the robot's process.
+
+    A service manager that stops the robot's program sends SIGTERM to this process too, at the same moment. It is left to that
+    program to finish; without it the closed pipe ends the drive.
+    """
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     pipe = Connection(int(sys.argv[1]))
     try:
         work(pipe)

@@ -181,6 +181,7 @@ for sample in drive:
     mapper.add(sample)
 while mapper.report.lag_s:
     time.sleep(0.01)
+os.kill(mapper.pid, signal.SIGTERM)  # as a service manager does that stops the whole group
 os.kill(os.getpid(), signal.SIGKILL)
 """
 
