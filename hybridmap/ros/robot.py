@@ -310,6 +310,9 @@ class RobotNode:
                 do()
             except HybridMapError as error:
                 self._fail(error)
+            except Exception as error:
+                self._fail(RosError(f"{self._ros.source}: {type(error).__name__}: {error}"))
+                raise
 
     def _fail(self, error: HybridMapError) -> None:
         if self._error is None:

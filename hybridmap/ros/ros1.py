@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from hybridmap.errors import HybridMapError, RosError
+from hybridmap.errors import HybridMapError, RosError, StreamError
 from hybridmap.ros.contents import Contents, Stamp
 from hybridmap.ros.middleware import OUTPUTS, Output, Service
 from hybridmap.streams.messages import Topic, full_type
@@ -63,11 +64,18 @@ class Ros1:
         self._publishers = {output: self._advertised(output) for output in OUTPUTS}
 
     def topics(self) -> list[Topic]:
-        """The topics that others publish."""
+        """The topics that others publish.
+
+        Raises:
+            StreamError: the master does not answer.
+        """
         master, own = self._rospy.get_master(), self._rospy.get_name()
-        _, _, (publishers, _, _) = master.getSystemState()
+        try:
+            _, _, (publishers, _, _) = master.getSystemState()
+            _, _, types = master.getTopicTypes()
+        except OSError as error:
+            raise StreamError(f"{self.source}: the master does not answer ({error})") from None
         others = {name for name, nodes in publishers if any(node != own for node in nodes)}
-        _, _, types = master.getTopicTypes()
         return [Topic(name, full_type(msgtype), 1) for name, msgtype in sorted(types) if name in others and msgtype != "*"]
 
     def subscribe(self, topic: str, msgtype: str, take: Callable[[bytes, str | None], None]) -> None:
@@ -87,7 +95,8 @@ class Ros1:
         """Publish a message."""
         publisher = self._publishers[output]
         if output.latched or publisher.get_num_connections():
-            publisher.publish(filled(publisher.data_class(), contents))
+            with suppress(self._rospy.ROSException):  # closed: rospy is shutting down
+                publisher.publish(filled(publisher.data_class(), contents))
 
     def offer(self, services: Sequence[Service]) -> None:
         """Offer services. What raises a HybridMapError is an error for the client of rospy, in its words."""

@@ -5,6 +5,7 @@ import random
 from collections.abc import Mapping
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,7 +16,7 @@ from hybridmap.streams.base import Rig, Sample
 from hybridmap.streams.incoming import Incoming
 from hybridmap.streams.messages import RawMessage, Topic
 from hybridmap.streams.rosbag import BagStream
-from tests.streams.recordings import NS, Recording, depth_mm, laser_drive, rgbd_drive
+from tests.streams.recordings import NS, OPTICAL_XYZW, Recording, color_pixels, depth_mm, laser_drive, rgbd_drive
 
 
 class Robot:
@@ -73,8 +74,24 @@ def shifted_pictures(ros1: bool) -> Recording:
     return recording
 
 
+def compressed_pictures(ros1: bool) -> Recording:
+    """Colour as PNG, depth as compressedDepth, on topics of image_transport."""
+    recording = Recording(ros1)
+    recording.transform("base_link", "camera_optical", (0.1, 0.0, 0.5), OPTICAL_XYZW)
+    for i in range(4):
+        stamp_ns = 100 * NS + i * NS // 10
+        recording.odometry(stamp_ns, 0.1 * i)
+        recording.camera_info(stamp_ns, (8, 6), (10.0, 10.0, 3.5, 2.5), topic="/camera/color/camera_info")
+        color = cv2.imencode(".png", color_pixels(i)[..., ::-1])[1].tobytes()
+        recording.compressed(stamp_ns + 5_000_000, color, "rgb8; png", topic="/camera/color/image_raw/compressed")
+        depth = bytes(12) + cv2.imencode(".png", depth_mm(i))[1].tobytes()
+        topic = "/camera/aligned_depth_to_color/image_raw/compressedDepth"
+        recording.compressed(stamp_ns + 9_000_000, depth, "16UC1; compressedDepth", topic=topic)
+    return recording
+
+
 @pytest.mark.parametrize("suffix", ["bag", "mcap"])
-@pytest.mark.parametrize("drive", [laser_drive, rgbd_drive, shifted_pictures])
+@pytest.mark.parametrize("drive", [laser_drive, rgbd_drive, shifted_pictures, compressed_pictures])
 def test_as_a_bag(tmp_path: Path, drive, suffix: str) -> None:
     bag = drive(suffix == "bag").write(tmp_path / f"drive.{suffix}")
     robot = Robot(bag)
