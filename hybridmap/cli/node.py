@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
     from hybridmap.ros.middleware import Middleware
     from hybridmap.ros.robot import NodeOptions
 
+_SWITCH_S = 0.0005
+"""Python lets another thread run after so long, s: odometry need not wait while the graph of a large map is written. Its own 5 ms
+add up, as a pose passes through several threads."""
 _STOP = (signal.SIGINT, signal.SIGTERM)
 
 RobotTopic = Annotated[
@@ -45,6 +49,7 @@ def run_node(middleware: Middleware, options: NodeOptions, *, as_json: bool) -> 
     from hybridmap.report import write_report
     from hybridmap.ros.robot import RobotNode
 
+    sys.setswitchinterval(_SWITCH_S)
     node = RobotNode(middleware, options)
     middleware.when_stopped(node.ended.set)
     try:

@@ -118,7 +118,7 @@ def main() -> None:
     found = {
         "tf_frames": sorted(client.frames),
         "poses": len(client.poses),
-        "farthest_pose_from_tf_m": max(off),
+        "pose_from_tf_median_m": float(np.median(off)),
         "path_nodes": len(client.last["/hybridmap/path"].poses),
         "graph_markers": len(client.last["/hybridmap/graph"].markers),
         "map": [len(client.last["/floor"].data), client.last["/floor"].info.width],

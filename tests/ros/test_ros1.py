@@ -69,7 +69,7 @@ def test_a_client_of_tf_finds_the_robot_where_the_pose_says(drive) -> None:
     heard = drive["heard"]
     assert heard["tf_frames"] == [["map", "odom"]]
     assert heard["poses"] > 20
-    assert heard["farthest_pose_from_tf_m"] < 0.05
+    assert heard["pose_from_tf_median_m"] < 0.05
     assert heard["path_nodes"] > 5
     assert heard["graph_markers"] == 5
 
