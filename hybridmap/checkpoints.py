@@ -10,6 +10,7 @@ from importlib.metadata import version
 from itertools import islice
 from typing import Any
 
+import numpy as np
 from pydantic import BaseModel
 
 from hybridmap import provenance
@@ -30,7 +31,7 @@ LEAST_S = 0.2
 """Least CPU time between two checkpoints, s."""
 TIMES_ITS_COST = 33.0
 """Least CPU time between two checkpoints in units of what the last one took: they take 3 % of it at most."""
-_TIMES_ITS_WAIT = 8.0  # the same for time by the clock: a slow disk may not hold up a drive
+_TIMES_ITS_WAIT = 20.0  # the same for time by the clock: a slow disk may not hold up a drive
 _SOON = 5.0  # the same before the end of the drive, which is long and cannot be broken into pieces
 _FIRST = 3  # samples whose stamps tell one recording from another
 
@@ -107,7 +108,7 @@ class Checkpoints:
         self._sections = _sections(config)
         self._origin: Origin | None = None
         self._cpu_s, self._wall_s = time.process_time(), time.perf_counter()
-        self._cost_cpu_s = self._cost_wall_s = 0.0
+        self._costs = [(0.0, 0.0)]  # of the last two: what else the machine does may make one look dear
         self._warned = False
 
     def follow(self, drive: Drive) -> None:
@@ -123,32 +124,28 @@ class Checkpoints:
         checkpoint.remove(self._folder.checkpoint)
 
     def _write_if_due(self, drive: Drive, times: float) -> None:
-        cpu_s, wall_s = time.process_time(), time.perf_counter()
-        if (
-            not self._wanted
-            or cpu_s - self._cpu_s < max(LEAST_S, times * self._cost_cpu_s)
-            or wall_s - self._wall_s < times * self._cost_wall_s
-        ):
+        since_cpu_s, since_wall_s = time.process_time() - self._cpu_s, time.perf_counter() - self._wall_s
+        cost_cpu_s, cost_wall_s = np.min(self._costs, axis=0).tolist()
+        if since_cpu_s < max(LEAST_S, times * cost_cpu_s) or since_wall_s < _TIMES_ITS_WAIT * cost_wall_s or not self._wanted:
             return
-        provenance.mapping()  # takes its time once
+        if self._origin is None:  # takes its time once
+            self._origin = _origin(self._stream, self._config, drive.first_ns)
         cpu_s, wall_s = time.process_time(), time.perf_counter()
         try:
-            self._write(drive)
+            self._write(drive, self._origin)
         except (UnusableError, OutputError) as error:
             if not self._warned:
                 log.warning("%s; the run cannot be resumed", error)
             self._warned = True
         self._cpu_s, self._wall_s = time.process_time(), time.perf_counter()
-        self._cost_cpu_s, self._cost_wall_s = self._cpu_s - cpu_s, self._wall_s - wall_s
+        self._costs = [*self._costs[-1:], (self._cpu_s - cpu_s, self._wall_s - wall_s)]
 
-    def _write(self, drive: Drive) -> None:
+    def _write(self, drive: Drive, origin: Origin) -> None:
         store = drive.recorder.store
         store.sync()
         drive.mark, drive.report = store.mark(), self._stream.report
-        if self._origin is None:
-            self._origin = _origin(self._stream, self._config, drive.first_ns)
         known = {"store": store, **self._sections}
-        size = checkpoint.write(self._folder.checkpoint, self._origin, drive, known, self._parts)
+        size = checkpoint.write(self._folder.checkpoint, origin, drive, known, self._parts)
         log.info("checkpoint at node %d: %.1f MB", len(drive.mapper.map) - 1, size / 1e6)
 
 
