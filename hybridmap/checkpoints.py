@@ -29,9 +29,10 @@ log = logging.getLogger(__name__)
 
 LEAST_S = 0.2
 """Least CPU time between two checkpoints, s."""
-TIMES_ITS_COST = 33.0
-"""Least CPU time between two checkpoints in units of what the last one took: they take 3 % of it at most."""
-_TIMES_ITS_WAIT = 20.0  # the same for time by the clock: a slow disk may not hold up a drive
+TIMES_ITS_COST = 40.0
+"""Least CPU time between two checkpoints in units of what one takes: they take 2.5 % of it."""
+TIMES_ITS_WAIT = 20.0
+"""The same for time by the clock: a slow disk may not hold up a drive."""
 _SOON = 5.0  # the same before the end of the drive, which is long and cannot be broken into pieces
 _FIRST = 3  # samples whose stamps tell one recording from another
 
@@ -126,7 +127,7 @@ class Checkpoints:
     def _write_if_due(self, drive: Drive, times: float) -> None:
         since_cpu_s, since_wall_s = time.process_time() - self._cpu_s, time.perf_counter() - self._wall_s
         cost_cpu_s, cost_wall_s = np.min(self._costs, axis=0).tolist()
-        if since_cpu_s < max(LEAST_S, times * cost_cpu_s) or since_wall_s < _TIMES_ITS_WAIT * cost_wall_s or not self._wanted:
+        if since_cpu_s < max(LEAST_S, times * cost_cpu_s) or since_wall_s < TIMES_ITS_WAIT * cost_wall_s or not self._wanted:
             return
         if self._origin is None:  # takes its time once
             self._origin = _origin(self._stream, self._config, drive.first_ns)

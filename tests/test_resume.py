@@ -87,6 +87,7 @@ def often(monkeypatch):
     """Checkpoints at every node."""
     monkeypatch.setattr(checkpoints, "LEAST_S", 0.0)
     monkeypatch.setattr(checkpoints, "TIMES_ITS_COST", 0.0)
+    monkeypatch.setattr(checkpoints, "TIMES_ITS_WAIT", 0.0)
 
 
 def broken_off(out: Path, after: int = 300) -> None:
