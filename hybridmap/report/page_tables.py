@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -135,4 +137,10 @@ def rendered(template: str, **content: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["code"] = _code
     return environment.get_template(template).render(content)
+
+
+def _code(text: str) -> str:
+    """A text as HTML; what it has between backticks is shown as code."""
+    return re.sub("`([^`]+)`", r"<code>\1</code>", html.escape(text))

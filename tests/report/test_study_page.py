@@ -58,10 +58,13 @@ def error_of(result: CellResult) -> float | None:
     return result.figures.get("ate_m")
 
 
+def _page_of(study: Study) -> str:
+    return write_study_page(study).read_text()
+
+
 def text_of(study: Study) -> str:
     """The page without its pictures and tags."""
-    page = write_study_page(study).read_text()
-    return " ".join(re.sub(r"<style>.*?</style>|<[^>]+>", " ", page, flags=re.DOTALL).split())
+    return " ".join(re.sub(r"<style>.*?</style>|<[^>]+>", " ", _page_of(study), flags=re.DOTALL).split())
 
 
 def better_by_the_seed(cell: Cell) -> float:
@@ -185,3 +188,16 @@ def test_what_a_setting_changes_is_a_table_of_its_own(made):
     assert [line.backend for line in lines] == ["gtsam-lm", "relaxed"]
     assert [line.verdict for line in lines] == ["higher", "higher"]
     assert "What the settings change" not in text_of(made(better_by_the_seed))
+
+
+def test_what_a_setting_changes_over_all_drives_is_seen_without_a_click(made):
+    settings = [{"name": "as it is"}, {"name": "twice"}]
+    sources = [{"name": f"laps {number}", "synthetic": {"nodes": 40}} for number in range(2)]
+    page = _page_of(made(better_by_the_seed, settings=settings, sources=sources, seeds=6, false_loops={}))
+    pooled = page.index("Over all drives")
+    assert page.index("all 2", pooled) < page.index("rows of single sources") < page.index("laps 1", pooled)
+
+
+def test_a_description_shows_names_as_code_and_no_markup_of_its_own(made):
+    page = _page_of(made(better_by_the_seed, description="`bionic` is <b>it</b>"))
+    assert "<p><code>bionic</code> is &lt;b&gt;it&lt;/b&gt;</p>" in page
