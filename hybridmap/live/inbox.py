@@ -37,7 +37,7 @@ _IN_PIPE = 1
 """Views in the pipe, besides the one that is being mapped."""
 _MOST_WAITING = 90
 """Views that may wait for odometry: 3 s of a camera."""
-_WORK_SHARE = 0.75
+_WORK_SHARE = 0.5
 """Share of the largest lag that the views which wait may need; the rest is for those that need longer than the mean."""
 _RECENT = 10
 """Newest gaps of a source that its patience is learnt from, and offsets of its stamps."""
@@ -178,16 +178,19 @@ class Inbox:
         return taken
 
     def flush(self, now_s: float) -> list[Sample]:
-        """End of the drive: all remaining samples, in order."""
+        """End of the drive: all remaining samples, in order; from here on nothing lags."""
         while self._unsorted:
             self._pass(_Turn.NOW, now_s)
-        return [sample for _ in range(len(self._due)) for sample in self._give()]
+        remaining = [sample for _ in range(len(self._due)) for sample in self._give()]
+        self.largest_lag_s = max(self.largest_lag_s, self.lag_s(now_s))
+        self._unmapped.clear()
+        return remaining
 
     def done(self, taken: int, mapped: int, busy_s: float, now_s: float) -> None:
         """Note that the mapper has taken views from the pipe, and has mapped some, in `busy_s` seconds."""
         self._untaken -= taken
         self.largest_lag_s = max(self.largest_lag_s, self.lag_s(now_s))
-        for _ in range(mapped):
+        for _ in range(min(mapped, len(self._unmapped))):
             self._unmapped.popleft()
         self._busy_s.extend([busy_s / max(mapped, 1)] * mapped)
 

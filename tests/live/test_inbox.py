@@ -170,6 +170,14 @@ def test_the_newest_view_is_the_one_that_is_kept():
     assert kept[0] > 3.8
 
 
+def test_what_is_mapped_after_the_drive_is_no_lag():
+    inbox, mapper, _ = mapped(every(motion, 0.02, 3.0) + every(scan, 0.1, 3.0), view_s=0.2)
+    assert inbox.largest_lag_s > 1.0
+    assert inbox.lag_s(100.0) == 0.0
+    inbox.done(1, 1, 0.2, 100.0)
+    assert inbox.largest_lag_s <= mapper.now_s
+
+
 def test_paused_views_are_left_out_and_odometry_goes_on():
     inbox = Inbox(["scans"], PATIENT, 0.0)
     inbox.paused = True
