@@ -92,13 +92,7 @@ def run(
     before = resumable(folder, stream, config) if resume else None
     mapper = Mapper(config, stream.rig) if before is None else before.drive.mapper
     with folder.writing(overwrite=overwrite or (resume and before is None), resume=before is not None) as unfinished:
-        if before is None:
-            folder.write_config(config.to_yaml())
-            if stream.groundtruth is not None:
-                folder.write_groundtruth(stream.groundtruth)  # before the drive, so that a killed run can be evaluated
-            store = MapStore.create(folder.path, config.to_yaml(), stream.rig, stream.name)
-        else:
-            store = MapStore.resume(folder.path)
+        store = _begun(folder, stream, config) if before is None else MapStore.resume(folder.path)
         with store, _kept(folder, store, mapper, unfinished):
             drive = Drive(mapper, Recorder(mapper, store)) if before is None else before.drive
             if before is not None:
@@ -113,6 +107,14 @@ def run(
             store.close()
         checkpoints.remove()
         return session
+
+
+def _begun(folder: SessionFolder, stream: Stream, config: Config) -> MapStore:
+    """The map file of a new session, with what can be written before the drive, so that a killed run can be evaluated."""
+    folder.write_config(config.to_yaml())
+    if stream.groundtruth is not None:
+        folder.write_groundtruth(stream.groundtruth)
+    return MapStore.create(folder.path, config.to_yaml(), stream.rig, stream.name)
 
 
 @contextmanager
