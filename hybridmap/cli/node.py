@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from hybridmap.ros.robot import NodeOptions
 
 _SWITCH_S = 0.0005
-"""Python lets another thread run after so long, s: odometry need not wait while the graph of a large map is written. Its own 5 ms
-add up, as a pose passes through several threads."""
+"""Python lets another thread run after so long, s, and not after 5 ms: odometry need not wait while the graph of a large map is
+written. A pose passes through several threads, so that the waits add up."""
 _STOP = (signal.SIGINT, signal.SIGTERM)
 
 RobotTopic = Annotated[

@@ -57,9 +57,12 @@ class Ros1:
         uri = os.environ.get("ROS_MASTER_URI", "http://localhost:11311")
         if not rosgraph.is_master_online():
             raise RosError(f"no ROS master at {uri}: start `roscore`, or set ROS_MASTER_URI")
-        handlers = list(logging.getLogger().handlers)
+        root = logging.getLogger()
+        handlers, level = list(root.handlers), root.level
         self._rospy.init_node(name, argv=["hybridmap", *remappings], disable_signals=True)
-        logging.getLogger().handlers[:] = handlers  # rospy has its own ideas of what all other modules log
+        root.handlers[:] = handlers  # rospy has its own ideas of what all other modules log
+        root.setLevel(level)
+        logging.getLogger("rosout").propagate = False  # it writes to the console by itself
         self.source = f"ROS 1 at {uri}"
         self._publishers = {output: self._advertised(output) for output in OUTPUTS}
 
