@@ -31,6 +31,14 @@ MapEvery = Annotated[
 ]
 Resolution = Annotated[float, typer.Option(help="Side of a cell of /map and of save_map, m.", min=0.005, max=10)]
 MapFrame = Annotated[str, typer.Option(help="Name of the frame of the map.")]
+KnownMap = Annotated[
+    Path | None,
+    typer.Option(
+        "--map",
+        help="Session folder of a finished map: the robot is looked for on it while it maps, and its pose there is published in"
+        " the frame known_map. The finished map stays as it is.",
+    ),
+]
 CorrectionSpeed = Annotated[
     float, typer.Option(help="map -> odom on /tf moves the robot no faster than this, m/s, after a loop closure.", min=0.001)
 ]

@@ -10,6 +10,7 @@ import typer
 from hybridmap.cli.node import (
     CorrectionSpeed,
     CorrectionTurn,
+    KnownMap,
     Lag,
     MapEvery,
     MapFrame,
@@ -44,6 +45,7 @@ def ros1(
     map_every: MapEvery = 5.0,
     resolution: Resolution = 0.05,
     map_frame: MapFrame = "map",
+    known_map: KnownMap = None,
     correction_m_s: CorrectionSpeed = 0.1,
     correction_deg_s: CorrectionTurn = 5.0,
     lag_s: Lag = 2.0,
@@ -79,6 +81,7 @@ def ros1(
         map_every_s=map_every,
         resolution_m=resolution,
         map_frame=map_frame,
+        known_map=known_map,
         limits=LiveLimits(lag_s=lag_s, correction_m_s=correction_m_s, correction_deg_s=correction_deg_s),
     )
     run_node(Ros1("hybridmap", remappings or ()), options, as_json=as_json)

@@ -29,13 +29,14 @@ class Output:
 TF = Output("/tf", "tf2_msgs/msg/TFMessage")
 RAW_CORRECTION = Output("~map_to_odom", "geometry_msgs/msg/TransformStamped")
 POSE = Output("~pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
+LOCALIZATION_POSE = Output("~localization_pose", "geometry_msgs/msg/PoseWithCovarianceStamped")
 PATH = Output("~path", "nav_msgs/msg/Path", latched=True)
 GRAPH = Output("~graph", "visualization_msgs/msg/MarkerArray", latched=True)
 MAP = Output("map", "nav_msgs/msg/OccupancyGrid", latched=True)
 MAP_METADATA = Output("map_metadata", "nav_msgs/msg/MapMetaData", latched=True)
 DIAGNOSTICS = Output("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 
-OUTPUTS = (TF, RAW_CORRECTION, POSE, PATH, GRAPH, MAP, MAP_METADATA, DIAGNOSTICS)
+OUTPUTS = (TF, RAW_CORRECTION, POSE, LOCALIZATION_POSE, PATH, GRAPH, MAP, MAP_METADATA, DIAGNOSTICS)
 
 INITIAL_POSE = "initialpose"
 """Where rviz tells the robot's pose, geometry_msgs/PoseWithCovarianceStamped."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from hybridmap.config.root import Config
 from hybridmap.errors import ExportError, HybridMapError, RosError, StreamError
+from hybridmap.geometry import Array, compose
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.live import LiveLimits, LiveMapper, Snapshot
 from hybridmap.live.process import MappingProcess
@@ -40,6 +41,8 @@ _PUBLISH_S = 1.0
 _SHARE = 0.05
 """Largest share of the time that goes into making them."""
 _GRID_WAIT_S = 30.0
+KNOWN_MAP = "known_map"
+"""Name of the frame of a finished map; the frame of the drive's own map is its child."""
 _LONGEST_S = 1.0
 """For how long the stamp of `map -> odom` goes on with the clock when no odometry comes, s."""
 _CLOCK_BACK_S = 3.0
@@ -60,6 +63,7 @@ class NodeOptions:
         map_every_s: time between two grids on `/map`; after a closure the next one comes at once.
         resolution_m: side of a cell of the grid.
         map_frame: name of the frame of the map.
+        known_map: session folder of a finished map on which the robot is looked for; None: there is none.
         limits: of lag and of the smoothed correction.
     """
 
@@ -72,6 +76,7 @@ class NodeOptions:
     map_every_s: float = 5.0
     resolution_m: float = 0.05
     map_frame: str = "map"
+    known_map: Path | None = None
     limits: LiveLimits = field(default_factory=LiveLimits)
 
 
@@ -104,7 +109,8 @@ class RobotNode:
 
     def start(self) -> None:
         """Look for the robot's topics, and offer the services; returns at once."""
-        services = Services(self._require_mapper, self._options.out, self._options.map_frame, self._options.resolution_m)
+        given = self._options
+        services = Services(self._require_mapper, given.out, given.map_frame, given.resolution_m, given.known_map)
         self._ros.offer(services.table)
         pose_type = "geometry_msgs/msg/PoseWithCovarianceStamped"
         self._ros.subscribe(ros.INITIAL_POSE, pose_type, lambda *_: self._refuse_initial_pose())
@@ -215,6 +221,8 @@ class RobotNode:
                 overwrite=options.overwrite,
                 process=self._process,
             )
+            if options.known_map is not None:
+                mapper.localise(options.known_map)
         except HybridMapError as error:
             self._fail(error)
             return
@@ -247,7 +255,7 @@ class RobotNode:
             self._ros.warn(f"left out: {error}")
 
     def _refuse_initial_pose(self) -> None:
-        self._ros.warn("initialpose: this node maps, and knows where it began; localisation is not supported yet: ignored")
+        self._ros.warn("initialpose: ignored: the robot is looked for on the whole of the map that --map gives")
 
     # ------------------------------------------------------------------ out
 
@@ -265,13 +273,27 @@ class RobotNode:
         now_s = time.monotonic()
         since_s = min(now_s - newest[1], _LONGEST_S)
         stamp_ns = newest[0] + round((since_s + self._options.ahead_s) * NS_PER_S)
-        if 0 <= self._corrected_ns - stamp_ns < _CLOCK_BACK_S * NS_PER_S:
-            return  # odometry was late: what was published is still ahead of it
-        self._corrected_ns = stamp_ns
         frames = self._options.map_frame, incoming.frames[0]
-        smoothed = mapper.smoothed_map_odom(now_s).pose_map_odom
-        self._ros.publish(ros.TF, {"transforms": [contents.transform(stamp_ns, *frames, smoothed)]})
+        shown = [contents.transform(stamp_ns, *frames, mapper.smoothed_map_odom(now_s).pose_map_odom)]
+        there = self._pose_known_map(mapper)
+        if there is not None:
+            shown.append(contents.transform(stamp_ns, KNOWN_MAP, frames[0], there))
+            pose = compose(there, mapper.pose_map_robot())
+            self._ros.publish(ros.LOCALIZATION_POSE, contents.pose_with_covariance(newest[0], KNOWN_MAP, pose, None))
         self._ros.publish(ros.RAW_CORRECTION, contents.transform(stamp_ns, *frames, mapper.pose_map_odom))
+        if 0 <= self._corrected_ns - stamp_ns < _CLOCK_BACK_S * NS_PER_S:
+            return  # odometry is late: what was published is still ahead of it
+        self._corrected_ns = stamp_ns
+        self._ros.publish(ros.TF, {"transforms": shown})
+
+    def _pose_known_map(self, mapper: LiveMapper) -> Array | None:
+        """(3,) pose of this drive's map in the finished one, m and rad; None while unknown."""
+        try:
+            return mapper.pose_base_map
+        except HybridMapError as error:
+            self._ros.warn(f"no longer looking for the robot on {self._options.known_map}: {error}")
+            mapper.localise(None)
+            return None
 
     def _show(self) -> None:
         """Publish the map where it has changed, and how the node is doing."""

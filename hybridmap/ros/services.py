@@ -14,13 +14,15 @@ from hybridmap.ros.contents import Contents
 from hybridmap.ros.middleware import Service, ServiceKind
 
 _ANSWER_S = 60.0
-_NO_LOCALISATION = "localisation on a finished map is not supported yet: this node maps"
+_NO_KNOWN_MAP = "no finished map to look for the robot on: start the node with --map DIR, its session folder"
 
 
 class Services:
     """What the services do."""
 
-    def __init__(self, mapper: Callable[[], LiveMapper], out: Path, map_frame: str, resolution_m: float) -> None:
+    def __init__(
+        self, mapper: Callable[[], LiveMapper], out: Path, map_frame: str, resolution_m: float, known_map: Path | None = None
+    ) -> None:
         """Remember what they need.
 
         Args:
@@ -28,8 +30,10 @@ class Services:
             out: the session folder; `save_map` writes beside it.
             map_frame: name of the frame of the map.
             resolution_m: side of a cell of the grid.
+            known_map: session folder of a finished map; None: there is none.
         """
         self._mapper, self._out, self._map_frame, self._resolution_m = mapper, out, map_frame, resolution_m
+        self._known_map = known_map
 
     @property
     def table(self) -> tuple[Service, ...]:
@@ -37,8 +41,8 @@ class Services:
         return (
             Service("~save_map", ServiceKind.TRIGGER, _answered(self._save_map)),
             Service("~serialize_map", ServiceKind.TRIGGER, _answered(self._serialize_map)),
-            Service("~deserialize_map", ServiceKind.TRIGGER, _answered(_refuse)),
-            Service("~set_localization_mode", ServiceKind.SET_BOOL, _answered(_stay_mapping)),
+            Service("~deserialize_map", ServiceKind.TRIGGER, _answered(lambda _: self._localise(True))),
+            Service("~set_localization_mode", ServiceKind.SET_BOOL, _answered(self._localise)),
             Service("~pause", ServiceKind.EMPTY, self._pause),
             Service("~resume", ServiceKind.EMPTY, self._resume),
             Service("~reset", ServiceKind.EMPTY, self._reset),
@@ -56,6 +60,13 @@ class Services:
     def _serialize_map(self, _: bool) -> str:
         self._mapper().save(timeout_s=_ANSWER_S)
         return f"everything so far is in the session folder {self._out}"
+
+    def _localise(self, wanted: bool) -> str:
+        mapper = self._mapper()
+        if wanted and self._known_map is None:
+            raise RosError(_NO_KNOWN_MAP)
+        mapper.localise(self._known_map if wanted else None)
+        return f"looking for the robot on {self._known_map}, and mapping" if wanted else "mapping"
 
     def _pause(self, _: bool) -> Contents:
         self._mapper().pause()
@@ -85,13 +96,3 @@ def _answered(do: Callable[[bool], str]) -> Callable[[bool], Contents]:
             return {"success": False, "message": str(error)}
 
     return answer
-
-
-def _refuse(_: bool) -> str:
-    raise RosError(_NO_LOCALISATION)
-
-
-def _stay_mapping(localise: bool) -> str:
-    if localise:
-        raise RosError(_NO_LOCALISATION)
-    return "mapping"

@@ -84,7 +84,7 @@ def test_the_map_is_that_of_the_bag_and_is_published_and_served(bag: Path, tmp_p
     for name, value in (("~deserialize_map", False), ("~set_localization_mode", True)):
         refused = robot.services[name].does(value)
         assert not refused["success"]
-        assert "not supported yet" in refused["message"]
+        assert "--map" in refused["message"]
     robot.takers["initialpose"](b"", None)
     assert any("initialpose" in warning for warning in robot.warnings)
     robot.wait_for(lambda: len(robot.published["/tf"]) > 20)
@@ -92,6 +92,24 @@ def test_the_map_is_that_of_the_bag_and_is_published_and_served(bag: Path, tmp_p
     assert finished.head["graph_hash"] == recorded.head["graph_hash"]
     assert finished.head["stream"] == recorded.head["stream"]
     check_published(robot, bag)
+
+
+def test_the_robot_is_found_on_a_finished_map(bag: Path, tmp_path: Path) -> None:
+    finished = session.run(BagStream(bag, Config.load("laser")), Config.load("laser"), tmp_path / "monday")
+    robot = PlayedRobot(bag)
+    node = RobotNode(robot, NodeOptions(tmp_path / "tuesday", known_map=tmp_path / "monday", limits=NO_LIMIT))
+    node.start()
+    robot.wait_for(lambda: "/tf_static" in robot.takers)
+    robot.play(20.0, until_s=SLOWLY_AFTER_S)
+    robot.wait_for(lambda: bool(robot.published["~localization_pose"]), 120.0)
+    robot.play(1.0, from_s=SLOWLY_AFTER_S)
+    (_, known) = robot.published["/tf"][-1]["transforms"]
+    assert (known["header"]["frame_id"], known["child_frame_id"]) == ("known_map", "map")
+    assert np.abs(transform_of(known)).max() < 0.1  # the same drive
+    assert robot.services["~set_localization_mode"].does(False) == {"success": True, "message": "mapping"}
+    assert robot.services["~deserialize_map"].does(False)["success"]
+    again = node.finish()
+    assert again.head["graph_hash"] == finished.head["graph_hash"]
 
 
 def check_published(robot: PlayedRobot, bag: Path) -> None:
