@@ -86,6 +86,26 @@ def test_a_reader_does_not_keep_a_run_from_its_end(tmp_path):
         assert store.ended
 
 
+@pytest.mark.parametrize("count", [1, 10])
+def test_a_session_that_is_read_is_overwritten_all_the_same(tmp_path, count):
+    session = write_session(tmp_path / "s", ring_map())
+    readers = [MapStore.open(session.path) for _ in range(count)]
+    before = [len(reader.map()) for reader in readers]
+    with session.writing(overwrite=True):
+        store = MapStore.create(session.path, "{}", Rig(), "new")
+        during = [MapStore.open(session.path) for _ in range(count)]
+        assert [reader.source for reader in during] == ["new"] * count
+        store.put_info("graph_hash", "0")
+        store.close()
+    assert [len(reader.map()) for reader in readers] == before
+    for reader in (*readers, *during):
+        reader.close()
+    with MapStore.open(session.path) as store:
+        assert store.source == "new"
+        assert store.ended
+    assert not (session.path / ".previous").exists()
+
+
 def test_metrics_are_merged_by_name_and_keep_the_head(tmp_path):
     session = SessionFolder(tmp_path)
     session.write_metrics({"graph_hash": "abc"}, [Metric("a/x", 1.0, "m", "A"), Metric("b/x", math.nan, "1", "B", 2.0, True)])
