@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import rospy
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import OccupancyGrid, Odometry
 from nav_msgs.msg import Path as PathMessage
 from nav_msgs.srv import GetMap
@@ -45,7 +45,7 @@ class Client:
         self.odometry: dict[int, np.ndarray] = {}
         self.poses: dict[int, np.ndarray] = {}
         rospy.Subscriber("/tf", TFMessage, self.heard_tf)
-        rospy.Subscriber("/hybridmap/map_to_odom", rospy.AnyMsg, lambda message: None)
+        rospy.Subscriber("/hybridmap/map_to_odom", TransformStamped, self.heard_correction)
         rospy.Subscriber("/hybridmap/pose", PoseWithCovarianceStamped, self.heard_pose)
         for name, kind in (("/floor", OccupancyGrid), ("/hybridmap/path", PathMessage), ("/hybridmap/graph", MarkerArray)):
             rospy.Subscriber(name, kind, lambda message, name=name: self.last.__setitem__(name, message))
@@ -53,7 +53,9 @@ class Client:
     def heard_tf(self, message: TFMessage) -> None:
         for one in message.transforms:
             self.frames.add((one.header.frame_id, one.child_frame_id))
-            self.corrections.append(planar(one.transform.translation, one.transform.rotation))
+
+    def heard_correction(self, message: TransformStamped) -> None:
+        self.corrections.append(planar(message.transform.translation, message.transform.rotation))
 
     def heard_pose(self, message: PoseWithCovarianceStamped) -> None:
         self.poses[message.header.stamp.to_nsec()] = planar(message.pose.pose.position, message.pose.pose.orientation)
@@ -118,7 +120,7 @@ def main() -> None:
     found = {
         "tf_frames": sorted(client.frames),
         "poses": len(client.poses),
-        "pose_from_tf_median_m": float(np.median(off)),
+        "pose_from_correction_median_m": float(np.median(off)),
         "path_nodes": len(client.last["/hybridmap/path"].poses),
         "graph_markers": len(client.last["/hybridmap/graph"].markers),
         "map": [len(client.last["/floor"].data), client.last["/floor"].info.width],

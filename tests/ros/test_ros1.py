@@ -65,11 +65,11 @@ def test_the_graph_is_that_of_the_bag_and_the_session_is_whole(drive) -> None:
 
 
 @pytest.mark.slow
-def test_a_client_of_tf_finds_the_robot_where_the_pose_says(drive) -> None:
+def test_the_correction_composed_with_odometry_is_the_pose(drive) -> None:
     heard = drive["heard"]
     assert heard["tf_frames"] == [["map", "odom"]]
     assert heard["poses"] > 20
-    assert heard["pose_from_tf_median_m"] < 0.05
+    assert heard["pose_from_correction_median_m"] < 0.05
     assert heard["path_nodes"] > 5
     assert heard["graph_markers"] == 5
 
