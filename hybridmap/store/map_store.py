@@ -93,7 +93,8 @@ class MapStore(Tables):
         """
         path = _file_of(folder)
         store = cls(path, schema.create(path), writable=True)
-        store.write_rows("sessions", [(0, 0, source, source, 0.0, 0.0, 0.0)])
+        name = source.encode("utf-8", "backslashreplace").decode("utf-8")  # the bytes of a file's name need not be UTF-8
+        store.write_rows("sessions", [(0, 0, name, name, 0.0, 0.0, 0.0)])
         for key, value in (("config_yaml", config_yaml), ("rig", records.rig_to_json(rig)), ("source", source)):
             store.put_info(key, value)
         store.commit()
