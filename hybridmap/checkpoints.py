@@ -171,14 +171,24 @@ def resumable(folder: SessionFolder, stream: Stream, config: Config) -> Resumabl
         return None
 
 
-def _last(folder: SessionFolder, stream: Stream, config: Config) -> Resumable:
-    if not folder.map_db.is_file():
-        raise UnusableError(f"{folder.path}: there is no session to resume")
+def require_same(folder: SessionFolder, stream: Stream, config: Config) -> None:
+    """Check that a session was made from a source of the same name, by the same configuration.
+
+    Raises:
+        StoreError: it was not, or its map is damaged.
+    """
     with MapStore.open(folder.path) as store:
         if store.config_yaml != config.to_yaml():
             raise _another(folder, f"configuration; its own is {folder.config_yaml}")
         if store.source != stream.name:
             raise _another(folder, f"source: found {stream.name}, expected {store.source}")
+
+
+def _last(folder: SessionFolder, stream: Stream, config: Config) -> Resumable:
+    if not folder.map_db.is_file():
+        raise UnusableError(f"{folder.path}: there is no session to resume")
+    require_same(folder, stream, config)
+    with MapStore.open(folder.path) as store:
         origin = checkpoint.read_origin(folder.checkpoint)
         if origin.code != provenance.mapping():
             raise _another(

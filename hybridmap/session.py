@@ -11,7 +11,7 @@ from typing import Any
 
 from hybridmap.backends.base import ODOMETRY
 from hybridmap.calibration.clock import ClockOffset
-from hybridmap.checkpoints import Checkpoints, Drive, resumable
+from hybridmap.checkpoints import Checkpoints, Drive, require_same, resumable
 from hybridmap.conclusion import figures_of, head_of
 from hybridmap.config import Config
 from hybridmap.errors import HybridMapError, StoreError, StreamError, counted
@@ -86,6 +86,7 @@ def run(
     """
     folder = SessionFolder(out)
     if resume and folder.ended:
+        require_same(folder, stream, config)
         log.warning("%s: the session is finished: there is nothing to resume", out)
         read = folder.read_metrics()
         return Session(folder, read.head, read.metrics)

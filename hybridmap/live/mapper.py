@@ -83,6 +83,7 @@ class LiveMapper:
         self._saved: dict[int, Future[None]] = {}
         self._numbers = 0
         self._ready: Future[None] = Future()
+        self._resets = threading.Lock()  # one after the other
         self._result: Future[Session] = Future()
         self._ended_s: float | None = None  # when `finish` was called
         self._drive = LiveDrive(self._rig, self._limits)
@@ -253,14 +254,15 @@ class LiveMapper:
 
     def reset(self) -> None:
         """Leave the map and begin a new one in its place; waits until the step that is being done has ended."""
-        with self._changed:
-            self._require_running()
-            self._ready = Future()
-            self._drive = LiveDrive(self._rig, self._limits)
-            self._told.clear()
-            self._outgoing.append(Reset())
-            self._changed.notify()
-        self._ready.result()
+        with self._resets:
+            with self._changed:
+                self._require_running()
+                self._ready = Future()
+                self._drive = LiveDrive(self._rig, self._limits)
+                self._told.clear()
+                self._outgoing.append(Reset())
+                self._changed.notify()
+            self._ready.result()
         if self._locator is not None:
             self.localise(self._locator.base)
 

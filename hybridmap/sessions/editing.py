@@ -14,9 +14,11 @@ import numpy as np
 from hybridmap.errors import StoreError, counted
 from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Status
+from hybridmap.graph.io import graph_hash
 from hybridmap.output import write_bytes, write_text
 from hybridmap.sessions.joining import FIGURES, Joined, conclude, config_of, describe, write_trajectories
 from hybridmap.sessions.joint_map import solutions_of
+from hybridmap.sessions.part import finished
 from hybridmap.store import MapStore
 from hybridmap.store.parts import copy_sessions
 from hybridmap.store.schema import MAP_NAME
@@ -140,7 +142,7 @@ def _written(
         for there, number in enumerate(numbers)
         if (path := read.groundtruth_of(number, newest=number == sessions[-1].number)).is_file()
     }
-    primary = whole.solutions()[whole.primary].poses
+    primary = finished(whole).poses
     ends = [*(one.first_node for one in sessions[1:]), len(primary)]
     poses = np.concatenate([primary[sessions[number].first_node : ends[number]] for number in numbers])
     with folder.writing(overwrite=overwrite):
@@ -151,7 +153,7 @@ def _written(
             write_bytes(folder.groundtruth, truth)
         with MapStore.create(folder.path, whole.config_yaml, whole.rig, whole.source) as store:
             copy_sessions(whole, store, numbers)
-            if kept is not None and len(numbers) == 1:
+            if kept is not None and len(numbers) == 1 and store.info("graph_hash") == graph_hash(store.map()):
                 return _as_before(store, folder)
             for number, edge in edges:
                 store.put_edge(number, edge)

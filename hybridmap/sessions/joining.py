@@ -22,7 +22,7 @@ from hybridmap.metrics import Metric, figure
 from hybridmap.output import write_bytes
 from hybridmap.session import Progress, run
 from hybridmap.sessions.joint_map import JointMap, joined_sessions
-from hybridmap.sessions.part import Part
+from hybridmap.sessions.part import Part, finished
 from hybridmap.store import MapStore
 from hybridmap.store.parts import copy_sessions
 from hybridmap.store.records import rig_to_json
@@ -65,8 +65,10 @@ def merge(base: Path, other: Path, out: Path, *, overwrite: bool = False) -> Joi
     Raises:
         StoreError: a map is missing, damaged or not finished, or its sensors are others than those of the first.
         StreamError: the views of a map cannot be taken up.
-        OutputError: the folder cannot be used.
+        OutputError: the folder cannot be used, or is that of one of the maps, or lies in it.
     """
+    for part in (base, other):
+        SessionFolder(part).require_apart(out)
     with MapStore.open(base) as first, MapStore.open(other) as second:
         config = config_of(first)
         require_sensors(first, second.rig, str(second.path))
@@ -116,10 +118,13 @@ def map_onto(
         overwrite: replace a session that exists there.
 
     Raises:
-        What `session.run` and `merge` raise. Then nothing is written.
+        What `session.run` and `merge` raise. What can be told before the drive is told before it; nothing is written then.
     """
+    SessionFolder(base).require_apart(out)
     with MapStore.open(base) as known:
         require_sensors(known, stream.rig, stream.name)
+        finished(known)
+    SessionFolder(out).require_free(overwrite=overwrite)
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out.absolute().parent, prefix=f".{out.name}.") as alone:
         run(stream, config, Path(alone) / "session", progress=progress)

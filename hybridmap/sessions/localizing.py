@@ -20,7 +20,7 @@ from hybridmap.metrics import Metric, figure
 from hybridmap.session import Progress, run
 from hybridmap.sessions.joining import config_of, require_sensors
 from hybridmap.sessions.joint_map import JointMap
-from hybridmap.sessions.part import Part
+from hybridmap.sessions.part import Part, finished
 from hybridmap.store import MapStore
 from hybridmap.store.session_folder import SessionFolder
 from hybridmap.store.track import Track, trajectory_of
@@ -66,10 +66,13 @@ def localize(
 
     Raises:
         StoreError: the map is missing, damaged or not finished, or of other sensors.
+        OutputError: `out` is the folder of the map, or lies in it.
         What `session.run` raises.
     """
+    SessionFolder(base).require_apart(out)
     with MapStore.open(base) as known:
         require_sensors(known, stream.rig, stream.name)
+        finished(known)
         before = graph_hash(known.map())
         folder = run(stream, config, out, overwrite=overwrite, progress=progress).folder
         joint = JointMap(config_of(known), known.rig)

@@ -8,6 +8,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from hybridmap.backends.base import Solution
 from hybridmap.errors import StoreError
 from hybridmap.geometry import Array
 from hybridmap.graph.experience_map import ExperienceMap
@@ -40,9 +41,7 @@ class Part:
         Raises:
             StoreError: the run did not come to its end, its primary back-end has no map, or the file is damaged.
         """
-        solution, experiences = store.solutions().get(store.primary), store.map()
-        if not store.ended or solution is None:
-            raise StoreError(f"{store.path}: has no finished map; expected one of a run that came to its end")
+        solution, experiences = finished(store), store.map()
         chosen = range(len(experiences.sessions)) if sessions is None else sessions
         own, nodes, _ = experiences.of_sessions(chosen)
         number = nodes.tolist().__getitem__
@@ -53,3 +52,15 @@ class Part:
             lambda node: store.keyframe(number(node)),
             lambda node: store.state(number(node)),
         )
+
+
+def finished(store: MapStore) -> Solution:
+    """The map of the primary back-end.
+
+    Raises:
+        StoreError: the run did not come to its end, or its primary back-end has no map.
+    """
+    solution = store.solutions().get(store.primary)
+    if not store.ended or solution is None:
+        raise StoreError(f"{store.path}: has no finished map; expected one of a run that came to its end")
+    return solution

@@ -183,6 +183,24 @@ class SessionFolder:
         if file.is_relative_to(folder) and {*file.relative_to(folder).parts[:1]} & {*_FILES}:
             raise OutputError(f"{target}: is a file of the session that is read; choose another name")
 
+    def require_apart(self, out: Path) -> None:
+        """Check that an output folder is neither the session's own nor lies in it.
+
+        Raises:
+            OutputError: it does.
+        """
+        if out.resolve().is_relative_to(self.path.resolve()):
+            raise OutputError(f"{out}: is in the folder of a map that is read; choose another one")
+
+    def require_free(self, *, overwrite: bool = False) -> None:
+        """Check that a session may be written here, before the work that leads to it.
+
+        Raises:
+            OutputError: as for `writing`.
+        """
+        with held(self.path, SESSION, overwrite=overwrite):
+            pass
+
     def _why_unended(self, reason: str) -> str:
         if is_held(self.path):
             return "is still being written: this is the map so far"

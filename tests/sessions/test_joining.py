@@ -13,17 +13,18 @@ from hybridmap.backends.pieces import pieces_of, solve_by_piece
 from hybridmap.backends.registry import create
 from hybridmap.cli.graphs import open_graph
 from hybridmap.config import Config
-from hybridmap.errors import ExportError, GraphError, StoreError
+from hybridmap.errors import ExportError, GraphError, OutputError, StoreError
 from hybridmap.evaluate import evaluate_session
 from hybridmap.export.formats import export_session
 from hybridmap.geometry import align, between, compose
 from hybridmap.graph.edges import EdgeKind, Status
+from hybridmap.graph.io import graph_hash
 from hybridmap.mapper import Mapper
 from hybridmap.report.session_scene import load_scene
 from hybridmap.session import run
 from hybridmap.sessions.editing import Measured, add_edge, remove_edge, remove_session
 from hybridmap.sessions.following import KnownMap
-from hybridmap.sessions.joining import merge
+from hybridmap.sessions.joining import map_onto, merge
 from hybridmap.sessions.localizing import localize
 from hybridmap.store import MapStore
 from hybridmap.streams.open import open_stream
@@ -120,6 +121,58 @@ def test_an_edge_that_is_taken_out_stays_in_the_file_and_parts_what_it_joined(jo
     assert again.joined
     with MapStore.open(whole) as store:
         assert store.solutions()["gtsam-gnc"].poses[there[0]] == pytest.approx(poses[there[0]], abs=0.02)
+
+
+def test_what_an_edge_by_hand_changed_is_solved_again_when_its_session_is_left_alone(joined, tmp_path):
+    changed = add_edge(joined.folder.path, Measured(0, 10, np.array([3.0, 3.0, 0.0]), 0.02, 0.01), tmp_path / "changed")
+    alone = remove_session(changed.folder.path, 1, tmp_path / "alone")
+    with MapStore.open(alone.folder.path) as store:
+        experiences, poses = store.map(), store.solutions()["gtsam-gnc"].poses
+        assert store.info("graph_hash") == alone.head["graph_hash"] == graph_hash(experiences)
+    again = create("gtsam-gnc", Config().backends).solve(experiences.pose_graph())
+    assert poses == pytest.approx(again.poses, abs=1e-3)
+
+
+def test_no_map_is_written_over_one_that_is_read(drives, tmp_path):
+    here, there = (shutil.copytree(path, tmp_path / path.name) for path in drives[:2])
+    before = rows(here)
+    config = Config.load("laser", {"simulation.world": "lab"})
+    stream = open_stream("lab", config, end_s=2.0)
+    for out in (here, here / "within"):
+        for write in (
+            lambda out=out: merge(here, there, out, overwrite=True),
+            lambda out=out: merge(there, here, out, overwrite=True),
+            lambda out=out: map_onto(stream, config, here, out, overwrite=True),
+            lambda out=out: localize(stream, config, here, out, overwrite=True),
+        ):
+            with pytest.raises(OutputError, match="is in the folder of a map that is read"):
+                write()
+    assert rows(here) == before
+
+
+def test_what_is_wrong_is_told_before_the_drive_is_mapped(drives, tmp_path):
+    """Here the drive cannot be mapped at all, so that an error that is told of it comes too late."""
+
+    class Undriven:
+        name, groundtruth, expected_observations = "undriven", None, None
+
+        def __init__(self, rig):
+            self.rig = rig
+
+    broken = shutil.copytree(drives[0], tmp_path / "broken")
+    with MapStore.open(broken) as store:
+        stream = Undriven(store.rig)
+    with sqlite3.connect(broken / "map.db") as file:
+        file.execute("DELETE FROM info WHERE key = 'graph_hash'")
+    with pytest.raises(StoreError, match="has no finished map"):
+        map_onto(stream, Config(), broken, tmp_path / "both")
+    with pytest.raises(StoreError, match="has no finished map"):
+        localize(stream, Config(), broken, tmp_path / "drive")
+    with pytest.raises(StoreError, match="has no finished map"):
+        remove_edge(broken, 3, tmp_path / "edited")
+    with pytest.raises(OutputError, match="holds a session already"):
+        map_onto(stream, Config(), drives[0], drives[1])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["broken"]
 
 
 def test_only_what_is_there_can_be_taken_out(drives, joined, tmp_path):
