@@ -196,6 +196,8 @@ def test_a_finished_session_or_one_that_is_written_is_not_resumed(tmp_path, capl
     again = session.run(RoomDrive(laps=0.2, with_scans=False), config, tmp_path / "s", resume=True)
     assert again.head == done.head
     assert "nothing to resume" in caplog.text
+    with pytest.raises(StoreError, match="another configuration"):
+        session.run(RoomDrive(laps=0.2, with_scans=False), CONFIG, tmp_path / "s", resume=True)
     broken_off(tmp_path / "held")
     with SessionFolder(tmp_path / "held").writing(resume=True), pytest.raises(OutputError, match="is being written"):
         session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "held", resume=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,8 +68,8 @@ def merge(base: Path, other: Path, out: Path, *, overwrite: bool = False) -> Joi
         StreamError: the views of a map cannot be taken up.
         OutputError: the folder cannot be used, or is that of one of the maps, or lies in it.
     """
-    for part in (base, other):
-        SessionFolder(part).require_apart(out)
+    for path in (base, other):
+        SessionFolder(path).require_apart(out)
     with MapStore.open(base) as first, MapStore.open(other) as second:
         config = config_of(first)
         require_sensors(first, second.rig, str(second.path))
@@ -143,12 +144,12 @@ def conclude(store: MapStore, folder: SessionFolder, solutions: Mapping[str, Sol
     primary = config.backends.names[0]
     _write_frames(store, solutions[primary].poses)
     experiences, sessions = store.map(), store.sessions()
-    pieces = joined_sessions(experiences)
+    pieces, lost = joined_sessions(experiences), _lost(store)
     for name, solution in solutions.items():
         store.put_solution(name, solution.poses, solution.report)
     write_trajectories(store, folder, {name: solution.poses for name, solution in solutions.items()})
     head = {
-        **said_of(_reasons(experiences, solutions[primary], primary, pieces)),
+        **said_of(_reasons(experiences, solutions[primary], primary, pieces, lost)),
         "graph_hash": graph_hash(experiences),
         "primary_backend": primary,
         "backends": list(solutions),
@@ -158,6 +159,7 @@ def conclude(store: MapStore, folder: SessionFolder, solutions: Mapping[str, Sol
             for one in sessions
         ],
         "joined": len(pieces) == 1,
+        "lost": lost,
         "remarks": [] if len(pieces) == 1 else [_not_joined(store, pieces)],
     }
     metrics = _figures(experiences, pieces)
@@ -245,10 +247,22 @@ def _write_frames(store: MapStore, poses: Array) -> None:
         store.write("UPDATE sessions SET x_m = ?, y_m = ?, yaw_rad = ? WHERE number = ?", (*frame.tolist(), session.number))
 
 
-def _reasons(experiences: ExperienceMap, solution: Solution, primary: str, pieces: list[list[int]]) -> Sequence[Reason]:
+def _reasons(
+    experiences: ExperienceMap, solution: Solution, primary: str, pieces: list[list[int]], lost: dict[str, tuple[int, int]]
+) -> Sequence[Reason]:
     if len(pieces) > 1:
         return [Reason("not joined", float(len(pieces)), 1.0)]
-    return reasons_of(Facts.of_drive(experiences, solution, primary))
+    return reasons_of(Facts.of_drive(experiences, solution, primary, lost=lost))
+
+
+def _lost(store: MapStore) -> dict[str, tuple[int, int]]:
+    """What the streams of all sessions lost: name -> (messages that were lost, messages that there were)."""
+    lost: dict[str, tuple[int, int]] = {}
+    for (text,) in store.rows("SELECT value FROM info WHERE key = ? ORDER BY session", (FIGURES,)):
+        for name, (gone, stated) in json.loads(text).get("lost", {}).items():
+            before = lost.get(name, (0, 0))
+            lost[name] = before[0] + gone, before[1] + stated
+    return lost
 
 
 def _figures(experiences: ExperienceMap, pieces: list[list[int]]) -> list[Metric]:

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -48,6 +49,19 @@ def drive():
 @pytest.fixture(scope="module")
 def recorded(drive, tmp_path_factory):
     return session.run(drive, CONFIG, tmp_path_factory.mktemp("recorded") / "s")
+
+
+def test_resets_from_several_threads_are_done_one_after_the_other(drive, tmp_path):
+    with LiveMapper(CONFIG, drive.rig, tmp_path / "s", limits=PATIENT) as mapper:
+        threads = [threading.Thread(target=mapper.reset, daemon=True) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60.0)
+        assert not any(thread.is_alive() for thread in threads)
+        for sample in as_they_arrive(drive):
+            mapper.add(sample)
+        assert mapper.finish(120.0).head["graph_hash"]
 
 
 def test_the_map_is_that_of_the_recording_whatever_the_order_across_sources(drive, recorded, tmp_path):

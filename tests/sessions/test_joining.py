@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import shutil
 import sqlite3
 
@@ -22,6 +23,7 @@ from hybridmap.graph.io import graph_hash
 from hybridmap.mapper import Mapper
 from hybridmap.report.session_scene import load_scene
 from hybridmap.session import run
+from hybridmap.sessions import joining, localizing
 from hybridmap.sessions.editing import Measured, add_edge, remove_edge, remove_session
 from hybridmap.sessions.following import KnownMap
 from hybridmap.sessions.joining import map_onto, merge
@@ -133,6 +135,16 @@ def test_what_an_edge_by_hand_changed_is_solved_again_when_its_session_is_left_a
     assert poses == pytest.approx(again.poses, abs=1e-3)
 
 
+def test_what_a_part_lost_counts_against_the_joint_map(drives, tmp_path):
+    here = shutil.copytree(drives[0], tmp_path / "here")
+    figures = json.loads((here / "metrics.json").read_text())
+    (here / "metrics.json").write_text(json.dumps(figures | {"lost": {"scans": [90, 100]}}))
+    both = merge(here, drives[1], tmp_path / "both")
+    assert both.head["lost"] == {"scans": (90, 100)}
+    assert both.head["verdict"] == "doubtful"
+    assert any("scans" in json.dumps(reason) for reason in both.head["reasons"])
+
+
 def test_no_map_is_written_over_one_that_is_read(drives, tmp_path):
     here, there = (shutil.copytree(path, tmp_path / path.name) for path in drives[:2])
     before = rows(here)
@@ -150,29 +162,26 @@ def test_no_map_is_written_over_one_that_is_read(drives, tmp_path):
     assert rows(here) == before
 
 
-def test_what_is_wrong_is_told_before_the_drive_is_mapped(drives, tmp_path):
-    """Here the drive cannot be mapped at all, so that an error that is told of it comes too late."""
+def test_what_is_wrong_is_told_before_the_drive_is_mapped(drives, tmp_path, monkeypatch):
+    def driven(*_args, **_named):
+        raise AssertionError("the drive was mapped")
 
-    class Undriven:
-        name, groundtruth, expected_observations = "undriven", None, None
-
-        def __init__(self, rig):
-            self.rig = rig
-
+    for module in (joining, localizing):
+        monkeypatch.setattr(module, "run", driven)
     broken = shutil.copytree(drives[0], tmp_path / "broken")
-    with MapStore.open(broken) as store:
-        stream = Undriven(store.rig)
     with sqlite3.connect(broken / "map.db") as file:
         file.execute("DELETE FROM info WHERE key = 'graph_hash'")
+    config = Config.load("laser")
+    stream = open_stream("lab", config)
     with pytest.raises(StoreError, match="has no finished map"):
-        map_onto(stream, Config(), broken, tmp_path / "both")
+        map_onto(stream, config, broken, tmp_path / "both")
     with pytest.raises(StoreError, match="has no finished map"):
-        localize(stream, Config(), broken, tmp_path / "drive")
+        localize(stream, config, broken, tmp_path / "drive")
     with pytest.raises(StoreError, match="has no finished map"):
         remove_edge(broken, 3, tmp_path / "edited")
     with pytest.raises(OutputError, match="holds a session already"):
-        map_onto(stream, Config(), drives[0], drives[1])
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["broken"]
+        map_onto(stream, config, drives[0], drives[1])
+    assert [path.name for path in tmp_path.iterdir()] == ["broken"]
 
 
 def test_only_what_is_there_can_be_taken_out(drives, joined, tmp_path):
