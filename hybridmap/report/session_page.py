@@ -66,6 +66,8 @@ def _content(scene: SessionScene, store: MapStore) -> dict[str, Any]:
         "judged_by": {"reference": "", "relations": ""} | scene.head.get("judged_by", {}),
         "saw_something": building is not None,
         "tiles": tiles(scene),
+        "sessions": len(scene.experiences.sessions),
+        "joined": scene.head.get("joined", True),
         "verdict": scene.head.get("verdict"),
         "reasons": [reason["words"] for reason in scene.head.get("reasons", ())],
         "remarks": _remarks(scene),

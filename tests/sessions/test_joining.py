@@ -21,6 +21,7 @@ from hybridmap.geometry import align, between, compose
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.io import graph_hash
 from hybridmap.mapper import Mapper
+from hybridmap.report import write_report
 from hybridmap.report.session_scene import load_scene
 from hybridmap.session import run
 from hybridmap.sessions import joining, localizing
@@ -220,6 +221,14 @@ def test_pieces_do_not_look_joined(drives, tmp_path):
     with pytest.raises(GraphError, match="2 pieces that are not joined"):
         open_graph(apart.path)
     export_session(apart.path, "tum", tmp_path / "newest.tum")
+
+
+def test_the_page_says_whose_trajectories_it_shows_and_that_pieces_lie_anywhere(drives, joined, tmp_path):
+    apart = merge(drives[0], drives[2], tmp_path / "apart").folder
+    for folder, said in ((joined.folder, False), (apart, True)):
+        page = write_report(folder).read_text()
+        assert "The map has 2 sessions" in page
+        assert ("the distance between them means nothing" in page) == said
 
 
 def test_a_map_of_several_sessions_is_evaluated_by_its_newest(drives, joined):
