@@ -153,6 +153,9 @@ class Relocaliser:
 
     The first node of a session comes after a break too (`arrived`). Nothing tells where it is, so there the break never proves
     to be a bad registration, and its edge comes from a node that was matched.
+
+    Attributes:
+        leading: the pending matches that agree best with each other, if they are of `SUPPORT` distinct nodes; else none.
     """
 
     def __init__(self, whereabouts: Whereabouts, new_key: Callable[[], int], span_m: float) -> None:
@@ -164,6 +167,7 @@ class Relocaliser:
         self._agree: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
         self._steps: deque[Edge] = deque(maxlen=KEPT_STEPS)
         self._arrivals: set[int] = set()
+        self.leading: tuple[Edge, ...] = ()
 
     def arrived(self, node: int) -> None:
         """Note that a session begins at a node, of which nothing is known but that its place may be on the map."""
@@ -184,7 +188,7 @@ class Relocaliser:
             found: nodes that were compared; those with pending edges are matches.
             belief: the map; poses on either side of a kidnapping are right relative to each other.
         """
-        out = [match.edge for match in found] + self._expired(belief)
+        out, self.leading = [match.edge for match in found] + self._expired(belief), ()
         self._waiting += [s for s in found if s.edge.status is Status.PENDING]
         if not self._waiting:
             return Settlement(out)
@@ -195,6 +199,8 @@ class Relocaliser:
         chosen = np.flatnonzero(largest_consistent_set(self._agree, weights))
         asked = self._asked(chosen, weights, belief)
         if not passed(asked):
+            if passed(asked[:1]):
+                self.leading = tuple(edges[i] for i in chosen.tolist())
             return Settlement(out)
         accepted = tuple(edges[i].settled(*asked) for i in chosen.tolist())
         self._waiting = [s for i, s in enumerate(self._waiting) if i not in set(chosen.tolist())]
@@ -209,7 +215,7 @@ class Relocaliser:
     def dismiss(self, lack: Lack = Lack.UNSUPPORTED) -> list[Edge]:
         """Reject all pending matches for the reason `lack`; returns their edges."""
         out = [s.edge.settled(lack=lack) for s in self._waiting]
-        self._waiting, self._agree = [], self._agree[:0, :0]
+        self._waiting, self._agree, self.leading = [], self._agree[:0, :0], ()
         return out
 
     def reattach(self, broken_at: int, accepted: tuple[Edge, ...], belief: Belief) -> list[Edge]:

@@ -27,8 +27,10 @@ from hybridmap.session import run
 from hybridmap.sessions import joining, localizing
 from hybridmap.sessions.editing import Measured, add_edge, remove_edge, remove_session
 from hybridmap.sessions.following import KnownMap
-from hybridmap.sessions.joining import map_onto, merge
+from hybridmap.sessions.joining import config_of, map_onto, merge
+from hybridmap.sessions.joint_map import JointMap
 from hybridmap.sessions.localizing import localize
+from hybridmap.sessions.part import Part
 from hybridmap.store import MapStore
 from hybridmap.streams.open import open_stream
 from hybridmap.trajectory import read_tum
@@ -284,6 +286,16 @@ def test_a_drive_is_localised_on_a_map_that_stays_as_it_is(drives, tmp_path):
     assert np.sqrt(np.mean(error_m**2)) < 0.03
     assert done.head["localized"]["graph_hash_before"] == done.head["localized"]["graph_hash_after"]
     assert {metric.name: metric.value for metric in done.metrics}["found_after"] < 5.0
+
+
+def test_a_place_that_some_views_agree_on_is_asked_about_at_all_nodes(drives):
+    """The search of the whole map does not find the first metres by themselves: the drive would be found after 2.6 m."""
+    with MapStore.open(drives[0]) as here, MapStore.open(drives[1]) as there:
+        joint = JointMap(config_of(here), here.rig)
+        joint.take_up(Part.of(here))
+        nodes = joint.take_up(Part.of(there))
+        assert found(joint.join(nodes)) < 2.3
+    assert any(edge.kind is EdgeKind.LOOP and edge.source == nodes.start for edge in joint.map.edges)
 
 
 @pytest.mark.parametrize("start_s", [2.0, 12.0])

@@ -217,6 +217,16 @@ class Prober:
         modes = self._search(gates, probe, Proposer.GLOBAL)[:MODES_ANYWHERE]
         return _distinct([self._verify(mode, probe, Search.WHOLE_MAP) for mode in modes])
 
+    def probe_at(self, probe: Submap, anchor: int, expected: Array) -> list[Hypothesis]:
+        """Register a submap to the old one around the node `anchor`, near an expected pose (3,) in its frame, m and rad.
+
+        Returns:
+            One hypothesis, failed or not; none where hardly anything fits.
+        """
+        gate = _Gate(anchor, expected, UNKNOWN, np.pi, UNKNOWN)
+        modes = self._about(gate, expected, probe, Proposer.PROXIMITY)
+        return [self._verify(mode, probe, Search.WHOLE_MAP) for mode in modes]
+
     def anchors_before(self, node: int) -> list[int]:
         """Nodes, ascending and some metres apart, around which there are submaps that lie wholly before a node."""
         self._extend_anchors()
@@ -249,10 +259,10 @@ class Prober:
         modes: list[_Mode] = []
         for old, pose in leads.where(inside).agreed()[:LEADS]:
             gate = min(gates, key=lambda g: abs(travel[old] - travel[g.anchor]))
-            modes += self._about(gate, between(chain[gate.anchor], pose), probe)
+            modes += self._about(gate, between(chain[gate.anchor], pose), probe, Proposer.PROFILE)
         return sorted(modes, key=lambda m: -m.score)
 
-    def _about(self, gate: _Gate, start: Array, probe: Submap) -> list[_Mode]:
+    def _about(self, gate: _Gate, start: Array, probe: Submap, proposed_by: Proposer) -> list[_Mode]:
         """The likeliest start near a pose (3,) of the probe in a target's frame; none where nothing fits."""
         if np.hypot(start[0], start[1]) > WINDOW_M:
             return []
@@ -265,7 +275,7 @@ class Prober:
         if scores[h, t] < ABOUT_MIN:
             return []
         pose = np.array([*(start[:2] + offsets[t]), headings[h]])
-        return [_Mode(gate, target, pose, float(scores[h, t]), Proposer.PROFILE)]
+        return [_Mode(gate, target, pose, float(scores[h, t]), proposed_by)]
 
     def _search(self, gates: list[_Gate], probe: Submap, proposed_by: Proposer) -> list[_Mode]:
         """Promising starts on the likeliest targets, the best first."""

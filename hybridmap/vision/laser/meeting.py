@@ -4,16 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hybridmap.config.vision import VisionConfig
+from hybridmap.geometry import between
 from hybridmap.graph.edges import Edge, Lack, Status
 from hybridmap.vision.base import Belief, known_nodes
 from hybridmap.vision.laser.commitment import Commitment
-from hybridmap.vision.laser.hypotheses import LENGTH_M, Prober
+from hybridmap.vision.laser.hypotheses import LENGTH_M, Hypothesis, Prober
 from hybridmap.vision.laser.kidnapping import FROM_M, OFTEN_M, SPAN_M, GlobalLocalisation
 from hybridmap.vision.laser.panorama import Panoramas
 from hybridmap.vision.laser.revisits import Reviser
 from hybridmap.vision.laser.submap import Atlas
-from hybridmap.vision.relocalising import Relocaliser, Whereabouts
+from hybridmap.vision.relocalising import Relocaliser, Whereabouts, placed_by
+
+NEAREST = 2
+"""A node is registered to so many old submaps, the nearest ones, where other nodes say that it is."""
 
 
 class ScanMeeting:
@@ -49,6 +56,7 @@ class ScanMeeting:
         self._relocaliser.arrived(first)
         self._commitment = Commitment(self._atlas.travel_m.__getitem__)
         self._searched_m = float("-inf")
+        self._asked: set[tuple[int, int]] = set()
 
     def meet(self, node: int, belief: Belief) -> list[Edge]:
         """Look for loops of a node to the nodes before the session, every few metres; see `MeetingFrontEnd.meet`."""
@@ -62,16 +70,42 @@ class ScanMeeting:
 
     def _search(self, node: int, belief: Belief) -> list[Edge]:
         """Register the last metres to the whole map."""
-        recent = self._atlas.along(node, LENGTH_M, 0.0)
         anchors = self._prober.anchors_before(self._first)
         if not anchors:
             return []
         found = self._prober.probe_anywhere(
-            self._atlas.submap(node, recent[recent <= node]), self._localisation.most_similar(node, anchors)
+            self._atlas.submap(node, self._recent(node)), self._localisation.most_similar(node, anchors)
         )
         settlement = self._relocaliser.settle(self._localisation.matches(found), belief)
+        proposals = settlement.proposals
+        if self._relocaliser.leading:
+            settlement = self._relocaliser.settle(self._localisation.matches(self._asked_there(node, belief)), belief)
+            proposals = proposals + settlement.proposals
         self._found = bool(settlement.accepted)
-        return settlement.proposals
+        return proposals
+
+    def _asked_there(self, node: int, belief: Belief) -> list[Hypothesis]:
+        """Register every node of the session up to a node where the matches that agree so far put it, once to each old submap.
+
+        A search of the whole map looks closely at the few places that look most alike. The first metres look like many.
+        """
+        poses, anchors = belief.poses_map_node, np.array(self._prober.anchors_before(self._first))
+        self._asked.update((edge.source, edge.target) for edge in self._relocaliser.leading)
+        found = []
+        for asked in range(self._first, node + 1):
+            expected = between(poses[anchors], placed_by(self._relocaliser.leading, asked, poses))
+            nearest = np.argsort(np.hypot(expected[:, 0], expected[:, 1]), kind="stable")[:NEAREST].tolist()
+            new = [i for i in nearest if (asked, int(anchors[i])) not in self._asked]
+            self._asked.update((asked, int(anchors[i])) for i in new)
+            if new:
+                probe = self._atlas.submap(asked, self._recent(asked))
+                found += [h for i in new for h in self._prober.probe_at(probe, int(anchors[i]), expected[i])]
+        return found
+
+    def _recent(self, node: int) -> NDArray[np.int64]:
+        """The nodes of a probe that ends at a node."""
+        recent = self._atlas.along(node, LENGTH_M, 0.0)
+        return recent[recent <= node]
 
     def _probe(self, node: int, belief: Belief) -> list[Edge]:
         """Register the last metres to the submaps of earlier sessions that may be near."""
