@@ -7,6 +7,8 @@ The source, a bag or the name of a simulated world, is cut to its first seconds 
 that bag. Then a `rosmaster` runs on a port of the loopback device, `hybridmap ros1` maps what `rosbag play` plays at
 the rate, and this program listens beside it. It exits with 1 if the graphs differ, odometry was lost, or poses are late at
 rate 1. ROS 1 comes from Debian's packages (`tools/ros1.py`), into the folder `--ros-folder`.
+
+With `--ros 2` the same bag is played to `hybridmap ros2` by `ros2_play.py`, with wheels of ROS 2 (`tools/ros2.py`).
 """
 
 from __future__ import annotations
@@ -25,8 +27,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import live_ros2
 import numpy as np
 from ros1 import Ros1, Ros1Error, fetch, master
+from ros2 import Ros2Error
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
@@ -134,10 +138,9 @@ def listen(environment: dict[str, str], ros: Ros1, odometry_topic: str, heard: H
     return rospy
 
 
-def play(bag: Path, ros: Ros1, rate: float, settings: list[str], heard: Heard, folder: Path) -> dict[str, Any]:
+def play(bag: Path, ros: Ros1, rate: float, odometry: str, settings: list[str], heard: Heard, folder: Path) -> dict[str, Any]:
     """Map what `rosbag play` plays; returns the head of the session."""
     out = folder / "live"
-    odometry = BagStream(bag, Config.load(None, dict(_pairs(settings)))).uses["odometry"]
     with master(ros) as environment:
         rospy = listen(environment, ros, odometry, heard)
         more = [word for setting in settings for word in ("--set", setting)]
@@ -177,18 +180,25 @@ def offline(bag: Path, settings: list[str], folder: Path) -> dict[str, Any]:
     return head
 
 
-def prove(source: str, ros_folder: Path, rate: float, seconds: float | None, settings: list[str], keep: Path) -> dict[str, Any]:
+def prove(
+    source: str, version: int, ros_folder: Path, rate: float, seconds: float | None, settings: list[str], keep: Path
+) -> dict[str, Any]:
     """Map a source both ways; returns the figures."""
-    ros = fetch(ros_folder)
     bag = recording(source, seconds, settings, keep)
     before, heard = offline(bag, settings, keep), Heard()
-    now = play(bag, ros, rate, settings, heard, keep)
+    odometry = BagStream(bag, Config.load(None, dict(_pairs(settings)))).uses["odometry"]
+    if version == 2:
+        now, told = live_ros2.play(bag, ros_folder, rate, odometry, settings, keep)
+        heard.late_s, heard.status = told["late_s"], told["status"]
+    else:
+        now = play(bag, fetch(ros_folder), rate, odometry, settings, heard, keep)
     late_ms = 1000.0 * np.array(heard.late_s or [np.nan])
     sent, taken = int(before["stream"]["odometry"]), int(now["stream"].get("odometry", 0))
     p99_ms = float(np.percentile(late_ms, 99))
     same = before["graph_hash"] == now["graph_hash"]
     return {
         "source": source,
+        "ros": version,
         "rate": rate,
         "seconds": seconds,
         "same_graph": same,
@@ -211,18 +221,19 @@ def main() -> int:
     """Prove and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source")
-    parser.add_argument("--ros", type=int, choices=(1,), default=1)
+    parser.add_argument("--ros", type=int, choices=(1, 2), default=1)
     parser.add_argument("--rate", type=float, default=1.0)
     parser.add_argument("--seconds", type=float, default=None, help="of the recording")
     parser.add_argument("--set", action="append", default=[], dest="settings", metavar="KEY=VALUE")
-    parser.add_argument("--ros-folder", type=Path, default=Path.home() / ".cache" / "hybridmap" / "ros1")
+    parser.add_argument("--ros-folder", type=Path, default=None, help="default: ~/.cache/hybridmap/ros1 or ros2")
     parser.add_argument("--keep", type=Path, default=None, help="folder for the bag and both sessions; default: none is kept")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         keep = given.keep or Path(scratch)
         keep.mkdir(parents=True, exist_ok=True)
-        found = prove(given.source, given.ros_folder, given.rate, given.seconds, given.settings, keep)
+        ros_folder = given.ros_folder or Path.home() / ".cache" / "hybridmap" / f"ros{given.ros}"
+        found = prove(given.source, given.ros, ros_folder, given.rate, given.seconds, given.settings, keep)
     if given.json:
         print(json.dumps(found, indent=2))
     else:
@@ -234,5 +245,5 @@ def main() -> int:
 if __name__ == "__main__":
     try:
         sys.exit(main())
-    except Ros1Error as error:
+    except (Ros1Error, Ros2Error) as error:
         sys.exit(f"live_proof: {error}")

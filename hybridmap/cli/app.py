@@ -28,6 +28,7 @@ from hybridmap.cli.merge import merge
 from hybridmap.cli.optimize import optimize
 from hybridmap.cli.reproduce import reproduce
 from hybridmap.cli.ros1 import ros1
+from hybridmap.cli.ros2 import ros2
 from hybridmap.cli.simulate import simulate
 from hybridmap.cli.study import study
 from hybridmap.cli.verify import verify
@@ -79,6 +80,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], dict[int, str]]] = {
     "merge": (merge, {0: "the map of both is written, whether or not they could be joined"}),
     "import": (import_session, {0: "the session is written, whatever its verdict"}),
     "ros1": (ros1, {0: "the session is written, whatever its verdict"}),
+    "ros2": (ros2, {0: "the session is written, whatever its verdict"}),
     "localize": (localize, {0: "the session of the drive is written, whether or not it was found on the map"}),
     "edit": (edit, {0: "the changed map is written, whatever its verdict"}),
     "evaluate": (evaluate, {0: "evaluated, even if metrics.json or the page cannot be written, which is only warned of"}),

@@ -1,13 +1,14 @@
-"""Run a ROS node until Ctrl-C, and conclude its session; what `ros1` has beside other nodes is its middleware."""
+"""Run a ROS node until Ctrl-C, and conclude its session; `ros1` and `ros2` differ by their middleware."""
 
 from __future__ import annotations
 
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
@@ -15,7 +16,7 @@ from hybridmap.cli.show import emit
 
 if TYPE_CHECKING:
     from hybridmap.ros.middleware import Middleware
-    from hybridmap.ros.robot import NodeOptions
+    from hybridmap.session import Session
 
 _SWITCH_S = 0.0005
 """Python lets another thread run after so long, s, and not after 5 ms: odometry need not wait while the graph of a large map is
@@ -48,17 +49,48 @@ Lag = Annotated[
 ]
 
 
-def run_node(middleware: Middleware, options: NodeOptions, *, as_json: bool) -> None:
+Configuration = Annotated[
+    str | None,
+    typer.Option(
+        help="Configuration: a name (an unknown one gives the list) or a YAML file. Default: the one for the sensor found."
+    ),
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")]
+
+
+class Node(Protocol):
+    """A node that maps: `ros.robot.RobotNode`, or one with a lifecycle around it.
+
+    Attributes:
+        ended: set when there is nothing more to wait for.
+    """
+
+    ended: threading.Event
+
+    def start(self) -> None:
+        """Begin; returns at once."""
+
+    def finish(self) -> Session:
+        """Conclude the session."""
+
+
+def overrides_of(settings: list[str] | None, **topics: str | None) -> dict[str, Any]:
+    """Dotted key -> value over the configuration: `--set`, and topics of the robot by their role."""
+    from hybridmap.cli.choose import parse_settings
+
+    named = {f"sensors.{role}_topic": topic for role, topic in topics.items() if topic is not None}
+    return {**named, **parse_settings(settings)}
+
+
+def run_node(middleware: Middleware, node: Node, *, as_json: bool) -> None:
     """Map until Ctrl-C, SIGTERM or the end of the middleware; then conclude the session and show its figures.
 
     Raises:
         HybridMapError: nothing could be mapped, or mapping failed.
     """
     from hybridmap.report import write_report
-    from hybridmap.ros.robot import RobotNode
 
     sys.setswitchinterval(_SWITCH_S)
-    node = RobotNode(middleware, options)
     middleware.when_stopped(node.ended.set)
     try:
         with _stopped_by_signals(node.ended.set):
@@ -70,9 +102,10 @@ def run_node(middleware: Middleware, options: NodeOptions, *, as_json: bool) -> 
         middleware.stop()
     write_report(session.folder)
     written = session.folder.read_metrics()
-    emit(written.head, written.metrics, as_json=as_json, title=f"{options.out}: {written.head['source']}")
+    folder = session.folder.path
+    emit(written.head, written.metrics, as_json=as_json, title=f"{folder}: {written.head['source']}")
     if not as_json:
-        typer.echo(f"page: {Path(options.out) / 'report.html'}")
+        typer.echo(f"page: {folder / 'report.html'}")
 
 
 @contextmanager

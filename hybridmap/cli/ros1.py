@@ -3,30 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from hybridmap.cli.node import (
+    Configuration,
     CorrectionSpeed,
     CorrectionTurn,
     KnownMap,
     Lag,
     MapEvery,
     MapFrame,
+    Overwrite,
     Rate,
     Resolution,
     RobotTopic,
+    overrides_of,
     run_node,
 )
 from hybridmap.cli.options import OUT, AsJson, SensorSetting
-
-_Configuration = Annotated[
-    str | None,
-    typer.Option(
-        help="Configuration: a name (an unknown one gives the list) or a YAML file. Default: the one for the sensor found."
-    ),
-]
 
 
 def ros1(
@@ -34,7 +30,7 @@ def ros1(
     remappings: Annotated[
         list[str] | None, typer.Argument(metavar="[NAME:=NAME]...", help="Remappings of ROS, such as map:=/floor_2.")
     ] = None,
-    config: _Configuration = None,
+    config: Configuration = None,
     odometry_topic: RobotTopic = None,
     scan_topic: RobotTopic = None,
     color_topic: RobotTopic = None,
@@ -49,7 +45,7 @@ def ros1(
     correction_m_s: CorrectionSpeed = 0.1,
     correction_deg_s: CorrectionTurn = 5.0,
     lag_s: Lag = 2.0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Map on a robot under ROS 1, until Ctrl-C.
@@ -58,24 +54,18 @@ def ros1(
     the map, and services to save, pause and reset it: docs/ros.md. Ctrl-C concludes the session, as at the end of a recording.
     Needs rospy and a ROS master.
     """
-    from hybridmap.cli.choose import parse_settings
     from hybridmap.live import LiveLimits
-    from hybridmap.ros.robot import NodeOptions
+    from hybridmap.ros.robot import NodeOptions, RobotNode
     from hybridmap.ros.ros1 import Ros1, import_rospy
 
     import_rospy()
-    named: dict[str, Any] = {
-        "odometry_topic": odometry_topic,
-        "scan_topic": scan_topic,
-        "color_topic": color_topic,
-        "depth_topic": depth_topic,
-        "camera_info_topic": camera_info_topic,
-    }
-    topics = {f"sensors.{name}": topic for name, topic in named.items() if topic is not None}
+    overrides = overrides_of(
+        setting, odometry=odometry_topic, scan=scan_topic, color=color_topic, depth=depth_topic, camera_info=camera_info_topic
+    )
     options = NodeOptions(
         out,
         config,
-        {**topics, **parse_settings(setting)},
+        overrides,
         overwrite,
         rate_hz=rate,
         map_every_s=map_every,
@@ -84,4 +74,5 @@ def ros1(
         known_map=known_map,
         limits=LiveLimits(lag_s=lag_s, correction_m_s=correction_m_s, correction_deg_s=correction_deg_s),
     )
-    run_node(Ros1("hybridmap", remappings or ()), options, as_json=as_json)
+    middleware = Ros1("hybridmap", remappings or ())
+    run_node(middleware, RobotNode(middleware, options), as_json=as_json)

@@ -98,6 +98,7 @@ class RobotNode:
         self._feeding = threading.Lock()
         self._missing = ["no topics yet"]
         self._refused = 0
+        self._paused = False
         self._newest: tuple[int, float] | None = None  # odometry: stamp, ns, and when it came
         self._process = MappingProcess()  # it loads its libraries while the topics are looked for
         self._starter: threading.Thread | None = None
@@ -119,6 +120,12 @@ class RobotNode:
             thread = threading.Thread(target=self._repeat, args=(wait_s, do), name=f"hybridmap-{name}", daemon=True)
             thread.start()
             self._threads.append(thread)
+
+    def pause(self, paused: bool = True) -> None:
+        """Leave views out, or take them again; also before the mapper has begun."""
+        self._paused = paused
+        if self._mapper is not None:
+            self._mapper.pause() if paused else self._mapper.resume()
 
     def finish(self) -> Session:
         """End of the drive: map what still waits, and conclude the session.
@@ -231,6 +238,7 @@ class RobotNode:
                 self._add(mapper, sample)
             self._early.clear()
             self._mapper = mapper
+            self.pause(self._paused)
             if self._newest is not None:
                 self._show_pose(mapper, self._newest[0])
         self._ros.inform(f"mapping into {options.out}")

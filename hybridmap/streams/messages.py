@@ -133,7 +133,7 @@ class Messages:
 
 
 @cache
-def _standard_store(is_ros1: bool) -> Any:
+def standard_store(is_ros1: bool) -> Any:
     """Type store of the standard messages."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -147,7 +147,7 @@ def _standard_store(is_ros1: bool) -> Any:
 @cache
 def _fallback_store(is_ros1: bool) -> Any:
     """Type store for messages without definitions: the standard ones and those of OpenRatSLAM."""
-    store = deepcopy(_standard_store(is_ros1))
+    store = deepcopy(standard_store(is_ros1))
     ratslam_messages.register(store)
     return store
 
@@ -168,7 +168,7 @@ def _embedded_store(definition: Any, msgtype: str, is_ros1: bool) -> Any | None:
         store = get_typestore(Stores.EMPTY)
         store.register(types)
         store.generate_msgdef(msgtype)
-        standard = _standard_store(is_ros1).fielddefs
+        standard = standard_store(is_ros1).fielddefs
         whole = all(_names(standard[name]) <= _names(types[name]) for name in types.keys() & standard.keys())
     except Exception:  # noqa: BLE001  an incomplete definition: the standard one will do
         return None
