@@ -16,6 +16,7 @@ from pydantic import BaseModel
 from hybridmap import provenance
 from hybridmap.config import Config
 from hybridmap.errors import OutputError, StoreError
+from hybridmap.geometry import Array
 from hybridmap.mapper import Mapper
 from hybridmap.output import is_held
 from hybridmap.recorder import Recorder
@@ -27,13 +28,15 @@ from hybridmap.streams.base import Observation, Sample, SeekableStream, Stream, 
 
 log = logging.getLogger(__name__)
 
-LEAST_S = 0.2
+LEAST_S = 0.1
 """Least CPU time between two checkpoints, s."""
-TIMES_ITS_COST = 40.0
-"""Least CPU time between two checkpoints in units of what one takes: they take 2.5 % of it."""
-TIMES_ITS_WAIT = 20.0
-"""The same for time by the clock: a slow disk may not hold up a drive."""
-_SOON = 5.0  # the same before the end of the drive, which is long and cannot be broken into pieces
+SHARE = 0.04
+"""Share of the CPU time of a run that checkpoints may take."""
+AHEAD_S = 0.06
+"""CPU time that they may take beside that, so that a run which dies early loses little, s."""
+SHARE_WAITED = 0.05
+"""The same share of time by the clock: a slow disk may not hold up a drive."""
+_SOON = 5.0  # before the end of the drive, which is long and in one piece: least time in units of what a checkpoint takes
 _FIRST = 3  # samples whose stamps tell one recording from another
 
 
@@ -108,46 +111,56 @@ class Checkpoints:
         self._folder, self._stream, self._config = folder, stream, config
         self._sections = _sections(config)
         self._origin: Origin | None = None
-        self._cpu_s, self._wall_s = time.process_time(), time.perf_counter()
-        self._costs = [(0.0, 0.0)]  # of the last two: what else the machine does may make one look dear
+        self._begun = self._last = _now()
+        self._spent = np.zeros(2)
+        self._costs = [np.zeros(2)]  # of the last two: what else the machine does may make one look dear
         self._warned = False
 
     def follow(self, drive: Drive) -> None:
         """Write a checkpoint if one is due."""
-        self._write_if_due(drive, TIMES_ITS_COST)
+        now, cost = _now(), np.min(self._costs, axis=0)
+        allowed = np.array([SHARE, SHARE_WAITED]) * (now - self._begun) + AHEAD_S
+        if (now - self._last)[0] >= LEAST_S and (self._spent + cost <= allowed).all():
+            self._write(drive)
 
     def before_the_end(self, drive: Drive) -> None:
         """Write a checkpoint after the last sample, unless the last one is new."""
-        self._write_if_due(drive, _SOON)
+        since_s, cost_s = (_now() - self._last)[0], np.min(self._costs, axis=0)[0]
+        if since_s >= max(LEAST_S, _SOON * cost_s):
+            self._write(drive)
 
     def remove(self) -> None:
         """Remove the checkpoint: the run came to its end."""
         checkpoint.remove(self._folder.checkpoint)
 
-    def _write_if_due(self, drive: Drive, times: float) -> None:
-        since_cpu_s, since_wall_s = time.process_time() - self._cpu_s, time.perf_counter() - self._wall_s
-        cost_cpu_s, cost_wall_s = np.min(self._costs, axis=0).tolist()
-        if since_cpu_s < max(LEAST_S, times * cost_cpu_s) or since_wall_s < TIMES_ITS_WAIT * cost_wall_s or not self._wanted:
+    def _write(self, drive: Drive) -> None:
+        if not self._wanted:
             return
         if self._origin is None:  # takes its time once
             self._origin = _origin(self._stream, self._config, drive.first_ns)
-        cpu_s, wall_s = time.process_time(), time.perf_counter()
+        before = _now()
         try:
-            self._write(drive, self._origin)
+            self._written(drive, self._origin)
         except (UnusableError, OutputError) as error:
             if not self._warned:
                 log.warning("%s; the run cannot be resumed", error)
             self._warned = True
-        self._cpu_s, self._wall_s = time.process_time(), time.perf_counter()
-        self._costs = [*self._costs[-1:], (self._cpu_s - cpu_s, self._wall_s - wall_s)]
+        self._last = _now()
+        self._costs = [*self._costs[-1:], self._last - before]
+        self._spent += self._costs[-1]
 
-    def _write(self, drive: Drive, origin: Origin) -> None:
+    def _written(self, drive: Drive, origin: Origin) -> None:
         store = drive.recorder.store
         store.sync()
         drive.mark, drive.report = store.mark(), self._stream.report
         known = {"store": store, **self._sections}
         size = checkpoint.write(self._folder.checkpoint, origin, drive, known, self._parts)
         log.info("checkpoint at node %d: %.1f MB", len(drive.mapper.map) - 1, size / 1e6)
+
+
+def _now() -> Array:
+    """CPU time of this process and time by the clock, s."""
+    return np.array([time.process_time(), time.perf_counter()])
 
 
 def resumable(folder: SessionFolder, stream: Stream, config: Config) -> Resumable | None:
@@ -201,7 +214,6 @@ def _last(folder: SessionFolder, stream: Stream, config: Config) -> Resumable:
         drive = found.state
         if not isinstance(drive, Drive) or drive.mark is None:
             raise UnusableError(f"{folder.checkpoint}: damaged: holds no drive")
-        store.check()
         now = store.mark()
         if now.nodes < drive.mark.nodes or now.last_ns < drive.mark.last_ns:
             raise UnusableError(f"{folder.map_db}: ends at node {now.nodes - 1}, before the checkpoint")

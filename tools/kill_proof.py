@@ -1,310 +1,263 @@
 """Prove that a map cannot be lost: kill runs, break them off, read sessions while they end; then resume and compare.
 
-    python tools/kill_proof.py SOURCE [--end S] [--config NAME] [--kills N] [--errors M] [--readers R] [--seed S] [--json]
+    python tools/kill_proof.py SOURCE [--end S] [--config NAME] [--parts kills errors readers overhead] [--kills N]
+        [--errors M] [--readers R] [--pairs P] [--seed S] [--keep FILE] [--json]
 
-Each run is a process of its own. A kill comes at a random moment of the CPU time of an unbroken run. An error is, in turn, a
-message that is damaged, a back-end that crashes, and a disk that is full (the size of files is limited). Afterwards every node
-that a reader saw, or that was committed, must be in the map as in an unbroken one, and the resumed run must end with the same
-tables, trajectories and hash. Its CPU time is held against what was missing: that of an unbroken run less that of the
-run that died. With readers, up to ten processes read a session until after its end. `--json` prints the figures as one object.
+Each run is a process of its own, one after the other. A kill comes at a random moment of the CPU time of an unbroken run. An
+error is, in turn, a message that is damaged, a back-end that crashes, and a disk that is full (a small one is mounted, or where
+that is not allowed the size of files is limited). Afterwards every node that a reader saw, or that was committed, must be in
+the map as in an unbroken one, and the resumed run must end with the same tables, trajectories and hash.
+
+Its CPU time, less that of an unbroken run up to its first view, is held against what was missing: the CPU time of an unbroken
+run less that of the run that died. As the speed of a machine changes, an unbroken run is timed anew every few trials. With
+readers, up to ten processes read a session until after its end. `overhead` maps with and without checkpoints in turn.
+
+`--keep FILE` appends each trial to a file as a line of JSON; the trials that are in it are not made again. `--json` prints
+the figures as one object.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import resource
+import shutil
 import signal
-import sqlite3
+import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from barred import at_least, at_most
+from killing import PAUSE_S, Case, Ended, contents, kept, kill_at, read_on, small_disk, start, wait
 
-from hybridmap import checkpoints, session
+from hybridmap import checkpoints
 from hybridmap.backends.ensemble import Ensemble
-from hybridmap.cli.choose import choose
 from hybridmap.cli.show import emit
-from hybridmap.errors import BackendError, HybridMapError, StoreError, StreamError
+from hybridmap.errors import BackendError, StreamError
 from hybridmap.metrics import Metric
-from hybridmap.store import MapStore
 
 MOST_RATIO = 1.15
 """CPU time of all resumed runs, in units of what was missing."""
+MOST_OVERHEAD = 1.05
+"""CPU time with checkpoints, in units of that without."""
 MOST_READERS = 10
-_PAUSE_S = 0.005
-_UNBROKEN = 3  # runs whose median is the time of an unbroken one: on a busy machine one may take twice as long
-_TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
+PARTS = {"kills": 20, "errors": 10, "readers": 20, "overhead": 5}
+"""Part of the proof -> number of trials."""
+_TIMED_EVERY = 8  # trials after which an unbroken run is timed
+_TIMES = 3  # timings before the first trial; the mean of the last ones is used: on a busy machine one may take twice as long
+_ATTEMPTS = 5  # for each trial: a run may come to its end before it dies
+Trial = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
-    """What is mapped."""
+class Proof:
+    """Makes the trials of one case, and keeps them."""
 
-    source: str
-    config: str | None
-    end_s: float | None
+    def __init__(self, case: Case, place: Path, seed: int, keep: Path | None) -> None:
+        """Map once without a break, to compare with, and read the trials that were kept."""
+        self._case, self._place, self._seed, self._keep = case, place, seed, keep
+        self._times: list[tuple[float, float]] = []
+        self._whole: dict[str, Any] = {}
+        self._bytes = 0
+        self.trials: list[Trial] = []
+        if keep is not None and keep.exists():
+            self.trials = [json.loads(line) for line in keep.read_text().splitlines()]
 
-    def run(self, out: Path, *, resume: bool = False) -> None:
-        """Map it into a session folder, and write beside it the CPU time up to its first observation."""
-        chosen = choose(self.source, self.config, {}, end_s=self.end_s)
+    def of(self, part: str) -> list[Trial]:
+        """The trials of a part."""
+        return [trial for trial in self.trials if trial["part"] == part]
 
-        def begun(done: int, total: int | None) -> None:
-            del done, total
-            if not _beside(out).exists():
-                _beside(out).write_text(str(time.process_time()))
+    def make(self, part: str, count: int) -> None:
+        """Make the trials of a part that are lacking."""
+        trial = {"kills": self._kill, "errors": self._error, "readers": self._readers, "overhead": self._overhead}[part]
+        for number in range(_ATTEMPTS * count):
+            if len(self.of(part)) >= count:
+                return
+            if number in {kept_one["number"] for kept_one in self.of(part)}:
+                continue
+            timed = part in ("kills", "errors")
+            again = timed and number % _TIMED_EVERY == 0
+            for _ in range(max((_TIMES if timed else 1) - len(self._times), int(again))):
+                self._time()
+            with TemporaryDirectory(dir=self._place) as folder:
+                found = trial(Path(folder) / "s", number, np.random.default_rng([self._seed, list(PARTS).index(part), number]))
+            if found is not None:
+                self._note({"part": part, "number": number, **found})
 
-        session.run(chosen.stream, chosen.config, out, resume=resume, progress=begun)
+    def _note(self, trial: Trial) -> None:
+        self.trials.append(trial)
+        print(json.dumps(trial), file=sys.stderr, flush=True)
+        if self._keep is not None:
+            with self._keep.open("a") as file:
+                file.write(json.dumps(trial) + "\n")
 
+    def _time(self) -> None:
+        """Map without a break."""
+        out = self._place / "whole"
+        shutil.rmtree(out, ignore_errors=True)
+        process, most = self._case.start(out, lambda: self._case.run(out)), 0
+        while os.waitid(os.P_PID, process, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
+            with suppress(FileNotFoundError):
+                most = max(most, sum(path.stat().st_size for path in out.glob("map.db*")))
+            time.sleep(PAUSE_S)
+        ended = wait(process, out)
+        if ended.code:
+            raise SystemExit(f"the unbroken run failed: {ended.said}")
+        self._times.append((self._case.followed.begun_s, ended.cpu_s))
+        self._whole, self._bytes = self._whole or contents(out), self._bytes or most
 
-@dataclass(frozen=True, slots=True)
-class Ended:
-    """How a process ended: its exit code (negative: the signal), CPU time in s, and what it said on standard error."""
+    def _unbroken(self) -> tuple[float, float]:
+        """CPU time of an unbroken run up to its first view, and in all, as of late, s."""
+        begun_s, whole_s = np.mean(self._times[-2 * _TIMES :], axis=0).tolist()
+        return begun_s, whole_s
 
-    code: int
-    cpu_s: float
-    said: str
-
-
-@dataclass(slots=True)
-class Tally:
-    """Counts of one kind of trial."""
-
-    runs: int = 0
-    lost: int = 0
-    differing: int = 0
-    unclear: int = 0
-    begun_anew: int = 0
-    spent_s: float = 0.0
-    missing_s: float = 0.0
-    ratios: list[float] = field(default_factory=list)
-
-    @property
-    def summary(self) -> str:
-        """The newest run, and the counts so far, for progress."""
-        return f"{self.ratios[-1]:.2f} x what was missing; of {self.runs} {self.lost} lost, {self.differing} differ"
-
-
-def _beside(out: Path) -> Path:
-    return out.with_suffix(".begun")
-
-
-def start(work: Callable[[], None], log: Path) -> int:
-    """Run something in a process of its own; returns its number. An error of ours gives one line and exit code 2."""
-    number = os.fork()
-    if number:
-        return number
-    code = 1
-    try:
-        handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        os.dup2(handle, 1)
-        os.dup2(handle, 2)
-        work()
-        code = 0
-    except HybridMapError as error:
-        print(f"hybridmap: error: {error}", file=sys.stderr, flush=True)
-        code = 2
-    finally:
-        os._exit(code)
-
-
-def wait(number: int, log: Path) -> Ended:
-    """Wait for a process."""
-    _, status, used = os.wait4(number, 0)
-    return Ended(os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime, log.read_text() if log.exists() else "")
-
-
-def kill_at(number: int, cpu_s: float, out: Path) -> int:
-    """Kill a process once it has used so much CPU time; returns how many nodes a reader saw just before."""
-    while True:
-        fields = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()
-        if fields[0] == "Z" or (int(fields[11]) + int(fields[12])) * _TICK_S >= cpu_s:
-            break
-        time.sleep(_PAUSE_S)
-    seen = 0
-    with suppress(StoreError), MapStore.open(out) as store:
-        seen = store.nodes
-    os.kill(number, signal.SIGKILL)
-    return seen
-
-
-def contents(out: Path) -> dict[str, Any]:
-    """All that a session holds, but for the times that it took."""
-    found: dict[str, Any] = {}
-    with sqlite3.connect(out / "map.db") as connection:
-        for (table,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall():
-            columns = [row[1] for row in connection.execute(f"PRAGMA table_info({table})") if row[1] != "report"]
-            found[table] = sorted(connection.execute(f"SELECT {', '.join(columns)} FROM {table}").fetchall(), key=repr)
-    return found | {path.name: path.read_bytes() for path in sorted((out / "trajectory").iterdir())}
-
-
-def kept(out: Path, seen: int, whole: dict[str, Any]) -> bool:
-    """Whether a session that did not end is sound and has the nodes of the whole one, as many as were seen or more."""
-    with MapStore.open(out) as store:
-        store.check()
-        nodes, stamps = store.nodes, [row[0] for row in store.rows("SELECT stamp_ns FROM nodes ORDER BY number")]
-        arrays = store.rows("SELECT * FROM arrays WHERE part = 'keyframe' ORDER BY 1, 2, 3")
-    expected = [row for row in sorted(whole["arrays"]) if row[1] == "keyframe" and row[0] < nodes]
-    all_stamps = [row[1] for row in sorted(whole["nodes"])]
-    return seen <= nodes == len(stamps) and stamps == all_stamps[:nodes] and arrays == expected
-
-
-def resumed(case: Case, out: Path, whole: dict[str, Any], begun_s: float, missing_s: float, tally: Tally) -> None:
-    """Resume a run that died, and compare."""
-    _beside(out).unlink(missing_ok=True)
-    log = out.with_suffix(".resumed")
-    ended = wait(start(lambda: case.run(out, resume=True), log), log)
-    tally.differing += ended.code != 0 or contents(out) != whole
-    tally.begun_anew += "from the beginning" in ended.said
-    spent_s = ended.cpu_s - begun_s
-    tally.spent_s, tally.missing_s = tally.spent_s + spent_s, tally.missing_s + missing_s
-    tally.ratios.append(spent_s / max(missing_s, 1e-9))
-
-
-def unbroken(case: Case, place: Path) -> tuple[float, float]:
-    """Map without a break, as often as it takes for fair times; returns the median CPU time to the first sample, and in all."""
-    times = []
-    for number in range(_UNBROKEN):
-        out, log = place / f"whole{number}", place / f"whole{number}.log"
-        cpu_s = wait(start(lambda out=out: case.run(out), log), log).cpu_s  # type: ignore[misc]
-        times.append((float(_beside(out).read_text()), cpu_s))
-    begun_s, whole_s = np.median(times, axis=0).tolist()
-    return begun_s, whole_s
-
-
-def kills(case: Case, place: Path, count: int, whole: dict[str, Any], times: tuple[float, float], rng: Any) -> Tally:
-    """Kill runs at random moments between the first sample and the end, and resume them."""
-    tally, (begun_s, whole_s) = Tally(), times
-    for number in range(count):
-        out, log = place / f"killed{number}", place / f"killed{number}.log"
-        at_s = float(rng.uniform(begun_s, whole_s))
-        process = start(lambda out=out: case.run(out), log)  # type: ignore[misc]
+    def _kill(self, out: Path, number: int, rng: np.random.Generator) -> Trial | None:
+        """Kill a run at a random moment between the first view and the end, and resume it."""
+        del number
+        at_s = float(rng.uniform(*self._unbroken()))
+        process = self._case.start(out, lambda: self._case.run(out))
         seen = kill_at(process, at_s, out)
-        ended = wait(process, log)
-        if ended.code == 0:
-            continue  # it was faster than the unbroken run
-        tally.runs += 1
-        if seen:
-            tally.lost += not kept(out, seen, whole)
-        resumed(case, out, whole, begun_s, whole_s - ended.cpu_s, tally)
-        _say(f"kill {number} at {at_s:.2f} of {whole_s:.2f} s: {seen} nodes seen, {tally.summary}")
-    return tally
+        died = wait(process, out)
+        if died.code == 0:
+            return None
+        lost = bool(seen) and not kept(out, seen, self._whole)
+        return {"at_s": at_s, "seen": seen, "lost": lost, **self._resumed(out, died)}
 
+    def _error(self, out: Path, number: int, rng: np.random.Generator) -> Trial | None:
+        """Break a run off by an error late in the drive, and resume it."""
+        kind, share = ("message", "back-end", "disk")[number % 3], float(rng.uniform(0.5, 0.98))
+        out.mkdir()
+        with small_disk(out, int(share * self._bytes) if kind == "disk" else 0) as full:
 
-def broken(case: Case, out: Path, kind: int, share: float, samples: int, nodes: int) -> None:
-    """Map with an error late in the drive."""
-    if kind == 0:
-        whole_samples = checkpoints.Drive.samples
+            def work() -> None:
+                if kind == "disk" and not full:
+                    resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * self._bytes) // 2, resource.RLIM_INFINITY))
+                self._broken(out, kind, share)
 
-        def damaged(drive: checkpoints.Drive, stream: Any) -> Any:
-            for sample in whole_samples(drive, stream):
-                if drive.taken > share * samples:
-                    raise StreamError(f"{case.source}: message {drive.taken} is damaged")
-                yield sample
+            died = wait(self._case.start(out, work), out)
+            if died.code == 0:
+                return None
+            if full:
+                subprocess.run(["mount", "-o", "remount,size=100%", str(out)], check=True)
+            lines = [line for line in died.said.splitlines() if line.startswith("hybridmap: error: ")]
+            clear = died.code == 2 and len(lines) == 1
+            lost, unclear = not kept(out, 1, self._whole), not clear
+            return {"kind": kind, "said": lines[-1:], "lost": lost, "unclear": unclear, **self._resumed(out, died)}
 
-        checkpoints.Drive.samples = damaged  # type: ignore[method-assign, assignment]
-    elif kind == 1:
-        whole_update = Ensemble.update
+    def _broken(self, out: Path, kind: str, share: float) -> None:
+        """Map with an error after a share of the drive."""
+        if kind == "message":
+            samples, last = checkpoints.Drive.samples, share * len(self._whole["track"])
 
-        def crashing(ensemble: Ensemble, graph: Any) -> None:
-            if graph.n_nodes > share * nodes:
-                raise BackendError(f"{ensemble.primary}: crashed at node {graph.n_nodes}")
-            whole_update(ensemble, graph)
+            def damaged(drive: checkpoints.Drive, stream: Any) -> Any:
+                for sample in samples(drive, stream):
+                    if drive.taken > last:
+                        raise StreamError(f"{self._case.source}: message {drive.taken} is damaged")
+                    yield sample
 
-        Ensemble.update = crashing  # type: ignore[method-assign, assignment]
-    case.run(out)
+            checkpoints.Drive.samples = damaged  # type: ignore[method-assign, assignment]
+        elif kind == "back-end":
+            update, most = Ensemble.update, share * len(self._whole["nodes"])
 
+            def crashing(ensemble: Ensemble, graph: Any) -> None:
+                if graph.n_nodes > most:
+                    raise BackendError(f"{ensemble.primary}: crashed at node {graph.n_nodes}")
+                update(ensemble, graph)
 
-def errors(
-    case: Case, place: Path, count: int, whole: dict[str, Any], times: tuple[float, float], size: int, rng: Any
-) -> Tally:
-    """Break runs off by errors of three kinds late in the drive, and resume them."""
-    tally, (begun_s, whole_s) = Tally(), times
-    samples, nodes = len(whole["track"]), len(whole["nodes"])
-    for number in range(count):
-        out, log, kind, share = (
-            place / f"broken{number}",
-            place / f"broken{number}.log",
-            number % 3,
-            float(rng.uniform(0.5, 0.98)),
-        )
+            Ensemble.update = crashing  # type: ignore[method-assign, assignment]
+        self._case.run(out)
 
-        def work(out: Path = out, kind: int = kind, share: float = share) -> None:
-            if kind == 2:
-                resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * size), resource.RLIM_INFINITY))
-            broken(case, out, kind, share, samples, nodes)
+    def _resumed(self, out: Path, died: Ended) -> Trial:
+        """Resume a run that died, and compare; right after the death, as how far it came is asked for."""
+        followed, (begun_s, whole_s) = self._case.followed, self._unbroken()
+        reached = followed.newest
+        ended = wait(self._case.start(out, lambda: self._case.run(out, resume=True)), out)
+        differs = ended.code != 0 or contents(out) != self._whole
+        return {
+            "differs": differs,
+            "anew": "from the beginning" in ended.said,
+            "said_resumed": ended.said.splitlines()[-3:] if differs else [],
+            "spent_s": ended.cpu_s - begun_s,
+            "missing_s": whole_s - died.cpu_s,
+            "begun_s": begun_s,
+            "begun_resumed_s": followed.begun_s,
+            "reached": reached,
+            "again": max(0, reached + 1 - followed.first) if followed.first else 0,
+        }
 
-        ended = wait(start(work, log), log)
-        lines = [line for line in ended.said.splitlines() if line.startswith("hybridmap: error: ")]
-        if ended.code == 0:
-            continue
-        tally.runs += 1
-        tally.unclear += ended.code != 2 or len(lines) != 1
-        tally.lost += not kept(out, 1, whole)
-        resumed(case, out, whole, begun_s, whole_s - ended.cpu_s, tally)
-        _say(f"error {number}: {lines[-1:]}, {tally.summary}")
-    return tally
-
-
-def read_on(out: Path, seed: int) -> None:
-    """Read a session again and again from its first node until after its end, with one connection that stays open."""
-    rng, standing, ended = np.random.default_rng(seed), None, False
-    while not ended:
-        time.sleep(float(rng.uniform(0.02, 0.4)))
-        with suppress(StoreError):
-            standing = standing or MapStore.open(out)
-            standing.rows("SELECT COUNT(*) FROM track")
-            with MapStore.open(out) as store:
-                ended = store.ended
-                store.map()
-
-
-def readers(case: Case, place: Path, count: int, rng: Any) -> Tally:
-    """Map with 1 to `MOST_READERS` processes that read the session until after its end."""
-    tally, expected = Tally(), place / "alone"
-    wait(start(lambda: case.run(expected), place / "alone.log"), place / "alone.log")
-    whole = contents(expected)
-    for number in range(count):
-        out, log = place / f"read{number}", place / f"read{number}.log"
-        process = start(lambda out=out: case.run(out), log)  # type: ignore[misc]
+    def _readers(self, out: Path, number: int, rng: np.random.Generator) -> Trial:
+        """Map with 1 to `MOST_READERS` processes that read the session until after its end."""
+        del number
+        process = self._case.start(out, lambda: self._case.run(out))
         seeds = rng.integers(0, 2**31, int(rng.integers(1, MOST_READERS + 1))).tolist()
-        reading = [start(lambda seed=seed, out=out: read_on(out, seed), place / "reader.log") for seed in seeds]  # type: ignore[misc]
-        ended = wait(process, log)
-        tally.runs += 1
-        tally.lost += ended.code != 0 or contents(out) != whole
+        reading = [start(lambda seed=seed: read_on(out, seed), out.with_suffix(".read")) for seed in seeds]  # type: ignore[misc]
+        ended = wait(process, out)
         if ended.code:
             for one in reading:
                 os.kill(one, signal.SIGKILL)
-        tally.unclear += sum(wait(one, place / "reader.log").code != 0 for one in reading)
-        _say(f"readers {number}: {len(reading)} of them, exit code {ended.code}")
-    return tally
+        failed = sum(wait(one, out).code != 0 for one in reading)
+        lost = ended.code != 0 or contents(out) != self._whole
+        return {"readers": len(reading), "lost": lost, "failed": failed, "said": ended.said.splitlines()[-3:] if lost else []}
+
+    def _overhead(self, out: Path, number: int, rng: np.random.Generator) -> Trial:
+        """Map with checkpoints and without, in an order that changes."""
+        del rng
+        spent = {}
+        for wanted in (True, False) if number % 2 else (False, True):
+            target = out.with_name(f"s{wanted}")
+
+            def work(target: Path = target, wanted: bool = wanted) -> None:
+                if not wanted:
+                    checkpoints.Checkpoints.follow = checkpoints.Checkpoints.before_the_end = _nothing  # type: ignore[method-assign, assignment]
+                self._case.run(target)
+
+            ended = wait(self._case.start(target, work), target)
+            spent[wanted] = ended.cpu_s
+        return {"with_s": spent[True], "without_s": spent[False]}
 
 
-def rows(name: str, tally: Tally) -> list[Metric]:
-    """The figures of runs that died."""
-    found = [
-        at_least(f"{name}/runs", tally.runs, 1, "runs that died"),
-        at_most(f"{name}/lost", tally.lost, 0, "of them lost a committed node, or are damaged"),
-        at_most(f"{name}/differing", tally.differing, 0, "of them, resumed, differ from the unbroken run"),
-        at_most(f"{name}/unclear", tally.unclear, 0, "of them did not end with one line and exit code 2"),
-        Metric(f"{name}/begun_anew", float(tally.begun_anew), "1", "of them had no checkpoint yet"),
+def _nothing(*_: Any) -> None:
+    pass
+
+
+def rows(part: str, trials: list[Trial]) -> list[Metric]:
+    """The figures of a part."""
+    if part == "overhead":
+        ratio = sum(trial["with_s"] for trial in trials) / max(sum(trial["without_s"] for trial in trials), 1e-9)
+        return [at_most(part, ratio, MOST_OVERHEAD, f"CPU time with checkpoints over that without, {len(trials)} pairs")]
+    count = {name: sum(trial.get(name, 0) for trial in trials) for name in ("lost", "differs", "unclear", "anew", "failed")}
+    if part == "readers":
+        return [
+            at_most(f"{part}/lost", count["lost"], 0, f"of {len(trials)} sessions that were read while they ended"),
+            at_most(f"{part}/failed", count["failed"], 0, f"of {sum(trial['readers'] for trial in trials)} readers failed"),
+        ]
+    spent_s, missing_s = (sum(trial[name] for trial in trials) for name in ("spent_s", "missing_s"))
+    ratios = [trial["spent_s"] / max(trial["missing_s"], 1e-9) for trial in trials]
+    begin_s = float(
+        np.median([trial["begun_resumed_s"] - trial["begun_s"] for trial in trials if trial["begun_resumed_s"]] or [0.0])
+    )
+    again = sum(trial["again"] for trial in trials) / max(sum(trial["reached"] for trial in trials), 1)
+    return [
+        at_least(f"{part}/runs", len(trials), 1, "runs that died"),
+        at_most(f"{part}/lost", count["lost"], 0, "of them lost a committed node, or are damaged"),
+        at_most(f"{part}/differing", count["differs"], 0, "of them, resumed, differ from the unbroken run"),
+        at_most(f"{part}/unclear", count["unclear"], 0, "of them did not end with one line and exit code 2"),
+        Metric(f"{part}/begun_anew", float(count["anew"]), "1", "of them had no checkpoint yet"),
+        at_most(
+            f"{part}/cpu_ratio",
+            spent_s / max(missing_s, 1e-9),
+            MOST_RATIO,
+            "CPU time of all resumed runs over what was missing",
+        ),
+        Metric(f"{part}/cpu_ratio_median", float(np.median(ratios)), "1", "median of the single runs"),
+        Metric(f"{part}/views_again", again, "1", "share of the views of the runs that died which were taken in again"),
+        Metric(f"{part}/start", begin_s, "s", "CPU time up to the first view, less that of an unbroken run, median"),
     ]
-    if tally.missing_s > 0.0:
-        ratio, said = tally.spent_s / tally.missing_s, "CPU time of all resumed runs, in units of what was missing"
-        found.append(at_most(f"{name}/cpu_ratio", ratio, MOST_RATIO, said))
-        found.append(Metric(f"{name}/cpu_ratio_median", float(np.median(tally.ratios)), "1", "median of the single runs"))
-    return found
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
 
 
 def main() -> None:
@@ -313,29 +266,19 @@ def main() -> None:
     parser.add_argument("source", help="recording or simulated world")
     parser.add_argument("--config", help="configuration, as for `hybridmap map`")
     parser.add_argument("--end", type=float, help="map only so many seconds")
-    for name, what in (
-        ("kills", "runs that are killed"),
-        ("errors", "runs with a late error"),
-        ("readers", "runs with readers"),
-    ):
-        parser.add_argument(f"--{name}", type=int, default=0, help=what)
-    parser.add_argument("--readers-end", type=float, default=30.0, help="seconds that are mapped with readers")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="parts of the proof")
+    for part, option in zip(PARTS, ("kills", "errors", "readers", "pairs"), strict=True):
+        parser.add_argument(f"--{option}", dest=part, type=int, default=PARTS[part], help="number of trials")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--keep", type=Path, help="file of the trials")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
-    case, rng, found = Case(given.source, given.config, given.end), np.random.default_rng(given.seed), list[Metric]()
+    found: list[Metric] = []
     with TemporaryDirectory() as folder:
-        place = Path(folder)
-        if given.kills or given.errors:
-            out, times = place / "whole0", unbroken(case, place)
-            whole = contents(out)
-            found += rows("kills", kills(case, place, given.kills, whole, times, rng)) if given.kills else []
-            size = (out / "map.db").stat().st_size
-            found += rows("errors", errors(case, place, given.errors, whole, times, size, rng)) if given.errors else []
-        if given.readers:
-            tally = readers(Case(given.source, given.config, given.readers_end), place, given.readers, rng)
-            found.append(at_most("readers/lost", tally.lost, 0, f"of {tally.runs} sessions that were read while they ended"))
-            found.append(at_most("readers/failed", tally.unclear, 0, "readers that failed"))
+        proof = Proof(Case(given.source, given.config, given.end), Path(folder), given.seed, given.keep)
+        for part in given.parts:
+            proof.make(part, getattr(given, part))
+            found += rows(part, proof.of(part)) if proof.of(part) else []
     emit({}, found, as_json=given.json, title=f"{given.source}: runs that died, and readers")
     sys.exit(any(row.passed is False for row in found))
 

@@ -17,6 +17,7 @@ from hybridmap.simulation.motion import DriveLimits, KidnappedDrive, as_transmit
 from hybridmap.simulation.surfaces import World
 from hybridmap.simulation.worlds import build_world
 from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion, StreamReport
+from hybridmap.streams.order import WHOLE, Window
 from hybridmap.trajectory import NS_PER_S, Trajectory
 
 if TYPE_CHECKING:
@@ -43,16 +44,18 @@ class SimulatedStream:
     that much earlier: scans and frames are late against it.
     """
 
-    def __init__(self, config: SimulationConfig, seed: int) -> None:
+    def __init__(self, config: SimulationConfig, seed: int, window: Window = WHOLE) -> None:
         """Prepare a drive; the world is rendered while iterating.
 
         Args:
             config: world, drive, sensors.
             seed: of the sensors' errors, and of a world that is drawn by chance.
+            window: the part of the drive to give; its samples are those of the whole drive.
 
         Raises:
             ConfigError: there is no such world, no visited place in it to which the robot could be kidnapped, or nothing in it
                 for the camera that is asked for.
+            StreamError: the part is not in the drive.
         """
         self._config = config
         self._seed = seed
@@ -80,6 +83,8 @@ class SimulatedStream:
                 f"simulation.carried_m: the robot is put down again after {self._carry.last * step_s:.1f} s, "
                 f"but the drive ends after {config.duration_s:g} s; make simulation.duration_s longer"
             )
+        first_ns = min(int(one[0]) for one in (self._odometry.stamps_ns, self._frame_stamps, self._scan_stamps) if len(one))
+        self._limits_ns = window.limits_over(self._odometry.stamps_ns, first_ns, self.name)
 
     @property
     def name(self) -> str:
@@ -120,7 +125,9 @@ class SimulatedStream:
     @property
     def expected_observations(self) -> int:
         """Number of camera frames and laser scans that the stream will yield."""
-        return sum(len(stamps) for stamps in (self._frame_stamps, self._scan_stamps))
+        low, high = self._limits_ns
+        stamps = np.concatenate([self._frame_stamps, self._scan_stamps])
+        return int(((stamps >= low) & (stamps <= high)).sum())
 
     @property
     def report(self) -> StreamReport:
@@ -143,12 +150,14 @@ class SimulatedStream:
                 yield make(kind, stamp, index)
 
     def _in_order(self) -> Iterator[tuple[int, int, int]]:
-        """Sensor, stamp and number of each sample."""
+        """Sensor, stamp and number of each sample of the part."""
+        low, high = self._limits_ns
         due = [(int(stamp), _CAMERA, index) for index, stamp in enumerate(self._frame_stamps)]
         due += [(int(stamp), _LASER, index) for index, stamp in enumerate(self._scan_stamps)]
         due += [(int(stamp), _WHEELS, index) for index, stamp in enumerate(self._odometry.stamps_ns)]
         for stamp, kind, index in sorted(due):
-            yield kind, stamp, index
+            if low <= stamp <= high:
+                yield kind, stamp, index
 
     def _sensors(self) -> Callable[[int, int, int], Observation]:
         """What makes an observation from its sensor, its stamp and its number."""

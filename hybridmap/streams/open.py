@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hybridmap.config.root import Config
 from hybridmap.errors import StreamError
 from hybridmap.plugins import loaded
-from hybridmap.streams.base import Sample, Stream, StreamReport
+from hybridmap.streams.base import Stream
 from hybridmap.streams.order import Window
 
 _SIMULATOR = "hybridmap.simulation"
@@ -104,8 +101,8 @@ def open_stream(
     world = world_of(source)
     if world is not None:
         simulation = config.simulation.model_copy(update={"world": world})
-        stream: Stream = _simulator().SimulatedStream(simulation, config.seed)
-        return stream if window == Window() else WindowedStream(stream, window)
+        simulated: Stream = _simulator().SimulatedStream(simulation, config.seed, window)
+        return simulated
     path = Path(source)
     opened: Stream = loaded(f"hybridmap.streams.{_OPENERS[kind_of(path)]}")(path, config, window, skip_damaged=skip_damaged)
     return opened
@@ -113,37 +110,3 @@ def open_stream(
 
 def _simulator() -> Any:
     return import_module(_SIMULATOR)
-
-
-class WindowedStream:
-    """The part of another stream between two times."""
-
-    def __init__(self, stream: Stream, window: Window) -> None:
-        self._stream, self._window = stream, window
-        self.name, self.rig, self.groundtruth = stream.name, stream.rig, stream.groundtruth
-        self.expected_observations: int | None = None  # not known before it has been read
-
-    @property
-    def report(self) -> StreamReport:
-        """What the last iteration found in the whole stream, also outside the part."""
-        return self._stream.report
-
-    def __iter__(self) -> Iterator[Sample]:
-        """Yield the samples within the window.
-
-        Raises:
-            StreamError: the stream ends before the window begins.
-        """
-        limits: tuple[int, int] | None = None
-        first_ns = last_ns = 0
-        for sample in self._stream:
-            if limits is None:
-                first_ns, limits = sample.stamp_ns, self._window.limits_ns(sample.stamp_ns)
-            low, high = limits
-            last_ns = sample.stamp_ns
-            if last_ns > high:
-                return
-            if last_ns >= low:
-                yield sample
-        if limits is not None:
-            self._window.limits_over(np.array([first_ns, last_ns]), first_ns, self.name)

@@ -91,6 +91,10 @@ class Window:
         return low, high
 
 
+WHOLE = Window()
+"""No limits."""
+
+
 def check_overlap(motion_ns: Stamps, observation_ns: Stamps, what: str) -> None:
     """Refuse observations that share no time with the self-motion, with a tolerance of one second; empty ones pass.
 
