@@ -85,7 +85,7 @@ def joined(world: str, sensor: str, pair: str, out: Path) -> Pair:
     """Merge the two drives of a pair, and compare with the truth."""
     parts = [drive(world, sensor, name, out) for name in pair]
     started = process_time()
-    done = merge(parts[0], parts[1], out / f"{world}-{sensor}-{pair}", overwrite=True)
+    done = merge(parts, out / f"{world}-{sensor}-{pair}", overwrite=True)
     cpu_s = process_time() - started
     with MapStore.open(done.folder.path) as store:
         experiences, poses = store.map(), store.solutions()[store.primary].poses

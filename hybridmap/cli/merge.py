@@ -1,4 +1,4 @@
-"""`hybridmap merge`: two maps become one."""
+"""`hybridmap merge`: maps become one."""
 
 from __future__ import annotations
 
@@ -9,24 +9,28 @@ import typer
 
 from hybridmap.cli.options import OUT, AsJson
 from hybridmap.cli.show import emit
+from hybridmap.errors import ConfigError
 
 
 def merge(
-    base: Annotated[Path, typer.Argument(help="Session folder of the first map, which gives frame and configuration.")],
-    other: Annotated[Path, typer.Argument(help="Session folder of the map that is looked for on it.")],
+    maps: Annotated[
+        list[Path], typer.Argument(help="Session folders of two or more maps; the first one gives frame and configuration.")
+    ],
     out: Annotated[Path, typer.Option(help=OUT)],
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Join two maps of one building into one, wherever each of them began.
+    """Join maps of one building into one, wherever each drive began. Their order matters for numbers and frame alone.
 
-    No odometry joins them. Views of the second map are looked for on the first, and loops enter once several of them agree.
-    Then both are solved as one map. If the second is not found, the new map holds both, each in a frame of its own, and the
-    verdict says `not joined`. Both maps stay as they are; nodes and edges of each are kept bit for bit.
+    No odometry joins them. Views of each session are looked for on the older ones, and loops enter once several of them agree.
+    Then all are solved as one map. What is not found is on the new map in a frame of its own, and the verdict says `not
+    joined`. The maps stay as they are; nodes and edges of each session are kept bit for bit.
     """
+    if len(maps) < 2:
+        raise ConfigError("merge: found 1 map, expected two or more")
     from hybridmap.report import write_report
     from hybridmap.sessions.joining import merge as merge_maps
 
-    joined = merge_maps(base, other, out, overwrite=overwrite)
+    joined = merge_maps(maps, out, overwrite=overwrite)
     write_report(joined.folder)
     emit(joined.head, joined.metrics, as_json=as_json, title=f"{out}: {joined.head['source']}")

@@ -1,15 +1,14 @@
-"""Two stored maps become one: `hybridmap merge`, and `hybridmap map SOURCE --onto MAP`."""
+"""Stored maps become one: `hybridmap merge`, and `hybridmap map SOURCE --onto MAP`."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-
-import numpy as np
 
 from hybridmap.backends.base import ODOMETRY, Solution
 from hybridmap.config import Config
@@ -22,8 +21,9 @@ from hybridmap.graph.io import graph_hash
 from hybridmap.metrics import Metric, figure
 from hybridmap.output import write_bytes
 from hybridmap.session import Progress, run
-from hybridmap.sessions.joint_map import JointMap, joined_sessions
-from hybridmap.sessions.part import Part, finished
+from hybridmap.sessions.assembly import assembled, changed_by_hand
+from hybridmap.sessions.joint_map import joined_sessions, solutions_of
+from hybridmap.sessions.part import finished
 from hybridmap.store import MapStore
 from hybridmap.store.parts import copy_sessions
 from hybridmap.store.records import rig_to_json
@@ -52,57 +52,53 @@ class Joined:
     metrics: list[Metric]
 
 
-def merge(base: Path, other: Path, out: Path, *, overwrite: bool = False) -> Joined:
-    """Write a map that holds the sessions of two others, and the loops that were found between them.
+def merge(maps: Sequence[Path], out: Path, *, overwrite: bool = False) -> Joined:
+    """Write a map that holds the sessions of others, and the loops that were found between them.
 
-    Both maps are read and not changed. The first one gives configuration and frame. If the second one is not found on it, the
-    new map holds both, each in a frame of its own.
+    The maps are read and not changed. The first one gives the configuration, and the frame of the piece that its first session
+    is on. Otherwise their order only says how sessions are numbered: loops between sessions are found as `assembly` says, also
+    those between sessions that were joined before. A session that is not found on any other is on the new map in a frame of its
+    own.
 
     Args:
-        base, other: session folders whose runs came to their end.
+        maps: at least two session folders whose runs came to their end.
         out: the session folder to write.
         overwrite: replace a session that exists there.
 
     Raises:
-        StoreError: a map is missing, damaged or not finished, or its sensors are others than those of the first.
+        StoreError: a map is missing, damaged or not finished, or its sensors are others than those of the first; or a drive is
+            in two of them.
         StreamError: the views of a map cannot be taken up.
         OutputError: the folder cannot be used, or is that of one of the maps, or lies in it.
     """
-    for path in (base, other):
+    return _joined(maps, out, overwrite, onto=False)
+
+
+def _joined(maps: Sequence[Path], out: Path, overwrite: bool, *, onto: bool) -> Joined:
+    """Write the map of several others; with `onto` the first one is continued, and its edges stay as they are."""
+    for path in maps:
         SessionFolder(path).require_apart(out)
-    with MapStore.open(base) as first, MapStore.open(other) as second:
-        config = config_of(first)
-        require_sensors(first, second.rig, str(second.path))
-        pieces = joined_sessions(first.map())
-        parts = [(base, first, pieces[0]), (other, second, None), *((base, first, piece) for piece in pieces[1:])]
-        joint = _joint_map(config, [Part.of(store, sessions) for _, store, sessions in parts], first.rig)
+    with ExitStack() as opened:
+        stores = [opened.enter_context(MapStore.open(path)) for path in maps]
+        first, config = stores[0], config_of(stores[0])
+        for store in stores:
+            require_sensors(first, store.rig, str(store.path))
+            finished(store)
+        kept = [number for number, store in enumerate(stores) if (onto and not number) or changed_by_hand(store)]
+        made = assembled(stores, config, first.rig, kept)
         folder = SessionFolder(out)
         with folder.writing(overwrite=overwrite):
             folder.write_config(config.to_yaml())
             with MapStore.create(folder.path, first.config_yaml, first.rig, "") as store:
-                for path, part, sessions in parts:
-                    copied = len(store.sessions()) if store.one("SELECT COUNT(*) FROM nodes", ()) else 0
-                    copy_sessions(part, store, sessions)
-                    keep_files(SessionFolder(path), part, sessions, folder, store, copied)
-                for number in range(int(store.one("SELECT COUNT(*) FROM edges", ())), len(joint.map.edges)):
-                    store.put_edge(number, joint.map.edge(number))
-                describe(store, first, f"{first.source} + {second.source}")
-                return conclude(store, folder, joint.solutions(config.backends.names), config)
-
-
-def _joint_map(config: Config, parts: Sequence[Part], rig: Rig) -> JointMap:
-    """Take up all parts, and look for each on those before it; for the first on the second, if that is not found on it."""
-    joint = JointMap(config, rig)
-    nodes = [joint.take_up(part) for part in parts]
-    found = joint.join(nodes[1])
-    if found is None:
-        turned = JointMap(config, rig)
-        there, here = turned.take_up(parts[1]), turned.take_up(parts[0])
-        if turned.join(here) is not None:
-            joint.adopt(turned, np.concatenate([len(here) + np.arange(len(there)), np.arange(len(here))]))
-    for later in nodes[2:]:
-        joint.join(later)
-    return joint
+                for number, (path, part) in enumerate(zip(maps, stores, strict=True)):
+                    copied = len(store.sessions()) if store.nodes else 0
+                    copy_sessions(part, store, between=number in kept)
+                    keep_files(SessionFolder(path), part, folder, store, copied)
+                for number, link in enumerate(made.links, start=int(store.one("SELECT COUNT(*) FROM edges", ()))):
+                    store.put_edge(number, link)
+                describe(store, first, " + ".join(dict.fromkeys(part.source for part in stores)))
+                solutions = solutions_of(store.map(), made.poses, config.backends.names, config.backends)
+                return conclude(store, folder, solutions, config)
 
 
 def map_onto(
@@ -110,7 +106,8 @@ def map_onto(
 ) -> Joined:
     """Map a drive, and look for its place on a map that exists; the new map holds both.
 
-    The drive is mapped as it would be alone, and then merged (`merge`).
+    The drive is mapped as it would be alone, and then looked for on the map, whose edges stay as they are. That costs the same
+    however many sessions the map has, where `merge` finds the loops between all of them again.
 
     Args:
         stream, config, progress: as for `session.run`.
@@ -129,7 +126,7 @@ def map_onto(
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=out.absolute().parent, prefix=f".{out.name}.") as alone:
         run(stream, config, Path(alone) / "session", progress=progress)
-        return merge(base, Path(alone) / "session", out, overwrite=overwrite)
+        return _joined([base, Path(alone) / "session"], out, overwrite, onto=True)
 
 
 def conclude(store: MapStore, folder: SessionFolder, solutions: Mapping[str, Solution], config: Config) -> Joined:
@@ -187,23 +184,21 @@ def describe(store: MapStore, like: MapStore, source: str) -> None:
         store.put_info(key, value)
 
 
-def keep_files(
-    part: SessionFolder, source: MapStore, sessions: Sequence[int] | None, folder: SessionFolder, store: MapStore, first: int
-) -> None:
+def keep_files(part: SessionFolder, source: MapStore, folder: SessionFolder, store: MapStore, first: int) -> None:
     """Keep what a part's folder has beside its map: the ground truth of its sessions, and the figures of a single one.
 
     Args:
-        part, source, sessions: the folder of the part, its map, and which of its sessions were taken; None: all.
+        part, source: the folder of the part, and its map.
         folder, store: the map that it became part of.
         first: number there of its first session.
     """
-    numbers = [one.number for one in source.sessions()]
-    if len(numbers) == 1 and part.metrics_json.is_file():
+    count = len(source.sessions())
+    if count == 1 and part.metrics_json.is_file():
         store.write_rows("info", [(first, FIGURES, part.metrics_json.read_text(encoding="utf-8"))])
-    for there, number in enumerate(numbers if sessions is None else sessions, start=first):
-        own = part.groundtruth_of(number, newest=number == numbers[-1])
+    for number in range(count):
+        own = part.groundtruth_of(number, newest=number == count - 1)
         if own.is_file():
-            write_bytes(folder.groundtruth_of(there, newest=False), own.read_bytes())
+            write_bytes(folder.groundtruth_of(first + number, newest=False), own.read_bytes())
             write_bytes(folder.groundtruth, own.read_bytes())
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from numpy.typing import NDArray
@@ -51,6 +51,27 @@ class Part:
             solution.poses[nodes],
             lambda node: store.keyframe(number(node)),
             lambda node: store.state(number(node)),
+        )
+
+    @classmethod
+    def alone(cls, store: MapStore, session: int) -> Part:
+        """One session of a map file as it was before it was joined to others; as for `of`.
+
+        Raises:
+            StoreError: as for `of`.
+        """
+        part, found = cls.of(store, [session]), store.solutions_alone(session).get(store.primary)
+        return part if found is None or len(found.poses) != len(part.poses) else replace(part, poses=found.poses)
+
+    def followed_by(self, other: Part, experiences: ExperienceMap, poses: Array) -> Part:
+        """This map and another one in one, whose nodes follow; `experiences` and `poses` (N, 3) are those of both."""
+        count = len(self.experiences)
+        return Part(
+            f"{self.name} + {other.name}",
+            experiences,
+            poses,
+            lambda node: self.keyframe(node) if node < count else other.keyframe(node - count),
+            lambda node: self.state(node) if node < count else other.state(node - count),
         )
 
 

@@ -366,17 +366,21 @@ class MapStore(Tables):
     @_reading
     def solutions(self) -> dict[str, Solution]:
         """Poses and report of every back-end, in order of first writing; before the end those of all nodes alone."""
-        rows = self.rows("SELECT backend, poses, report FROM solutions WHERE session = ? ORDER BY position", (schema.WHOLE,))
-        nodes = self.one("SELECT COUNT(*) FROM nodes", ())
-        found = {
-            str(name): Solution(schema.unpack_floats(poses, 3), records.report_from_json(report))
-            for name, poses, report in rows
-        }
+        found, nodes = self.solutions_alone(schema.WHOLE), self.one("SELECT COUNT(*) FROM nodes", ())
         fit = {name: solution for name, solution in found.items() if len(schema.near(solution.poses)) == nodes}
         if self.ended and len(fit) < len(found):
             name = next(name for name in found if name not in fit)
             raise ValueError(f"{name} has {len(found[name].poses)} poses, expected one for each of {nodes} nodes")
         return fit
+
+    @_reading
+    def solutions_alone(self, session: int) -> dict[str, Solution]:
+        """Poses and report of every back-end as they were before a session was joined to others; empty if that is unknown."""
+        rows = self.rows("SELECT backend, poses, report FROM solutions WHERE session = ? ORDER BY position", (session,))
+        return {
+            str(name): Solution(schema.unpack_floats(poses, 3), records.report_from_json(report))
+            for name, poses, report in rows
+        }
 
 
 def _file_of(folder_or_db: Path) -> Path:

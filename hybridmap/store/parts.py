@@ -19,7 +19,7 @@ class _Move:
     by: int
 
 
-def copy_sessions(source: MapStore, target: MapStore, sessions: Collection[int] | None = None) -> None:
+def copy_sessions(source: MapStore, target: MapStore, sessions: Collection[int] | None = None, *, between: bool = True) -> None:
     """Append sessions of a map to another one, with the edges between nodes that are copied.
 
     Facts and solutions of the map as a whole become those of its session if it has one session only; otherwise they are left
@@ -30,6 +30,7 @@ def copy_sessions(source: MapStore, target: MapStore, sessions: Collection[int] 
         source: the map that is read.
         target: the map that is written.
         sessions: numbers of the sessions, ascending; None: all.
+        between: with the edges between these sessions.
 
     Raises:
         StoreError: a file cannot be read or written.
@@ -44,7 +45,7 @@ def copy_sessions(source: MapStore, target: MapStore, sessions: Collection[int] 
     alone = len(source.sessions()) == 1
     for move in moves:
         _copy_session(source, target, move, WHOLE if alone else move.here)
-    _copy_edges(source, target, moves)
+    _copy_edges(source, target, moves, between)
     if len(target.sessions()) == 1:
         for table in ("info", "solutions"):
             target.write(f"UPDATE {table} SET session = {WHOLE}", ())
@@ -85,12 +86,13 @@ def _copy_session(source: MapStore, target: MapStore, move: _Move, own: int) -> 
     target.write_rows("online", ((*there, *row[1:]) for row in rows))
 
 
-def _copy_edges(source: MapStore, target: MapStore, moves: list[_Move]) -> None:
+def _copy_edges(source: MapStore, target: MapStore, moves: list[_Move], between: bool) -> None:
     number = {node: node + move.by for move in moves for node in move.nodes}
+    session_of = {node: move.here for move in moves for node in move.nodes}
     count = int(target.one("SELECT COUNT(*) FROM edges", ()))
     for row in source.each_row("SELECT * FROM edges ORDER BY number"):
         ends = number.get(row[1]), number.get(row[2])
-        if None in ends:
+        if None in ends or not (between or session_of[row[1]] == session_of[row[2]]):
             continue
         since = number.get(row[11], max(node for node in ends if node is not None))
         target.write_rows("edges", [(count, *ends, *row[3:11], since)])

@@ -53,7 +53,7 @@ def drives(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def joined(drives, tmp_path_factory):
-    return merge(drives[0], drives[1], tmp_path_factory.mktemp("joined") / "both")
+    return merge([drives[0], drives[1]], tmp_path_factory.mktemp("joined") / "both")
 
 
 def rows(path):
@@ -86,7 +86,7 @@ def test_a_second_drive_is_found_on_the_map_of_the_first(drives, joined):
 
 def test_the_maps_that_are_read_stay_as_they_are(drives, tmp_path):
     before = [hashlib.sha256((path / "map.db").read_bytes()).hexdigest() for path in drives[:2]]
-    merge(drives[0], drives[1], tmp_path / "both")
+    merge([drives[0], drives[1]], tmp_path / "both")
     assert [hashlib.sha256((path / "map.db").read_bytes()).hexdigest() for path in drives[:2]] == before
 
 
@@ -142,7 +142,7 @@ def test_what_a_part_lost_counts_against_the_joint_map(drives, tmp_path):
     here = shutil.copytree(drives[0], tmp_path / "here")
     figures = json.loads((here / "metrics.json").read_text())
     (here / "metrics.json").write_text(json.dumps(figures | {"lost": {"scans": [90, 100]}}))
-    both = merge(here, drives[1], tmp_path / "both")
+    both = merge([here, drives[1]], tmp_path / "both")
     assert both.head["lost"] == {"scans": (90, 100)}
     assert both.head["verdict"] == "doubtful"
     assert any("scans" in json.dumps(reason) for reason in both.head["reasons"])
@@ -155,8 +155,8 @@ def test_no_map_is_written_over_one_that_is_read(drives, tmp_path):
     stream = open_stream("lab", config, end_s=2.0)
     for out in (here, here / "within"):
         for write in (
-            lambda out=out: merge(here, there, out, overwrite=True),
-            lambda out=out: merge(there, here, out, overwrite=True),
+            lambda out=out: merge([here, there], out, overwrite=True),
+            lambda out=out: merge([there, here], out, overwrite=True),
             lambda out=out: map_onto(stream, config, here, out, overwrite=True),
             lambda out=out: localize(stream, config, here, out, overwrite=True),
         ):
@@ -199,9 +199,81 @@ def test_only_what_is_there_can_be_taken_out(drives, joined, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def placed(folder):
+    """First stamp and length of each session -> its poses, in the frame of the session that began first."""
+    with MapStore.open(folder) as store:
+        experiences, poses = store.map(), store.solutions()["gtsam-gnc"].poses
+    found = {(int(experiences.stamps_ns[nodes[0]]), len(nodes)): poses[list(nodes)] for nodes in experiences.sessions}
+    return {key: between(found[min(found)][0], of) for key, of in found.items()}
+
+
+def test_in_any_order_three_drives_make_the_same_map(drives, tmp_path):
+    here, there = drives[:2]
+    third = drive("lab", tmp_path / "third", 4.0, 16.0, 8)
+    wanted = placed(merge([here, there, third], tmp_path / "whole").folder.path)
+    assert len(wanted) == 3
+    for number, (first, second, last) in enumerate(((third, there, here), (there, here, third), (here, third, there))):
+        two = merge([first, second], tmp_path / f"two {number}").folder.path
+        three = placed(merge([last, two], tmp_path / f"three {number}").folder.path)
+        for key, poses in wanted.items():
+            assert three[key] == pytest.approx(poses, abs=1e-6)
+
+
+def test_the_frame_is_that_of_the_first_map(drives, tmp_path):
+    with MapStore.open(merge([drives[1], drives[0]], tmp_path / "turned").folder.path) as store:
+        experiences, poses = store.map(), store.solutions()["gtsam-gnc"].poses
+    with MapStore.open(drives[1]) as store:
+        assert int(experiences.stamps_ns[0]) == int(store.map().stamps_ns[0])
+        assert poses[0] == pytest.approx(store.solutions()["gtsam-gnc"].poses[0], abs=1e-9)
+
+
+def test_a_drive_that_is_given_twice_is_refused(drives, joined, tmp_path):
+    for maps in ([drives[0], drives[0]], [joined.folder.path, drives[1]], [drives[1], joined.folder.path]):
+        with pytest.raises(StoreError, match="is the same drive as session"):
+            merge(maps, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_pieces_are_looked_for_one_by_one(drives, tmp_path, turned):
+    """A drive joins the piece that saw the same walls, and leaves the other where it is, whichever map is named first."""
+    apart = merge([drives[2], drives[0]], tmp_path / "apart")
+    assert not apart.joined
+    maps = [drives[1], apart.folder.path]
+    both = merge(maps[::-1] if turned else maps, tmp_path / "both")
+    pieces = {
+        one["source"]: [o["piece"] for o in both.head["sessions"] if o["source"] == one["source"]]
+        for one in both.head["sessions"]
+    }
+    assert len(set(pieces["lab"])) == 1
+    assert len(pieces["lab"]) == 2
+    assert pieces["office"] != pieces["lab"][:1]
+
+
+def test_what_was_changed_by_hand_is_joined_as_it_is(drives, joined, tmp_path):
+    """Loops between sessions are found again when maps are merged; an edge by hand would be lost."""
+    with MapStore.open(joined.folder.path) as store:
+        here, there = store.map().sessions
+    measured = Measured(here[3], there[3], np.array([3.0, 3.0, 0.0]), 0.02, 0.01)
+    changed = add_edge(joined.folder.path, measured, tmp_path / "changed").folder.path
+    third = drive("lab", tmp_path / "third", 4.0, 16.0, 8)
+    again = merge([third, changed], tmp_path / "again").folder.path
+    assert sum(edge.kind is EdgeKind.MANUAL for edge in accepted(again)) == 1
+
+
+def test_a_map_that_is_continued_keeps_its_edges(drives, joined, tmp_path):
+    config = Config.load("laser", {"simulation.world": "lab", "seed": 9, "backends.names": ["gtsam-gnc"], "neural.modules": 0})
+    done = map_onto(open_stream("lab", config, start_s=4.0, end_s=16.0), config, joined.folder.path, tmp_path / "onto")
+    assert done.joined
+    with MapStore.open(joined.folder.path) as before, MapStore.open(tmp_path / "onto") as after:
+        count = len(before.map())
+        old = [edge for edge in after.map().edges if max(edge.source, edge.target) < count]
+        assert [(e.source, e.target, e.status) for e in old] == [(e.source, e.target, e.status) for e in before.map().edges]
+
+
 def test_what_is_not_found_stays_apart_and_says_so(drives, tmp_path):
     """A drive through another building: two pieces, each as it was alone, and a verdict that says it."""
-    apart = merge(drives[0], drives[2], tmp_path / "apart")
+    apart = merge([drives[0], drives[2]], tmp_path / "apart")
     assert not apart.joined
     assert [reason["kind"] for reason in apart.head["reasons"]] == ["not joined"]
     with MapStore.open(apart.folder.path) as store, MapStore.open(drives[2]) as alone:
@@ -213,7 +285,7 @@ def test_what_is_not_found_stays_apart_and_says_so(drives, tmp_path):
 
 def test_pieces_do_not_look_joined(drives, tmp_path):
     """Not on the page, where they are drawn beside each other, and in no export or solution that puts them in one frame."""
-    apart = merge(drives[0], drives[2], tmp_path / "apart").folder
+    apart = merge([drives[0], drives[2]], tmp_path / "apart").folder
     with MapStore.open(apart.path) as store:
         scene = load_scene(apart, store)
         here, there = store.map().sessions
@@ -226,7 +298,7 @@ def test_pieces_do_not_look_joined(drives, tmp_path):
 
 
 def test_the_page_says_whose_trajectories_it_shows_and_that_pieces_lie_anywhere(drives, joined, tmp_path):
-    apart = merge(drives[0], drives[2], tmp_path / "apart").folder
+    apart = merge([drives[0], drives[2]], tmp_path / "apart").folder
     for folder, said in ((joined.folder, False), (apart, True)):
         page = write_report(folder).read_text()
         assert "The map has 2 sessions" in page
@@ -251,7 +323,7 @@ def accepted(folder):
 
 
 def test_every_piece_has_a_frame_of_its_own(drives, tmp_path):
-    apart = merge(drives[0], drives[2], tmp_path / "apart")
+    apart = merge([drives[0], drives[2]], tmp_path / "apart")
     with MapStore.open(apart.folder.path) as store:
         graph, config = store.map().pose_graph(), Config.from_tree(store.config_tree, "test")
     pieces = pieces_of(graph)
@@ -265,7 +337,7 @@ def test_other_sensors_are_refused(drives, tmp_path):
     config = Config.load("laser", {"simulation.world": "lab", "simulation.laser.beams": 90, "backends.names": ["gtsam-gnc"]})
     run(open_stream("lab", config, end_s=4.0), config, tmp_path / "other")
     with pytest.raises(StoreError, match="other sensors"):
-        merge(drives[0], tmp_path / "other", tmp_path / "both")
+        merge([drives[0], tmp_path / "other"], tmp_path / "both")
     assert not (tmp_path / "both").exists()
 
 
@@ -337,7 +409,7 @@ def test_a_drive_elsewhere_is_not_localised_and_says_so(drives, tmp_path):
 def test_a_camera_finds_its_place_too(tmp_path):
     """Begun a metre ahead with the same heading: the two are one map, and neither is where the other began."""
     here, there = drive("lab", tmp_path / "here", 0.0, 14.0, 1, "rgbd"), drive("lab", tmp_path / "there", 3.0, 16.0, 2, "rgbd")
-    both = merge(here, there, tmp_path / "both")
+    both = merge([here, there], tmp_path / "both")
     assert both.joined
     with MapStore.open(both.folder.path) as store:
         firsts = [nodes[0] for nodes in store.map().sessions]
