@@ -30,13 +30,14 @@ class RobotLifecycle:
         self._robot: RobotNode | None = None
         self._started = False
         self._sessions = 0
+        self._concluding = threading.Lock()
         self._last: Session | HybridMapError = RosError(f"{ros.source}: nothing was mapped: the node was never activated")
 
     def start(self) -> None:
         """Let others move the node, or begin to map at once; returns at once.
 
         Raises:
-            RosError: it does not become active.
+            HybridMapError: it does not become active.
         """
         self._ros.follow(self, autostart=self._autostart)
 
@@ -57,36 +58,28 @@ class RobotLifecycle:
 
     # ------------------------------------------------------------------ transitions
 
-    def configure(self) -> bool:
+    def configure(self) -> None:
         """Make topics, and load what mapping needs."""
         self._sessions += 1
-        try:
-            self._robot = RobotNode(self._ros, replace(self._options, out=self._out))
-        except HybridMapError as error:
-            self._last = error
-            self._ros.warn(str(error))
-            return False
+        self._robot = RobotNode(self._ros, replace(self._options, out=self._out))
         self._ros.begin()
-        return True
 
-    def activate(self) -> bool:
+    def activate(self) -> None:
         """Map, or go on mapping."""
         assert self._robot is not None
         if self._started:
             self._robot.pause(False)
-            return True
+            return
         self._robot.start()
         self._started = True
         threading.Thread(target=self._watch, args=(self._robot,), name="hybridmap-watch", daemon=True).start()
-        return True
 
-    def deactivate(self) -> bool:
+    def deactivate(self) -> None:
         """Leave views out; odometry counts all the time."""
         assert self._robot is not None
         self._robot.pause()
-        return True
 
-    def cleanup(self) -> bool:
+    def cleanup(self) -> None:
         """Conclude the session."""
         self._conclude()
         self._ros.forget()
@@ -94,12 +87,10 @@ class RobotLifecycle:
             self._ros.warn(str(self._last))
         else:
             write_report(self._last.folder)
-        return True
 
-    def shutdown(self) -> bool:
+    def shutdown(self) -> None:
         """End the node; the session is concluded by who waits for it."""
         self.ended.set()
-        return True
 
     # ------------------------------------------------------------------ own
 
@@ -109,16 +100,17 @@ class RobotLifecycle:
         return out if self._sessions == 1 else out.with_name(f"{out.name}-{self._sessions}")
 
     def _conclude(self) -> None:
-        robot, self._robot = self._robot, None
-        if robot is None:
-            return
-        self._ros.end()
-        started, self._started = self._started, False
-        try:
-            self._last = robot.finish()
-        except HybridMapError as error:
-            if started:
-                self._last = error
+        with self._concluding:  # Ctrl-C may come during `cleanup`
+            robot, self._robot = self._robot, None
+            if robot is None:
+                return
+            self._ros.end()
+            started, self._started = self._started, False
+            try:
+                self._last = robot.finish()
+            except HybridMapError as error:
+                if started:
+                    self._last = error
 
     def _watch(self, robot: RobotNode) -> None:
         """End the node when mapping has failed."""

@@ -41,21 +41,21 @@ def import_rclpy() -> Any:
 
 
 class Transitions(Protocol):
-    """What a lifecycle node does. Each returns whether the transition is made."""
+    """What a lifecycle node does. A transition that raises a HybridMapError is not made."""
 
-    def configure(self) -> bool:
+    def configure(self) -> None:
         """From unconfigured to inactive."""
 
-    def activate(self) -> bool:
+    def activate(self) -> None:
         """From inactive to active."""
 
-    def deactivate(self) -> bool:
+    def deactivate(self) -> None:
         """From active to inactive."""
 
-    def cleanup(self) -> bool:
+    def cleanup(self) -> None:
         """From inactive to unconfigured."""
 
-    def shutdown(self) -> bool:
+    def shutdown(self) -> None:
         """To the end, from anywhere."""
 
 
@@ -125,13 +125,13 @@ class Ros2:
             autostart: configure and activate it at once.
 
         Raises:
-            RosError: it does not become active.
+            HybridMapError: it does not become active.
         """
         self._transitions = transitions
         if autostart:
             for name, trigger in (("configure", self._node.trigger_configure), ("activate", self._node.trigger_activate)):
                 if trigger() != self._rclpy.lifecycle.TransitionCallbackReturn.SUCCESS:
-                    raise RosError(f"{self.source}: the transition {name!r} has failed")
+                    raise self._node.error or RosError(f"{self.source}: the transition {name!r} has failed")
         self._spinner.start()
 
     def begin(self) -> None:
@@ -209,7 +209,7 @@ class Ros2:
         """Offer services. Where one raises a HybridMapError, it is logged, and the answer is empty."""
         for service in services:
             package, _, kind = service.kind.value.partition("/")
-            found = getattr(import_module(f"{package}.srv"), kind)
+            found = _service_class(package, kind)
             name, answer = _name(service.name), self._answering(service)
             self._services[service.name] = self._node.create_service(found, name, answer, callback_group=self._group)
 
@@ -258,8 +258,11 @@ class Ros2:
     # ------------------------------------------------------------------ own
 
     def _spin(self) -> None:
-        with suppress(self._rclpy.executors.ExternalShutdownException, self._rclpy.executors.ShutdownException):
-            self._executor.spin()
+        try:
+            with suppress(self._rclpy.executors.ExternalShutdownException, self._rclpy.executors.ShutdownException):
+                self._executor.spin()
+        finally:
+            self._tell_stopped()  # nothing more will come: the drive is over
 
     def _tell_stopped(self) -> None:
         for call in self._stopped:
@@ -290,6 +293,15 @@ class _Worker:
         self._thread.join(timeout_s)
 
 
+def _service_class(package: str, kind: str) -> Any:
+    try:
+        return getattr(import_module(f"{package}.srv"), kind)
+    except ImportError as error:
+        raise RosError(
+            f"ROS 2 has no service type {package}/srv/{kind} here ({error}): install the package {package}"
+        ) from None
+
+
 def _name(name: str) -> str:
     """As ROS 2 has it: what is private to a node begins with `~/`."""
     return f"~/{name[1:]}" if name.startswith("~") else name
@@ -299,31 +311,34 @@ def _lifecycle_node(name: str, context: Any, transitions: Callable[[], Transitio
     """A lifecycle node that does what `transitions` gives."""
     from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 
-    def made(step: str, before: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        """Publishers follow first when they begin, so that nothing is lost, and are the last to end."""
-
-        def on(state: Any) -> Any:
-            found = transitions()
-            if found is not None and not getattr(found, step)():
-                return TransitionCallbackReturn.FAILURE
-            return before(state)
-
-        return on
+    def done(node: Any, step: str, rest: Callable[[Any], Any], state: Any) -> Any:
+        """Do a step of ours, then that of the publishers."""
+        found = transitions()
+        try:
+            if found is not None:
+                getattr(found, step)()
+        except HybridMapError as error:
+            node.error = error
+            node.get_logger().error(f"{step}: {error}")
+            return TransitionCallbackReturn.FAILURE
+        return rest(state)
 
     class Node(LifecycleNode):  # type: ignore[misc]  # rclpy is not known where types are checked
+        error: HybridMapError | None = None
+
         def on_configure(self, state: Any) -> Any:
-            return made("configure", super().on_configure)(state)
+            return done(self, "configure", super().on_configure, state)
 
         def on_activate(self, state: Any) -> Any:
-            return made("activate", super().on_activate)(state)
+            return done(self, "activate", super().on_activate, state)
 
         def on_deactivate(self, state: Any) -> Any:
-            return made("deactivate", super().on_deactivate)(state)
+            return done(self, "deactivate", super().on_deactivate, state)
 
         def on_cleanup(self, state: Any) -> Any:
-            return made("cleanup", super().on_cleanup)(state)
+            return done(self, "cleanup", super().on_cleanup, state)
 
         def on_shutdown(self, state: Any) -> Any:
-            return made("shutdown", super().on_shutdown)(state)
+            return done(self, "shutdown", super().on_shutdown, state)
 
     return Node(name, context=context)
