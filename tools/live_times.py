@@ -1,25 +1,26 @@
 """Feed a recording to a live mapper as a robot would, and print how fast it answers, how far it lags and what it maps.
 
-    python tools/live_times.py SOURCE [--config NAME] [--rate 1] [--end S] [--late 0.1] [--slow 1] [--out DIR] [--json]
+    python tools/live_times.py SOURCE [--config NAME] [--rate 1] [--end S] [--late 0.1] [--overload 3]
+                               [--reference FILE] [--out DIR] [--json]
 
-Every source comes with a delay of its own, from 0 to `--late` seconds of the recording. `--slow N` holds the mapping
-process still for so large a part of the time that it is N times slower. The exit code is 1 if nothing was left out and
-the maps differ.
+Every source comes with a delay of its own, from 0 to `--late` seconds of the recording. `--overload N` makes the mapping
+process so slow that it needs N times the time that the drive takes at this rate. The exit code is 1 if nothing was left out
+and the maps differ, if views lag by more than 2 s, or if the map's error is more than twice that of the recording's.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import signal
 import sys
 import tempfile
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from overload import ERROR_RATIO, LAG_S, error_m, slowed, slowness
 
 from hybridmap import session
 from hybridmap.config import Config
@@ -28,7 +29,6 @@ from hybridmap.live.inbox import source_of
 from hybridmap.streams.open import open_stream
 from hybridmap.trajectory import NS_PER_S
 
-_HOLD_S = 0.02
 _READ_S = 0.01
 
 
@@ -56,15 +56,6 @@ class Reader:
         self._thread.join()
 
 
-def hold(pid: int, slow: float, stop: threading.Event) -> None:
-    """Stop a process again and again, so that it is slower."""
-    while slow > 1.0 and not stop.is_set():
-        os.kill(pid, signal.SIGSTOP)
-        time.sleep(_HOLD_S * (slow - 1.0))
-        os.kill(pid, signal.SIGCONT)
-        time.sleep(_HOLD_S)
-
-
 def percentiles(times_s: list[float]) -> dict[str, float]:
     """Median, 99 % and maximum, ms."""
     return {name: round(1e3 * float(np.percentile(times_s, q)), 3) for name, q in (("p50", 50), ("p99", 99), ("max", 100))}
@@ -78,7 +69,8 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=1.0)
     parser.add_argument("--end", type=float)
     parser.add_argument("--late", type=float, default=0.1)
-    parser.add_argument("--slow", type=float, default=1.0)
+    parser.add_argument("--overload", type=float, default=0.0)
+    parser.add_argument("--reference", type=Path, help="true trajectory (TUM), for the errors of both maps")
     parser.add_argument("--out", type=Path, help="folder in which both sessions are kept")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
@@ -86,21 +78,23 @@ def main() -> None:
     stream = open_stream(args.source, config, end_s=args.end)
     samples = list(stream)
     with tempfile.TemporaryDirectory() as temporary:
-        folder = args.out or temporary
+        folder = Path(args.out or temporary)
         began_s = time.perf_counter()
-        recorded = session.run(stream, config, Path(folder) / "recorded")
-        found: dict[str, object] = {"offline_s": round(time.perf_counter() - began_s, 2), "samples": len(samples)}
+        recorded = session.run(stream, config, folder / "recorded")
+        found: dict[str, Any] = {"offline_s": round(time.perf_counter() - began_s, 2), "samples": len(samples)}
         delays = {name: args.late * number for number, name in enumerate(sorted({source_of(one) for one in samples}))}
         arrivals = sorted(samples, key=lambda one: one.stamp_ns / NS_PER_S + delays[source_of(one)])
-        with LiveMapper(config, stream.rig, Path(folder) / "live") as mapper:
+        with LiveMapper(config, stream.rig, folder / "live") as mapper:
             reader, adds_s, first_s = Reader(mapper), [], time.perf_counter()
-            threading.Thread(target=hold, args=(mapper.pid, args.slow, reader.stop), daemon=True).start()
-            for sample in arrivals:
-                due_s = ((sample.stamp_ns - arrivals[0].stamp_ns) / NS_PER_S + delays[source_of(sample)]) / args.rate
-                time.sleep(max(0.0, first_s + due_s - time.perf_counter()))
-                began_s = time.perf_counter()
-                mapper.add(sample)
-                adds_s.append(time.perf_counter() - began_s)
+            slow = slowness(folder / "recorded", args.rate, args.overload)
+            found["slower"] = round(slow, 2)
+            with slowed(mapper.pid, slow):
+                for sample in arrivals:
+                    due_s = ((sample.stamp_ns - arrivals[0].stamp_ns) / NS_PER_S + delays[source_of(sample)]) / args.rate
+                    time.sleep(max(0.0, first_s + due_s - time.perf_counter()))
+                    began_s = time.perf_counter()
+                    mapper.add(sample)
+                    adds_s.append(time.perf_counter() - began_s)
             found["drive_s"] = round(time.perf_counter() - first_s, 2)
             reader.join()
             began_s = time.perf_counter()
@@ -114,12 +108,17 @@ def main() -> None:
                 "same_map": finished.head["graph_hash"] == recorded.head["graph_hash"],
                 "doctor": mapper.doctor(),
             }
+        if args.reference is not None:
+            found["error_m"], found["error_recorded_m"] = (
+                error_m(folder / name, args.reference) for name in ("live", "recorded")
+            )
     if args.json:
         print(json.dumps(found))
     else:
         for name, value in found.items():
             print(f"{name:14} {value}")
-    sys.exit(not found["dropped"] and not found["same_map"])
+    worse = found.get("error_m", 0.0) > ERROR_RATIO * found.get("error_recorded_m", 0.0)
+    sys.exit(bool(found["largest_lag_s"] > LAG_S or worse or not (found["dropped"] or found["same_map"])))
 
 
 if __name__ == "__main__":

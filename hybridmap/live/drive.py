@@ -24,7 +24,9 @@ class LiveReport:
         state: `mapping`, `paused`, `finishing`, `finished` or `failed`.
         samples: source -> number of samples that came.
         dropped: source -> reason -> number of them that the mapper did not get.
-        lag_s, largest_lag_s: time from the turn of the oldest view that is not on the map until now, and the largest so far.
+        lag_s, largest_lag_s: how long the oldest view that the mapper could have mapped by now has been waiting for it, and the
+            largest so far.
+        waiting_s: how long the oldest view has been waiting for odometry, or for another source that may have an older one.
         nodes: nodes of the newest snapshot.
     """
 
@@ -33,6 +35,7 @@ class LiveReport:
     dropped: Mapping[str, Mapping[str, int]]
     lag_s: float
     largest_lag_s: float
+    waiting_s: float
     nodes: int
 
 
@@ -69,5 +72,6 @@ class LiveDrive:
             {name: dict(source.left_out) for name, source in inbox.sources.items() if source.left_out},
             lag_s,
             max(lag_s, inbox.largest_lag_s),
+            inbox.waiting_s(now_s),
             len(self.snapshot.poses),
         )

@@ -12,6 +12,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
 
+from hybridmap.live.odometry import Odometer
+from hybridmap.live.pace import Pace
 from hybridmap.streams.base import Observation, Sample
 from hybridmap.streams.order import sort_key
 from hybridmap.streams.sensors import kind_of
@@ -33,16 +35,15 @@ LONGEST_WAIT_S = 10.0
 """No sample waits longer for another source: for one that was never heard, or whose clock is another."""
 _TICK_MAX_S = 0.3
 """A pause of all sources counts as no more than this: then the network, the recording or this process stood still."""
-_IN_PIPE = 1
-"""Views in the pipe, besides the one that is being mapped."""
+_AHEAD = 1
+"""Views that are given to the mapper while it is busy with one, so that it need not wait for the next."""
 _MOST_WAITING = 90
 """Views that may wait for odometry: 3 s of a camera."""
 _WORK_SHARE = 0.5
-"""Share of the largest lag that the views which wait may need; the rest is for those that need longer than the mean."""
+"""Share of the largest lag that the views which wait may need by their mean, or that one may be old when it is given. The rest is
+for those that need longer than any before."""
 _RECENT = 10
 """Newest gaps of a source that its patience is learnt from, and offsets of its stamps."""
-_RECENT_VIEWS = 30
-"""Newest views whose time on the mapper tells how long the next ones will need."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,7 @@ class LiveLimits:
     """Limits of a live mapper.
 
     Attributes:
-        lag_s: views are left out so that none is mapped later than this after its turn, if two can be mapped in this time;
+        lag_s: views are left out so that none is mapped later than this after its turn, unless its own step takes longer;
             infinite: none is left out.
         correction_m_s, correction_deg_s: fastest motion of the robot on the map by the smoothed correction.
     """
@@ -102,7 +103,10 @@ class Source:
 @dataclass(slots=True)
 class _Waiting:
     sample: Sample
-    since_s: float  # when it came, by the clock of the input; after its turn, when that was, by the wall clock
+    came_s: float  # by the wall clock
+    tick_s: float  # when it came, by the clock of the input
+    since_s: float = 0.0  # when its turn came, by the wall clock
+    way: float = 0.0  # by then, of the odometer
     left_out: bool = False
 
     @property
@@ -122,13 +126,15 @@ class Inbox:
     is silent is measured by a clock that runs only while others are heard.
 
     Odometry is never left out for want of time. Views are, where the mapper would lag behind by more than
-    `LiveLimits.lag_s`; the newest one never is.
+    `LiveLimits.lag_s`; the newest one never is. A view is given to the mapper only when it will be mapped within that limit,
+    even if this step, and the one that the mapper may be busy with, take as long as the longest of late. What is too late for
+    that is left out before it is given.
 
     Attributes:
         sources: name -> what is known about it; `odometry` and the sensors (`scans`, `frames`).
         began_s: when it began, by the wall clock.
         paused: whether views are left out now.
-        largest_lag_s: longest time from the turn of a view to its end on the map.
+        largest_lag_s: the largest `lag_s` so far.
     """
 
     def __init__(self, views: Iterable[str], limits: LiveLimits, now_s: float) -> None:
@@ -143,16 +149,16 @@ class Inbox:
         self._arrivals = 0
         self._due: deque[_Waiting] = deque()
         self._due_views: list[_Waiting] = []  # the views of `_due` that are not left out
-        self._given_ns = 0  # stamp of the newest view that was given
+        self._odometer = Odometer()
+        self._given_way = 0.0  # of the newest view that was given
         self._passed: tuple[int, int] | None = None  # sort key of the newest sample whose turn has come
-        self._untaken = 0  # views in the pipe
-        self._unmapped: deque[float] = deque()  # when the turn came of the views that were given and are not mapped yet
-        self._busy_s: deque[float] = deque(maxlen=_RECENT_VIEWS)
+        self._pace = Pace()
+        self._asked = 0  # samples that had been given when the mapper was asked how far it is
 
     def add(self, sample: Sample, now_s: float) -> None:
         """Take in a sample that has come just now."""
         name = source_of(sample)
-        source, waiting = self.sources[name], _Waiting(sample, self._tick(now_s))
+        source, waiting = self.sources[name], _Waiting(sample, now_s, self._tick(now_s))
         jumped_s = source.back_s
         source.hear(sample.stamp_ns, now_s, self._tick_s)
         if source.back_s and not jumped_s:
@@ -173,7 +179,7 @@ class Inbox:
         """The samples that the mapper should get now, in order."""
         self._sort(now_s)
         taken: list[Sample] = []
-        while self._due and not (self._due[0].is_view and self._untaken >= _IN_PIPE and not self._due[0].left_out):
+        while self._due and self._may_give(self._due[0], now_s):
             taken += self._give()
         return taken
 
@@ -181,24 +187,33 @@ class Inbox:
         """End of the drive: all remaining samples, in order; from here on nothing lags."""
         while self._unsorted:
             self._pass(_Turn.NOW, now_s)
-        remaining = [sample for _ in range(len(self._due)) for sample in self._give()]
         self.largest_lag_s = max(self.largest_lag_s, self.lag_s(now_s))
-        self._unmapped.clear()
+        remaining = [sample for _ in range(len(self._due)) for sample in self._give()]
+        self._pace.forget()
         return remaining
 
-    def done(self, taken: int, mapped: int, busy_s: float, now_s: float) -> None:
-        """Note that the mapper has taken views from the pipe, and has mapped some, in `busy_s` seconds."""
-        self._untaken -= taken
+    def done(self, consumed: int, mapped: int, busy_s: float, motion_s: float, now_s: float) -> None:
+        """Note how far the mapper is; see `messages.Done`."""
         self.largest_lag_s = max(self.largest_lag_s, self.lag_s(now_s))
-        for _ in range(min(mapped, len(self._unmapped))):
-            self._unmapped.popleft()
-        self._busy_s.extend([busy_s / max(mapped, 1)] * mapped)
+        self._pace.done(consumed, mapped, busy_s, motion_s)
+
+    @property
+    def is_held_up(self) -> bool:
+        """Whether a view waits until the mapper has nothing to do, which it should tell once."""
+        held = bool(self._due) and self._asked != self._pace.count
+        self._asked = self._pace.count if held else self._asked
+        return held
 
     def lag_s(self, now_s: float) -> float:
-        """How long the oldest view whose turn has come is waiting for its end on the map."""
-        if self._unmapped:
-            return now_s - self._unmapped[0]
-        return now_s - self._due_views[0].since_s if self._due_views else 0.0
+        """How far the mapper is behind: how long the oldest view that it could map by now has been waiting for it."""
+        since = [self._pace.since_s, self._due_views[0].since_s if self._due_views else None]
+        return now_s - min((one for one in since if one is not None), default=now_s)
+
+    def waiting_s(self, now_s: float) -> float:
+        """How long the oldest view has been waiting for odometry, or for another source that may have an older one."""
+        unsorted = (row[2].came_s for row in self._unsorted if row[2].is_view)
+        first_s = self._pace.waiting_since_s
+        return now_s - min([*unsorted, *([] if first_s is None else [first_s])], default=now_s)
 
     @property
     def left_out(self) -> Counter[tuple[str, str]]:
@@ -222,24 +237,32 @@ class Inbox:
     def _thin(self, now_s: float) -> None:
         """Leave out views that cannot be mapped in time: those that are missed least, and the oldest ones if they are too late.
 
-        The newest one stays. Least missed is the view whose neighbours are nearest to each other, so what stays is spread
-        evenly over the drive.
+        The newest one stays. Least missed is the view whose neighbours are nearest to each other by the way that the robot has
+        moved, so what stays is spread evenly over the drive.
         """
-        views, busy_s = self._due_views, self._busy_s
-        mean_s, longest_s, before = sum(busy_s) / max(len(busy_s), 1), max(busy_s, default=0.0), len(self._unmapped)
-        while len(views) > 1 and (before + len(views)) * mean_s > _WORK_SHARE * self._limits.lag_s:
-            stamps = [self._given_ns, *(one.sample.stamp_ns for one in views)]
-            gaps = [after - earlier for earlier, after in zip(stamps, stamps[2:], strict=False)]
+        views, pace, limit_s = self._due_views, self._pace, self._limits.lag_s
+        moving_s = (pace.count - pace.consumed + len(self._due) - len(views)) * pace.motion_s
+        while len(views) > 1 and moving_s + (pace.is_busy + len(views)) * pace.mean_s > _WORK_SHARE * limit_s:
+            ways = [self._given_way, *(one.way for one in views)]
+            gaps = [after - earlier for earlier, after in zip(ways, ways[2:], strict=False)]
             self._leave_out(views.pop(gaps.index(min(gaps))), SLOW)
-        while len(views) > 1 and now_s - views[0].since_s + (before + 1) * longest_s > self._limits.lag_s:
+        while len(views) > 1 and now_s - views[0].since_s + max(pace.longest_s, (1.0 - _WORK_SHARE) * limit_s) > limit_s:
             self._leave_out(views.pop(0), SLOW)
+
+    def _may_give(self, waiting: _Waiting, now_s: float) -> bool:
+        """Whether the mapper may have it now: a view that would be late waits until the mapper has nothing to do."""
+        pace = self._pace
+        if not waiting.is_view or waiting.left_out or pace.count == pace.consumed:
+            return True
+        in_time = now_s - waiting.since_s + pace.remaining_s + pace.longest_s <= self._limits.lag_s
+        return in_time and pace.views_ahead < _AHEAD
 
     def _turn(self, waiting: _Waiting) -> _Turn:
         stamp_ns, own = waiting.sample.stamp_ns, self.sources[source_of(waiting.sample)]
         behind = [one for one in self.sources.values() if one is not own and (one.stamp_ns is None or one.stamp_ns < stamp_ns)]
         needs = waiting.is_view and any(one is self.sources[ODOMETRY] for one in behind)
         needs |= own.stamp_ns is not None and stamp_ns - own.stamp_ns > SILENT_MIN_S * NS_PER_S
-        if self._tick_s - waiting.since_s > LONGEST_WAIT_S:
+        if self._tick_s - waiting.tick_s > LONGEST_WAIT_S:
             return _Turn.NEVER if needs else _Turn.NOW
         return _Turn.LATER if needs or not all(map(self._overdue, behind)) else _Turn.NOW
 
@@ -251,7 +274,7 @@ class Inbox:
         if turn is _Turn.NEVER:
             self._leave_out(waiting, AHEAD)
             return
-        self._passed, waiting.since_s = key, now_s
+        self._passed, waiting.since_s, waiting.way = key, now_s, self._odometer.way(waiting.sample)
         self._due.append(waiting)
         if waiting.is_view:
             self._due_views.append(waiting)
@@ -261,10 +284,10 @@ class Inbox:
         waiting = self._due.popleft()
         if waiting.left_out:
             return []
+        self._pace.give(is_view=waiting.is_view, came_s=waiting.came_s, since_s=waiting.since_s)
         if waiting.is_view:
-            self._untaken += 1
-            self._given_ns = waiting.sample.stamp_ns
-            self._unmapped.append(self._due_views.pop(0).since_s)
+            self._given_way = waiting.way
+            self._due_views.pop(0)
         return [waiting.sample]
 
     def _bound(self) -> None:

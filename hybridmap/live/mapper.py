@@ -22,7 +22,7 @@ from hybridmap.live.drawing import Artist
 from hybridmap.live.drive import LiveDrive, LiveReport
 from hybridmap.live.inbox import LiveLimits
 from hybridmap.live.locating import Locator
-from hybridmap.live.messages import Begin, Done, Dropped, End, Ready, Reset, Save, Saved, Snapshot
+from hybridmap.live.messages import Ask, Begin, Done, Dropped, End, Ready, Reset, Save, Saved, Snapshot
 from hybridmap.live.odometry import SmoothedCorrection
 from hybridmap.live.process import MappingProcess
 from hybridmap.live.samples import check, check_kind, stamp_ns_of, used
@@ -30,6 +30,9 @@ from hybridmap.session import Session
 from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame
+
+_LOOK_S = 0.1
+"""Views that wait grow old also while nothing comes, and are looked at so often, s."""
 
 
 class LiveMapper:
@@ -318,7 +321,7 @@ class LiveMapper:
             with self._changed:
                 messages = self._next()
                 if not messages:
-                    self._changed.wait()
+                    self._changed.wait(_LOOK_S)
             self._process.send(messages)
             if messages and isinstance(messages[-1], End):
                 return
@@ -327,11 +330,13 @@ class LiveMapper:
         """The messages to send now."""
         now_s, orders, ending = time.monotonic(), self._outgoing, self._ended_s is not None
         self._outgoing = []
-        samples = self._drive.inbox.flush(now_s) if ending else self._drive.inbox.take(now_s)
-        left_out = self._drive.inbox.left_out
+        inbox = self._drive.inbox
+        samples = inbox.flush(now_s) if ending else inbox.take(now_s)
+        asked = [Ask()] if inbox.is_held_up else []
+        left_out = inbox.left_out
         news = [Dropped(*key, number) for key, number in (left_out - self._told).items()]
         self._told = left_out
-        return [*orders, *news, *samples, *([End()] if ending else [])]
+        return [*orders, *news, *samples, *([End()] if ending else asked)]
 
     def _receive(self, message: Any) -> None:
         """Take in a message of the mapping process."""
@@ -343,7 +348,8 @@ class LiveMapper:
             elif not self._ready.done():
                 return  # of the map that was left
             elif isinstance(message, Done):
-                self._drive.inbox.done(message.taken, message.mapped, message.busy_s, time.monotonic())
+                times_s = message.busy_s, message.motion_s, time.monotonic()
+                self._drive.inbox.done(message.consumed, message.mapped, *times_s)
                 self._drive.correction = message.pose_map_odom
             elif isinstance(message, Snapshot):
                 self._drive.snapshot, self._drive.correction = message, message.pose_map_odom

@@ -42,6 +42,11 @@ class Save:
 
 
 @dataclass(frozen=True, slots=True)
+class Ask:
+    """To the child: say how far you are."""
+
+
+@dataclass(frozen=True, slots=True)
 class Reset:
     """To the child: leave the map, and begin a new one in its place."""
 
@@ -61,15 +66,17 @@ class Done:
     """To the robot: how far the mapper is.
 
     Attributes:
-        taken: views that the mapper has taken from the pipe since the last message.
-        mapped: views of which the mapper has done the step since then.
-        busy_s: wall time that it needed for these steps, s.
+        consumed: samples of this map that the mapper has taken in so far.
+        mapped: views of which the mapper has done the step since the last message.
+        busy_s: wall time that it needed for these, s.
+        motion_s: wall time that it needs for a sample of odometry, s.
         pose_map_odom: (3,) the correction `map -> odom` now, m and rad.
     """
 
-    taken: int
+    consumed: int
     mapped: int
     busy_s: float
+    motion_s: float
     pose_map_odom: Array
 
 

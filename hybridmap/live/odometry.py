@@ -9,11 +9,13 @@ import numpy as np
 
 from hybridmap.errors import StreamError
 from hybridmap.geometry import IDENTITY, Array, between, compose, exp, interpolate, inverse
-from hybridmap.streams.base import Motion, SelfMotion, Velocity
+from hybridmap.streams.base import Motion, Sample, SelfMotion, Velocity
 from hybridmap.trajectory import NS_PER_S, format_stamp
 
 _SAME = 1e-9
 """Two poses are the same that differ by no more than this, m or rad."""
+_TURN_M, _STANDING_M_S = 1.0, 0.01
+"""A turn by a radian shows a sensor as much that is new as this way; of views from one place, newer ones are better."""
 _KEPT = 4000
 """Poses that are kept, for poses at stamps of the last minute or more."""
 
@@ -80,6 +82,29 @@ class ReceivedOdometry:
             return IDENTITY
         dt_s = (stamp_ns - self._velocity.stamp_ns) / NS_PER_S
         return compose(self.newest, exp(np.array([self._velocity.v_m_s * dt_s, 0.0, self._velocity.omega_rad_s * dt_s])))
+
+
+class Odometer:
+    """How far the robot has moved, with turns, by samples in order; where it stands, time goes on slowly."""
+
+    def __init__(self) -> None:
+        self._way = 0.0
+        self._last: Motion | None = None
+        self._stamp_ns: int | None = None
+
+    def way(self, sample: Sample) -> float:
+        """The way up to a sample, in metres: `_TURN_M` for a radian, and `_STANDING_M_S` for a second."""
+        dt_s = 0.0 if self._stamp_ns is None else (sample.stamp_ns - self._stamp_ns) / NS_PER_S
+        self._way += _STANDING_M_S * dt_s
+        self._stamp_ns = sample.stamp_ns
+        last = self._last
+        if isinstance(last, Velocity):
+            self._way += (abs(last.v_m_s) + _TURN_M * abs(last.omega_rad_s)) * dt_s
+        elif isinstance(last, SelfMotion) and isinstance(sample, SelfMotion):
+            step = between(last.pose_odom_robot, sample.pose_odom_robot)
+            self._way += float(np.hypot(step[0], step[1]) + _TURN_M * abs(step[2]))
+        self._last = sample if isinstance(sample, SelfMotion | Velocity) else last
+        return self._way
 
 
 @dataclass(frozen=True, slots=True)

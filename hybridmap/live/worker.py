@@ -22,7 +22,7 @@ from hybridmap import session
 from hybridmap.errors import HybridMapError
 from hybridmap.graph.io import graph_hash
 from hybridmap.live.inbox import SLOW, source_of
-from hybridmap.live.messages import Begin, Done, Dropped, End, Failed, Ready, Reset, Save, Saved, Snapshot
+from hybridmap.live.messages import Ask, Begin, Done, Dropped, End, Failed, Ready, Reset, Save, Saved, Snapshot
 from hybridmap.mapper import Mapper
 from hybridmap.store import MapStore
 from hybridmap.streams.base import Observation, Sample, StreamReport
@@ -32,6 +32,11 @@ log = logging.getLogger(__name__)
 
 SNAPSHOT_SHARE = 0.05
 """Largest share of the time that goes into snapshots while samples wait."""
+
+_IDLE_S = 0.02
+"""With nothing to do for so long, s, the mapper has time for a snapshot: where views are left out, it is idle for less."""
+_NEW_SHARE = 0.05
+"""Weight of the newest in the mean time for a sample of odometry."""
 
 
 class _RestartError(HybridMapError):
@@ -53,7 +58,8 @@ class PipedStream:
         self._mapper: Mapper | None = None
         self._store: MapStore | None = None
         self._unmapped: deque[int] = deque()  # stamps of views whose step is still to come
-        self._taken, self._busy_s = 0, 0.0  # since the robot was told last
+        self._consumed, self._told = 0, 0  # samples so far, and those that the robot knows of
+        self._mapped, self._busy_s, self._motion_s = 0, 0.0, 0.0  # views since it was told, time for them, time for a motion
         self._shown = 0  # nodes of the newest snapshot
         self._show_after_s = 0.0
 
@@ -80,6 +86,8 @@ class PipedStream:
                 self._send(Saved(message.number))
             elif isinstance(message, Dropped):
                 self._note(message)
+            elif isinstance(message, Ask):
+                self._say()
             else:
                 yield from self._timed(message)
 
@@ -88,10 +96,18 @@ class PipedStream:
         self.report.count(source_of(sample))
         began_s = time.monotonic()
         yield sample
-        self._busy_s += time.monotonic() - began_s
-        if isinstance(sample, Observation):
-            self._taken += 1
+        took_s = time.monotonic() - began_s
+        self._consumed += 1
+        is_view, before = isinstance(sample, Observation), self._mapped
+        if is_view:
             self._unmapped.append(sample.stamp_ns)
+        while self._unmapped and self._unmapped[0] <= self._parts[0].stamp_ns:
+            self._unmapped.popleft()
+            self._mapped += 1
+        if is_view or self._mapped > before:
+            self._busy_s += took_s
+        else:
+            self._motion_s += _NEW_SHARE * (took_s - self._motion_s)
 
     def _save(self) -> None:
         """Write the maps of all back-ends, and everything else so far, so that readers find a whole session."""
@@ -107,6 +123,7 @@ class PipedStream:
         self._send(snapshot_of(mapper, ended=ended))
         self._shown = len(mapper.map)
         ended_s = time.monotonic()
+        self._busy_s += ended_s - began_s
         self._show_after_s = ended_s + (ended_s - began_s) / SNAPSHOT_SHARE
 
     def _send(self, message: object) -> None:
@@ -120,17 +137,17 @@ class PipedStream:
         return self._mapper, self._store
 
     def _tell(self) -> None:
-        """Tell the robot how far the mapper is, if that has changed."""
+        """Tell the robot how far the mapper is with views, and show it the map, where that has changed."""
         mapper = self._parts[0]
-        mapped = 0
-        while self._unmapped and self._unmapped[0] <= mapper.stamp_ns:
-            self._unmapped.popleft()
-            mapped += 1
-        if self._taken or mapped:
-            self._send(Done(self._taken, mapped, self._busy_s, mapper.pose_map_odom))
-            self._taken, self._busy_s = 0, 0.0 if mapped else self._busy_s
-        if len(mapper.map) > self._shown and (time.monotonic() >= self._show_after_s or not self._pipe.poll()):
+        if self._consumed > self._told and (self._unmapped or self._mapped):
+            self._say()
+        if len(mapper.map) > self._shown and (time.monotonic() >= self._show_after_s or not self._pipe.poll(_IDLE_S)):
             self.show()
+
+    def _say(self) -> None:
+        """Tell the robot how far the mapper is."""
+        self._send(Done(self._consumed, self._mapped, self._busy_s, self._motion_s, self._parts[0].pose_map_odom))
+        self._told, self._mapped, self._busy_s = self._consumed, 0, 0.0 if self._mapped else self._busy_s
 
     def _note(self, dropped: Dropped) -> None:
         """Count what the robot's process has left out, for the figures and the verdict."""

@@ -150,6 +150,7 @@ def diagnostics(stamp_ns: int, name: str, report: LiveReport | None, sentences: 
     figures: dict[str, Any] = {"state": state}
     if report is not None:
         figures |= {"nodes": report.nodes, "lag, s": f"{report.lag_s:.3f}", "largest lag, s": f"{report.largest_lag_s:.3f}"}
+        figures |= {"waiting for odometry, s": f"{report.waiting_s:.3f}"}
         figures |= {f"samples of {source}": count for source, count in report.samples.items()}
         left_out = ((source, why, count) for source, reasons in report.dropped.items() for why, count in reasons.items())
         figures |= {f"left out of {source}: {why}": count for source, why, count in left_out}

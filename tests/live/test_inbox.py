@@ -1,5 +1,6 @@
 """Order, lateness and overload, with a clock that the test sets."""
 
+import itertools
 import math
 
 import numpy as np
@@ -30,18 +31,20 @@ def every(make, period_s, end_s, start_s=0.0, delay_s=0.0):
 
 
 class SlowMapper:
-    """Maps each view in a given time; everything is simulated."""
+    """Maps each view in a given time, or in the times of a list again and again; everything is simulated."""
 
     def __init__(self, inbox, view_s):
-        self.inbox, self.view_s = inbox, view_s
+        self.inbox, self.times_s = inbox, itertools.cycle(np.atleast_1d(view_s).tolist())
         self.pipe, self.got, self.lags = [], [], []
-        self.now_s, self.free_s = 0.0, None
+        self.now_s, self.free_s, self.busy_s, self.consumed = 0.0, None, 0.0, 0
 
     def run_until(self, now_s):
         """Let time pass up to `now_s`."""
         while self.free_s is not None and self.free_s <= now_s:
             self.now_s, self.free_s = max(self.free_s, self.now_s), None
-            self.inbox.done(0, 1, self.view_s, self.now_s)
+            self.consumed += 1
+            self.lags.append(self.inbox.lag_s(self.now_s))
+            self.inbox.done(self.consumed, 1, self.busy_s, 0.0, self.now_s)
             self.work()
         self.now_s = now_s
 
@@ -51,9 +54,11 @@ class SlowMapper:
         while self.pipe and self.free_s is None:
             self.got.append(self.pipe.pop(0))
             if isinstance(self.got[-1], Observation):
-                self.free_s = self.now_s + self.view_s
-                self.inbox.done(1, 0, 0.0, self.now_s)
+                self.busy_s = next(self.times_s)
+                self.free_s = self.now_s + self.busy_s
                 self.pipe += self.inbox.take(self.now_s)
+            else:
+                self.consumed += 1
 
     def feed(self, arrivals):
         for now_s, sample in sorted(arrivals, key=lambda row: row[0]):
@@ -156,6 +161,36 @@ def test_a_machine_that_is_too_slow_keeps_up_by_leaving_out_views(lag_s, period_
     assert any(f"scans: {dropped} of 600 left out" in one for one in sentences(inbox, 60.0))
 
 
+def test_single_steps_that_take_long_are_allowed_for():
+    """Every seventh step takes half the limit: what it holds up is left out in time, once its length is known."""
+    arrivals = every(motion, 0.02, 120.0) + every(scan, 0.1, 120.0, delay_s=0.03)
+    inbox, mapper, got = mapped(arrivals, limits=LiveLimits(), view_s=[0.25] * 6 + [1.2])
+    assert inbox.largest_lag_s == max(mapper.lags) <= 2.0
+    assert sum(isinstance(sample, LaserScan) for sample in got) == 1200 - inbox.left_out["scans", SLOW]
+    assert sum(isinstance(sample, LaserScan) for sample in mapper.got) > 280  # 7 views need 2.7 s: it is never idle for long
+
+
+def test_a_view_that_waits_for_odometry_is_said_and_is_no_lag():
+    """The mapper takes it in, and has it on the map only after the odometry that follows."""
+    inbox = Inbox(["scans"], LiveLimits(), 0.0)
+    for now_s, sample in ((0.0, motion(0.0)), (0.1, scan(0.1)), (0.6, motion(0.1))):
+        inbox.add(sample, now_s)
+    assert inbox.waiting_s(0.6) == 0.0
+    assert len(inbox.take(0.7)) == 3
+    assert inbox.lag_s(0.9) == pytest.approx(0.3)
+    inbox.done(3, 0, 0.0, 0.0, 1.0)
+    assert inbox.lag_s(5.0) == 0.0
+    assert inbox.waiting_s(5.0) == pytest.approx(4.9)
+    for now_s, sample in ((5.0, motion(0.12)), (5.1, scan(0.2))):
+        inbox.add(sample, now_s)
+    inbox.take(5.2)
+    assert inbox.lag_s(5.5) == pytest.approx(0.4)  # since odometry that came at 5.0 s had its turn, with the scan of 5.1 s
+    assert inbox.waiting_s(5.5) == pytest.approx(0.4)
+    inbox.done(4, 1, 0.3, 0.0, 5.6)
+    assert inbox.lag_s(6.0) == 0.0
+    assert inbox.waiting_s(6.0) == pytest.approx(0.9)
+
+
 def test_a_machine_that_is_fast_enough_leaves_nothing_out():
     arrivals = every(motion, 0.02, 60.0) + every(scan, 0.1, 60.0, delay_s=0.03)
     inbox, _, got = mapped(arrivals, limits=LiveLimits(), view_s=0.08)
@@ -174,7 +209,7 @@ def test_what_is_mapped_after_the_drive_is_no_lag():
     inbox, mapper, _ = mapped(every(motion, 0.02, 3.0) + every(scan, 0.1, 3.0), view_s=0.2)
     assert inbox.largest_lag_s > 1.0
     assert inbox.lag_s(100.0) == 0.0
-    inbox.done(1, 1, 0.2, 100.0)
+    inbox.done(1, 1, 0.2, 0.0, 100.0)
     assert inbox.largest_lag_s <= mapper.now_s
 
 

@@ -76,12 +76,13 @@ def test_the_grid_is_row_by_row_from_its_lower_left_corner() -> None:
 
 
 def test_diagnostics_say_what_is_wrong_and_how_much_was_left_out() -> None:
-    report = LiveReport("mapping", {"odometry": 90, "scans": 40}, {"scans": {"too slow": 3}}, 0.25, 1.5, 7)
+    report = LiveReport("mapping", {"odometry": 90, "scans": 40}, {"scans": {"too slow": 3}}, 0.25, 1.5, 0.125, 7)
     (status,) = contents.diagnostics(NS, "hybridmap", report, ["scans: late"])["status"]
     assert (status["level"], status["message"]) == (1, "scans: late")
     values = {value["key"]: value["value"] for value in status["values"]}
     assert values["left out of scans: too slow"] == "3"
     assert values["samples of odometry"] == "90"
+    assert (values["lag, s"], values["largest lag, s"], values["waiting for odometry, s"]) == ("0.250", "1.500", "0.125")
     (well,) = contents.diagnostics(NS, "hybridmap", report, [])["status"]
     assert well["level"] == 0
     (waiting,) = contents.diagnostics(NS, "hybridmap", None, ["no odometry"])["status"]

@@ -124,7 +124,7 @@ def test_the_node_follows_its_lifecycle_and_is_silent_while_inactive(drive) -> N
     assert drive["heard"]["heard_while_inactive"] == 0
 
 
-REPORT = LiveReport("mapping", {"odometry": 90}, {"scans": {"too slow": 3}}, 0.25, 1.5, 7)
+REPORT = LiveReport("mapping", {"odometry": 90}, {"scans": {"too slow": 3}}, 0.25, 1.5, 0.0, 7)
 
 
 @pytest.mark.parametrize(
