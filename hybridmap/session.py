@@ -94,7 +94,7 @@ def run(
     mapper = Mapper(config, stream.rig) if before is None else before.drive.mapper
     with folder.writing(overwrite=overwrite or (resume and before is None), resume=before is not None) as unfinished:
         store = _begun(folder, stream, config) if before is None else MapStore.resume(folder.path)
-        with store, _kept(folder, store, mapper, unfinished):
+        with store, _kept(folder, store, mapper, unfinished, repeatable=repeatable):
             drive = Drive(mapper, Recorder(mapper, store)) if before is None else before.drive
             if before is not None:
                 drive.rewind(store)
@@ -119,8 +119,10 @@ def _begun(folder: SessionFolder, stream: Stream, config: Config) -> MapStore:
 
 
 @contextmanager
-def _kept(folder: SessionFolder, store: MapStore, mapper: Mapper, unfinished: Unfinished) -> Iterator[None]:
-    """Context in which an error marks the map as broken off, if anything is on it."""
+def _kept(
+    folder: SessionFolder, store: MapStore, mapper: Mapper, unfinished: Unfinished, *, repeatable: bool
+) -> Iterator[None]:
+    """Context in which an error marks the map as broken off, if anything is on it; a repeatable stream can go on."""
     try:
         yield
     except BaseException as error:
@@ -130,7 +132,7 @@ def _kept(folder: SessionFolder, store: MapStore, mapper: Mapper, unfinished: Un
             unfinished.worth_keeping = store.nodes > 0
         with suppress(StoreError):
             store.close()
-        if unfinished.worth_keeping and not isinstance(error, KeyboardInterrupt):
+        if unfinished.worth_keeping and repeatable and not isinstance(error, KeyboardInterrupt):
             log.warning("%s: what was mapped is kept; %s", folder.path, folder.what_to_do)
         raise
 

@@ -40,8 +40,8 @@ _AHEAD = 1
 _MOST_WAITING = 90
 """Views that may wait for odometry: 3 s of a camera."""
 _WORK_SHARE = 0.5
-"""Share of the largest lag that the views which wait may need by their mean, or that one may be old when it is given. The rest is
-for those that need longer than any before."""
+"""Share of the largest lag that the views which wait may need by their mean, or that one may be old when it is given. The rest
+is for those that need longer than any before."""
 _RECENT = 10
 """Newest gaps of a source that its patience is learnt from, and offsets of its stamps."""
 

@@ -52,10 +52,9 @@ class Locator:
         Raises:
             StoreError: the map is missing, damaged or not finished, or of other sensors.
         """
-        with MapStore.open(base) as known:
-            Part.of(known)
-            with MapStore.open(out) as drive:
-                require_sensors(known, drive.rig, "the drive")
+        require_map(base)
+        with MapStore.open(base) as known, MapStore.open(out) as drive:
+            require_sensors(known, drive.rig, "the drive")
         self.base = base
         self.pose_base_map: Array | None = None
         self.error: HybridMapError | None = None
@@ -92,6 +91,16 @@ class Locator:
                 self.error, self._ended = None if self._ended else found, True
                 return
             self.pose_base_map = found
+
+
+def require_map(base: Path) -> None:
+    """Check that a robot can be looked for on the map of a session folder.
+
+    Raises:
+        StoreError: the map is missing, damaged or not finished.
+    """
+    with MapStore.open(base) as known:
+        Part.of(known)
 
 
 def locate(base: Path, out: Path, poses: Array) -> Array | HybridMapError | None:

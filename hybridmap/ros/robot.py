@@ -17,6 +17,7 @@ from hybridmap.errors import ExportError, HybridMapError, RosError, StreamError
 from hybridmap.geometry import Array, compose
 from hybridmap.graph.edges import EdgeKind
 from hybridmap.live import LiveLimits, LiveMapper, Snapshot
+from hybridmap.live.locating import require_map
 from hybridmap.live.process import MappingProcess
 from hybridmap.ros import contents
 from hybridmap.ros import middleware as ros
@@ -78,6 +79,11 @@ class NodeOptions:
     map_frame: str = "map"
     known_map: Path | None = None
     limits: LiveLimits = field(default_factory=LiveLimits)
+
+    def __post_init__(self) -> None:
+        """Refuse a finished map that is missing, damaged or not finished, by a StoreError."""
+        if self.known_map is not None:
+            require_map(self.known_map)
 
 
 class RobotNode:

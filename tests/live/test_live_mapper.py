@@ -211,6 +211,20 @@ def test_a_robot_whose_program_dies_keeps_its_map(tmp_path):
     assert SessionFolder(tmp_path / "s").read_metrics().head["graph_hash"] == recorded.head["graph_hash"]
 
 
+@pytest.mark.parametrize("repeatable", [True, False])
+def test_a_drive_that_cannot_be_had_again_is_not_said_to_be_resumable(repeatable, tmp_path, caplog):
+    class Broken(RoomDrive):
+        def __iter__(self):
+            yield from super().__iter__()
+            raise StreamError("torn")
+
+    with pytest.raises(StreamError, match="torn"):
+        session.run(Broken(laps=0.5), CONFIG, tmp_path / "s", repeatable=repeatable)
+    assert ("--resume" in caplog.text) == repeatable
+    with MapStore.open(tmp_path / "s") as store:
+        assert store.nodes > 3
+
+
 def test_what_cannot_be_set_up_is_said_at_once(tmp_path):
     with pytest.raises(StreamError, match="laser"):
         LiveMapper(CONFIG, Rig(), tmp_path / "s")

@@ -8,7 +8,7 @@ import pytest
 
 from hybridmap import session
 from hybridmap.config import Config
-from hybridmap.errors import OutputError, RosError, StreamError
+from hybridmap.errors import OutputError, RosError, StoreError, StreamError
 from hybridmap.geometry import compose
 from hybridmap.live import LiveLimits
 from hybridmap.ros.robot import NodeOptions, RobotNode
@@ -142,6 +142,11 @@ def test_a_node_without_a_sensor_says_what_it_waits_for_and_writes_nothing(bag: 
     with pytest.raises(StreamError, match=r"nothing was mapped: .*'/front'"):
         node.finish()
     assert not (tmp_path / "s").exists()
+
+
+def test_a_finished_map_that_is_not_there_is_refused_before_anything_is_started(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="mondey"):
+        NodeOptions(tmp_path / "s", known_map=tmp_path / "mondey")
 
 
 def test_a_folder_that_holds_something_ends_the_node_with_the_reason(bag: Path, tmp_path: Path) -> None:
