@@ -60,15 +60,18 @@ def fetch(folder: Path) -> Ros2:
     """Make the environment, unless it stands in the folder.
 
     Raises:
-        Ros2Error: the wheels cannot be had; says why.
+        Ros2Error: the wheels cannot be had, or the folder holds something else; says why.
     """
     ros, marker = Ros2(folder.resolve()), folder / "complete"
     if marker.is_file():
         return ros
-    venv.create(folder, with_pip=False, clear=folder.exists())
     packages = folder / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
-    beside = "".join(f"site.addsitedir({path!r}); " for path in site.getsitepackages())
-    (packages / "beside.pth").write_text(f"import site; {beside}\n")  # so that pip takes as installed what is there
+    beside = packages / "beside.pth"
+    if folder.exists() and any(folder.iterdir()) and not beside.is_file():
+        raise Ros2Error(f"{folder} holds something else: name a new folder")
+    venv.create(folder, with_pip=False)
+    paths = "".join(f"site.addsitedir({path!r}); " for path in site.getsitepackages())
+    beside.write_text(f"import site; {paths}\n")  # pip takes as installed what is there
     command = [
         sys.executable,
         "-m",

@@ -100,14 +100,15 @@ def _message_class(msgtype: str) -> Any:
     except (ImportError, AttributeError) as error:
         missing = error
     if msgtype in standard_store(is_ros1=False).fielddefs:
-        borrowed = _borrowed(package, name, msgtype)
+        borrowed = borrowed_class(msgtype)
         if borrowed is not None:
             return borrowed
     raise RosError(f"ROS 2 has no message type {msgtype} here ({missing}): install the package {package}")
 
 
-def _borrowed(package: str, name: str, msgtype: str) -> Any:
+def borrowed_class(msgtype: str) -> Any:
     """A class with the C code of a TransformStamped under another name; None unless the middleware is Fast DDS."""
+    package, _, name = msgtype.split("/")
     import rclpy
     from geometry_msgs.msg import TransformStamped
 

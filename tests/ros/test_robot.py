@@ -112,6 +112,25 @@ def test_the_robot_is_found_on_a_finished_map(bag: Path, tmp_path: Path) -> None
     assert again.head["graph_hash"] == finished.head["graph_hash"]
 
 
+def test_a_paused_node_leaves_views_out_and_takes_odometry_in(bag: Path, tmp_path: Path) -> None:
+    robot = PlayedRobot(bag)
+    node = RobotNode(robot, NodeOptions(tmp_path / "live", limits=NO_LIMIT))
+    node.start()
+    robot.wait_for(lambda: "/tf_static" in robot.takers)
+    node.pause()
+    robot.play(20.0, until_s=4.0)
+    robot.wait_for(lambda: bool(robot.published["~pose"]))
+    robot.play(40.0, from_s=4.0, until_s=8.0)
+    node.pause(False)
+    robot.play(40.0, from_s=8.0, until_s=12.0)
+    stream = node.finish().head["stream"]
+    assert stream["scans left out (paused)"] > 5
+    assert stream["scans"] > 5
+    whole = [sample for sample in BagStream(bag, Config()) if isinstance(sample, SelfMotion)]
+    until_ns = whole[0].stamp_ns + 12 * NS
+    assert stream["odometry"] == sum(sample.stamp_ns <= until_ns for sample in whole)
+
+
 def check_published(robot: PlayedRobot, bag: Path) -> None:
     """The correction on /tf, composed with the odometry, is the pose on the map."""
     (last,) = robot.published["/tf"][-1]["transforms"]

@@ -124,6 +124,20 @@ def test_the_node_follows_its_lifecycle_and_is_silent_while_inactive(drive) -> N
     assert drive["heard"]["heard_while_inactive"] == 0
 
 
+@pytest.mark.slow
+def test_a_borrowed_type_is_understood_by_those_who_have_the_real_one(ros) -> None:
+    script = Path(__file__).with_name("borrowed_in_ros2.py")
+    environment = ros.environment() | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [str(ros.python), str(script)], env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    came = json.loads(done.stdout.splitlines()[-1])
+    assert (came["x"], came["bytes"]) == ([3.0], [came["sent"]])
+    assert len(came["hashes"]) == 2
+    assert came["hashes"][0] == came["hashes"][1]
+
+
 REPORT = LiveReport("mapping", {"odometry": 90}, {"scans": {"too slow": 3}}, 0.25, 1.5, 0.0, 7)
 
 
@@ -176,6 +190,21 @@ def test_a_profile_that_the_user_has_named_stays(monkeypatch: pytest.MonkeyPatch
     assert str(made) in (os.environ["FASTDDS_DEFAULT_PROFILES_FILE"], os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"])
     assert fastdds.provide_buffers() is None
     made.unlink()
+
+
+def test_where_there_are_no_wheels_the_tool_says_so_and_leaves_other_folders_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", "")
+    for _ in range(2):  # what was begun may be tried again
+        with pytest.raises(Ros2Error, match="ros-rclpy"):
+            fetch(tmp_path / "ros2")
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "letters.txt").write_text("dear")
+    with pytest.raises(Ros2Error, match="holds something else"):
+        fetch(tmp_path / "home")
+    assert [path.name for path in (tmp_path / "home").iterdir()] == ["letters.txt"]
 
 
 def test_without_ros_the_error_says_how_to_get_it(tmp_path: Path) -> None:
