@@ -36,7 +36,7 @@ AHEAD_S = 0.06
 """CPU time that they may take beside that, so that a run which dies early loses little, s."""
 SHARE_WAITED = 0.05
 """The same share of time by the clock: a slow disk may not hold up a drive."""
-_SOON = 5.0  # before the end of the drive, which is long and in one piece: least time in units of what a checkpoint takes
+_SOON = 5.0  # at the end of the drive, whose steps are long: least CPU time between two in units of what one takes
 _FIRST = 3  # samples whose stamps tell one recording from another
 
 
@@ -123,8 +123,8 @@ class Checkpoints:
         if (now - self._last)[0] >= LEAST_S and (self._spent + cost <= allowed).all():
             self._write(drive)
 
-    def before_the_end(self, drive: Drive) -> None:
-        """Write a checkpoint after the last sample, unless the last one is new."""
+    def at_the_end(self, drive: Drive) -> None:
+        """Write a checkpoint after the last sample, or a step of the end, unless the last one is new."""
         since_s, cost_s = (_now() - self._last)[0], np.min(self._costs, axis=0)[0]
         if since_s >= max(LEAST_S, _SOON * cost_s):
             self._write(drive)

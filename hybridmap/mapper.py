@@ -77,6 +77,7 @@ class Mapper:
         self.calibration = OdometryWatch(config, self.integrator, self._synchroniser)
         self._novelty = Novelty(config.nodes)
         self._position = Position(config.edges, self.backends.primary)
+        self._steps_ended = 0
 
     def add_odometry(self, stamp_s: float, pose_odom_robot: ArrayLike) -> Update | None:
         """Take in a pose (3,) of `base_link` in `odom`, m and rad.
@@ -142,15 +143,15 @@ class Mapper:
 
         Call it once, after the last sample. The last of the returned updates says `end of the drive`, unless no node was made.
         """
-        updates = [self.step(ready) for ready in self._synchroniser.flush()]
-        self._position.pose_odom = self.cells.pose_odom_robot
-        if len(self.map):
-            updates += self._retime() + self._conclude()
-            self._correct(final=True)
-            updates += self._look_again()
-            self._measure_between_nodes()
-            updates.append(self._position.update("end of the drive"))
-        return updates
+        return [update for updates in self.ending() for update in updates]
+
+    def ending(self) -> Iterator[list[Update]]:
+        """What `finish` does, in steps; gives the updates of each. If it is left between two steps, another call goes on."""
+        steps = (self._flush, self._retime, self._conclude, self._solve_finally, self._look_again, self._measure_between_nodes)
+        for step in steps[self._steps_ended :]:
+            updates = step() if len(self.map) or not self._steps_ended else []
+            self._steps_ended += 1
+            yield updates
 
     @property
     def left_out(self) -> dict[str, int]:
@@ -228,17 +229,30 @@ class Mapper:
             accepted = any(proposal.status is Status.ACCEPTED for proposal in proposals)
         return updates
 
-    def _look_again(self) -> Iterator[Update]:
+    def _flush(self) -> list[Update]:
+        """Do the steps that still waited for later samples."""
+        updates = [self.step(ready) for ready in self._synchroniser.flush()]
+        self._position.pose_odom = self.cells.pose_odom_robot
+        return updates
+
+    def _solve_finally(self) -> list[Update]:
+        self._correct(final=True)
+        return []
+
+    def _look_again(self) -> list[Update]:
         """Part the map where the robot was carried unnoticed, and let vision measure again the loops without weight."""
+        updates = []
         for done, edges in self.second_look.take(self.belief, self.clock):
             self._correct(final=True)
-            yield self._position.update(done, None, edges)
+            updates.append(self._position.update(done, None, edges))
+        return updates
 
-    def _measure_between_nodes(self) -> None:
+    def _measure_between_nodes(self) -> list[Update]:
         """Register the frames between nodes to the final map: the dense trajectory."""
         if isinstance(self.vision, DenseFrontEnd):
             with self.clock.stage("retrace"):
                 self.anchors = self.vision.dense_trajectory(replace(self.belief(), poses_map_node=self.poses()))
+        return [self._position.update("end of the drive")]
 
     def _retime(self) -> list[Update]:
         """Measure the odometry of the whole drive again if its clock was off against the views, or its gain by them.

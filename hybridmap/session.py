@@ -179,9 +179,11 @@ def _drive(stream: Stream, drive: Drive, checkpoints: Checkpoints, progress: Pro
     for name, (gone, stated) in stream.report.lost.items():
         of = counted(stated, "message")
         log.warning("%s: %s: %d of %s damaged or missing, left out", stream.name, name, gone, of)
-    checkpoints.before_the_end(drive)
-    for update in mapper.finish():
-        recorder.record(update)
+    checkpoints.at_the_end(drive)
+    for updates in mapper.ending():
+        for update in updates:
+            recorder.record(update)
+        checkpoints.at_the_end(drive)
     recorder.rewrite_odometry()
     if not len(mapper.map):
         counts = ", ".join(f"{count} {name}" for name, count in stream.report.counts.items()) or "no sample"

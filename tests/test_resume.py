@@ -18,7 +18,8 @@ from typer.testing import CliRunner
 from hybridmap import checkpoints, provenance, session
 from hybridmap.cli.app import app
 from hybridmap.config import Config
-from hybridmap.errors import ConfigError, OutputError, StoreError, StreamError
+from hybridmap.errors import BackendError, ConfigError, OutputError, StoreError, StreamError
+from hybridmap.mapper import Mapper
 from hybridmap.store import SessionFolder, checkpoint
 from hybridmap.store.checkpoint import UnusableError
 from hybridmap.streams import open_stream
@@ -87,6 +88,7 @@ def often(monkeypatch):
     """Checkpoints at every node."""
     monkeypatch.setattr(checkpoints, "LEAST_S", 0.0)
     monkeypatch.setattr(checkpoints, "AHEAD_S", 1e9)
+    monkeypatch.setattr(checkpoints, "_SOON", 0.0)
 
 
 def broken_off(out: Path, after: int = 300) -> None:
@@ -140,6 +142,27 @@ def test_a_run_that_fails_at_its_very_end_is_resumed_there(unbroken, tmp_path, m
     seen: list[int] = []
     session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "s", resume=True, progress=lambda done, _: seen.append(done))
     assert not seen or seen[0] > 100
+    assert contents(tmp_path / "s") == unbroken
+
+
+@pytest.mark.usefixtures("often")
+@pytest.mark.parametrize("number", range(6))
+def test_a_run_that_fails_between_two_steps_of_its_end_is_resumed_there(unbroken, tmp_path, monkeypatch, number):
+    steps = ["_flush", "_retime", "_conclude", "_solve_finally", "_look_again", "_measure_between_nodes"]
+
+    def failing(_: Mapper) -> None:
+        raise BackendError("out of memory")
+
+    def done_before(_: Mapper) -> None:
+        pytest.fail("a step is done again that was done before")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Mapper, steps[number], failing)
+        with pytest.raises(BackendError):
+            session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "s")
+    for step in ["step", *steps[:number]][: 2 * number]:
+        monkeypatch.setattr(Mapper, step, done_before)
+    session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "s", resume=True)
     assert contents(tmp_path / "s") == unbroken
 
 

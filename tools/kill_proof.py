@@ -213,7 +213,7 @@ class Proof:
 
             def work(target: Path = target, wanted: bool = wanted) -> None:
                 if not wanted:
-                    checkpoints.Checkpoints.follow = checkpoints.Checkpoints.before_the_end = _nothing  # type: ignore[method-assign, assignment]
+                    checkpoints.Checkpoints.follow = checkpoints.Checkpoints.at_the_end = _nothing  # type: ignore[method-assign, assignment]
                 self._case.run(target)
 
             ended = wait(self._case.start(target, work), target)

@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import numpy as np
 from hybridmap import session
 from hybridmap.cli.choose import choose
 from hybridmap.errors import HybridMapError, StoreError
+from hybridmap.mapper import Mapper
 from hybridmap.store import MapStore
 
 PAUSE_S = 0.005
@@ -60,19 +61,18 @@ class Followed:
         return float(self._values[2])
 
 
-@dataclass(frozen=True, slots=True)
 class Case:
-    """What is mapped."""
+    """What is mapped. The source is opened, and compiled code loaded, once for all processes that `start` begins."""
 
-    source: str
-    config: str | None
-    end_s: float | None
-    followed: Followed = field(default_factory=Followed)
+    def __init__(self, source: str, config: str | None, end_s: float | None) -> None:
+        """Open the source."""
+        self.source, self.followed = source, Followed()
+        self._chosen = choose(source, config, {}, end_s=end_s)
+        Mapper(self._chosen.config, self._chosen.stream.rig)
 
     def run(self, out: Path, *, resume: bool = False) -> None:
         """Map it into a session folder."""
-        chosen = choose(self.source, self.config, {}, end_s=self.end_s)
-        session.run(chosen.stream, chosen.config, out, resume=resume, progress=self.followed.progress)
+        session.run(self._chosen.stream, self._chosen.config, out, resume=resume, progress=self.followed.progress)
 
     def start(self, out: Path, work: Callable[[], None]) -> int:
         """Begin a run in a process of its own; returns its number."""

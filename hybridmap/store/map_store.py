@@ -278,7 +278,7 @@ class MapStore(Tables):
     @_reading
     def map(self) -> ExperienceMap:
         """A new experience map with the nodes and edges of the file, in the order in which they were made."""
-        experiences, version = ExperienceMap(), int(self.one("PRAGMA user_version", ()))
+        experiences = ExperienceMap()
         codes, frames = self.arrays_of_nodes(_CODE, "place"), {one.first_node: one.pose_map_session for one in self.sessions()}
         for number, row in enumerate(self.rows("SELECT * FROM nodes ORDER BY number")):
             node = Node(int(row[1]), _pose(row[2:5]), codes[number], int(row[8]), float(row[9]))
@@ -289,7 +289,7 @@ class MapStore(Tables):
                 raise ValueError(f"node {number} is missing")
         for number, row in enumerate(self.rows("SELECT * FROM edges ORDER BY number")):
             relative = None if row[9] is None else RelativePose(_pose(row[6:9]), schema.covariance_from_bytes(row[9]))
-            kind, status, record = EdgeKind[row[3].upper()], Status(row[4]), records.record_from_json(row[10], row[5], version)
+            kind, status, record = EdgeKind[row[3].upper()], Status(row[4]), records.record_from_json(row[10])
             edge = Edge(int(row[1]), int(row[2]), kind, status, relative, since_node=int(row[11]), **record)
             if experiences.add_edge(edge) != row[0]:
                 raise ValueError(f"edge {number} is missing")

@@ -12,7 +12,6 @@ from pydantic import TypeAdapter
 
 from hybridmap.backends.base import SolveReport, SolveStatus
 from hybridmap.graph.edges import Check, Edge, Lack, Method, Need, Proposer, Search
-from hybridmap.store import schema
 from hybridmap.streams.base import Rig
 from hybridmap.streams.sensors import kinds
 
@@ -51,24 +50,16 @@ def record_to_json(edge: Edge) -> str:
         "carried_m": edge.kidnapped_m,
         "broken_by": [_row(check) for check in edge.broken_by],
         "contradicts_odometry": edge.contradicts_odometry,
+        "note": edge.note,
     }
     return json.dumps({name: value for name, value in fields.items() if value})
 
 
-def record_from_json(text: str, reason: str, version: int = schema.VERSION) -> dict[str, Any]:
-    """The fields of an edge that `record_to_json` wrote, by name.
-
-    Args:
-        text: the JSON object.
-        reason: the reason in words. A file of a version before 3 has only this and measured values.
-        version: of the file.
-    """
+def record_from_json(text: str) -> dict[str, Any]:
+    """The fields of an edge that `record_to_json` wrote, by name."""
     fields: dict[str, Any] = json.loads(text)
     carried_m = fields.pop("carried_m", None)
     fields["kidnapped_m"] = None if carried_m is None else float(carried_m)
-    if version < 3:
-        kidnapped_m = fields.pop("kidnapped_m")
-        return {"figures": _figures(fields), "kidnapped_m": kidnapped_m, "note": str(reason)}
     for name in ("checks", "broken_by"):
         fields[name] = tuple(_check(*row) for row in fields.get(name, ()))
     for name, kind in _OF_EDGES.items():
@@ -93,6 +84,7 @@ _OF_EDGES: dict[str, Callable[[Any], Any]] = {
     "figures": _figures,
     "shift": int,
     "contradicts_odometry": bool,
+    "note": str,
 }
 """Field of an edge's record -> its value from that in the file."""
 

@@ -15,16 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.errors import StoreError
+from hybridmap.store import migrations
 from hybridmap.streams.cameras import decode_picture
 from hybridmap.trajectory import FARTHEST_M
 
-VERSION = 4
-"""Raised whenever the tables change."""
-
-READABLE = (1, 2, 3, 4)
-"""Versions that can be read; a file of another one is refused. Version 1 has no anchors; before version 3 an edge had figures
-and a reason in words, but no record of its checks; before version 4 a map was one session, and what makes it possible to take
-it up again was not kept."""
+VERSION = migrations.NEWEST
+"""Raised whenever the tables change, with a step in `migrations.STEPS` that leads there."""
 
 WHOLE = -1
 """Session number of what is said of the map as a whole: its solutions, and its facts (`info`). Under the number of a session
@@ -110,8 +106,8 @@ def open_read_only(path: Path) -> sqlite3.Connection:
     Raises:
         StoreError: the file is missing, is not a map, or is of another version.
     """
-    connection = _opened(path, "ro", READABLE)
-    _see_as_newest(connection)
+    connection, version = _opened(path, "ro", (*migrations.STEPS, VERSION))
+    migrations.see_as_newest(connection, version)
     return connection
 
 
@@ -121,7 +117,7 @@ def open_to_write(path: Path) -> sqlite3.Connection:
     Raises:
         StoreError: the file is missing, is not a map, is damaged, or is of another version.
     """
-    connection = _opened(path, "rw", (VERSION,))
+    connection, _ = _opened(path, "rw", (VERSION,))
     try:
         check(connection, path)
         _set_up(connection)
@@ -145,8 +141,8 @@ def check(connection: sqlite3.Connection, path: Path) -> None:
         raise StoreError(f"{path}: damaged: {' '.join(found.split())}; map the source again")
 
 
-def _opened(path: Path, mode: str, versions: tuple[int, ...]) -> sqlite3.Connection:
-    """Open a map file of one of these versions in a mode of SQLite."""
+def _opened(path: Path, mode: str, versions: tuple[int, ...]) -> tuple[sqlite3.Connection, int]:
+    """Open a map file of one of these versions in a mode of SQLite; returns its version, too."""
     if not path.is_file():
         raise StoreError(f"{path}: no such map file; expected a session folder, as `hybridmap map SOURCE --out DIR` writes it")
     try:
@@ -162,36 +158,13 @@ def _opened(path: Path, mode: str, versions: tuple[int, ...]) -> sqlite3.Connect
         connection.close()
         newer = "a newer hybridmap wrote it: use that one" if version > VERSION else "map the source again with this hybridmap"
         raise StoreError(f"{path}: map of version {version}, expected {VERSION}; {newer}")
-    return connection
+    return connection, version
 
 
 def _set_up(connection: sqlite3.Connection) -> None:
     """Set how a map is written: see `create`."""
     connection.execute("PRAGMA journal_mode = WAL")
     connection.execute("PRAGMA synchronous = NORMAL")
-
-
-def _see_as_newest(connection: sqlite3.Connection) -> None:
-    """Let queries find the tables of a map of an earlier version as this version has them; the file is not changed."""
-    tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-    if "sessions" not in tables:
-        connection.executescript(_AS_SESSIONS)
-    if "anchors" not in tables:
-        connection.execute("CREATE TEMP VIEW anchors AS SELECT * FROM track WHERE 0")
-    elif "sessions" not in tables:
-        connection.execute("CREATE TEMP VIEW anchors AS SELECT 0 AS session, * FROM main.anchors")
-
-
-_AS_SESSIONS = f"""
-CREATE TEMP VIEW info AS SELECT {WHOLE} AS session, * FROM main.info;
-CREATE TEMP VIEW sessions AS SELECT 0 AS number, 0 AS first_node,
-    json_extract(value, '$') AS name, json_extract(value, '$') AS source,
-    0.0 AS x_m, 0.0 AS y_m, 0.0 AS yaw_rad FROM main.info WHERE key = 'source';
-CREATE TEMP VIEW track AS SELECT 0 AS session, * FROM main.track;
-CREATE TEMP VIEW online AS SELECT 0 AS session, * FROM main.online;
-CREATE TEMP VIEW solutions AS SELECT {WHOLE} AS session, * FROM main.solutions;
-"""
-"""A map of before version 4, which was one session, as the tables have it now."""
 
 
 def finish(connection: sqlite3.Connection) -> None:

@@ -236,56 +236,6 @@ def test_anchors_come_back_exactly_and_a_later_set_replaces_the_earlier(tmp_path
         np.testing.assert_array_equal(getattr(back, name), getattr(anchors, name))
 
 
-def test_a_map_of_the_version_before_has_no_anchors(tmp_path):
-    MapStore.create(tmp_path, "{}", Rig(), "x").close()
-    with sqlite3.connect(tmp_path / "map.db") as connection:
-        connection.execute("DROP TABLE anchors")
-        connection.execute("PRAGMA user_version = 1")
-    connection.close()
-    with MapStore.open(tmp_path) as store:
-        assert len(store.track().anchors) == 0
-
-
-def test_a_map_of_before_there_were_sessions_is_one_session(tmp_path):
-    """Its tables have no column of sessions; everything reads as it did, and the file is not changed."""
-    folder = tmp_path / "s"
-    write_session(folder, ring_map())
-    with MapStore.open(folder) as store:
-        new = store.map(), store.track().odometry, store.solutions(), store.info("graph_hash"), store.source
-    with sqlite3.connect(folder / "map.db") as connection:
-        for table in ("info", "track", "anchors", "online", "solutions"):
-            columns = [row[1] for row in connection.execute(f"PRAGMA table_info({table})") if row[1] != "session"]
-            connection.execute(f"CREATE TABLE before AS SELECT {', '.join(columns)} FROM {table}")
-            connection.execute(f"DROP TABLE {table}")
-            connection.execute(f"ALTER TABLE before RENAME TO {table}")
-        connection.execute("DROP TABLE sessions")
-        connection.execute("PRAGMA user_version = 3")
-    connection.close()
-    bytes_before = (folder / "map.db").read_bytes()
-    with MapStore.open(folder) as store:
-        assert [(one.number, one.first_node, one.source) for one in store.sessions()] == [(0, 0, new[4])]
-        assert graph_hash(store.map()) == graph_hash(new[0])
-        np.testing.assert_array_equal(store.track().odometry.poses, new[1].poses)
-        assert store.solutions().keys() == new[2].keys()
-        assert store.info("graph_hash") == new[3]
-        assert store.state(0) == {}
-    assert (folder / "map.db").read_bytes() == bytes_before
-
-
-def test_a_map_of_a_version_before_keeps_the_reasons_that_it_stored(tmp_path):
-    write_session(tmp_path / "s", ring_map())
-    with sqlite3.connect(tmp_path / "s" / "map.db") as connection:
-        connection.execute("ALTER TABLE edges RENAME COLUMN record TO scores")
-        connection.execute("UPDATE edges SET reason = 'overlap 0.21 < 0.30', scores = '{\"overlap\": 0.21}'")
-        connection.execute("PRAGMA user_version = 2")
-    connection.close()
-    with MapStore.open(tmp_path / "s") as store:
-        edge = store.map().edges[-1]
-    assert edge.reason == "overlap 0.21 < 0.30"
-    assert edge.figures == {"overlap": 0.21}
-    assert edge.checks == ()
-
-
 @pytest.mark.parametrize(
     ("change", "read"),
     [
