@@ -36,7 +36,8 @@ AHEAD_S = 0.06
 """CPU time that they may take beside that, so that a run which dies early loses little, s."""
 SHARE_WAITED = 0.05
 """The same share of time by the clock: a slow disk may not hold up a drive."""
-_SOON = 5.0  # at the end of the drive, whose steps are long: least CPU time between two in units of what one takes
+SOON = 5.0
+"""Least CPU time between two at the end of the drive, whose steps are long, in units of what one takes."""
 _FIRST = 3  # samples whose stamps tell one recording from another
 
 
@@ -126,7 +127,7 @@ class Checkpoints:
     def at_the_end(self, drive: Drive) -> None:
         """Write a checkpoint after the last sample, or a step of the end, unless the last one is new."""
         since_s, cost_s = (_now() - self._last)[0], np.min(self._costs, axis=0)[0]
-        if since_s >= max(LEAST_S, _SOON * cost_s):
+        if since_s >= max(LEAST_S, SOON * cost_s):
             self._write(drive)
 
     def remove(self) -> None:

@@ -88,7 +88,7 @@ def often(monkeypatch):
     """Checkpoints at every node."""
     monkeypatch.setattr(checkpoints, "LEAST_S", 0.0)
     monkeypatch.setattr(checkpoints, "AHEAD_S", 1e9)
-    monkeypatch.setattr(checkpoints, "_SOON", 0.0)
+    monkeypatch.setattr(checkpoints, "SOON", 0.0)
 
 
 def broken_off(out: Path, after: int = 300) -> None:
