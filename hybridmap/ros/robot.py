@@ -10,19 +10,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hybridmap.config.root import Config
-from hybridmap.errors import ExportError, HybridMapError, RosError, StreamError
+from hybridmap.errors import ExportError, HybridMapError, LiveError, RosError, StreamError
 from hybridmap.geometry import Array, compose
-from hybridmap.graph.edges import EdgeKind
-from hybridmap.live import LiveLimits, LiveMapper, Snapshot
+from hybridmap.live import LiveLimits, LiveMapper
 from hybridmap.live.locating import require_map
 from hybridmap.live.process import MappingProcess
 from hybridmap.ros import contents
 from hybridmap.ros import middleware as ros
 from hybridmap.ros.middleware import Middleware
 from hybridmap.ros.services import Services
+from hybridmap.ros.shown import PUBLISH_S, Shown
 from hybridmap.session import Session
 from hybridmap.streams.base import Rig, Sample, SelfMotion
 from hybridmap.streams.incoming import Incoming
@@ -37,10 +35,6 @@ _LOOK_S = 0.5
 the other."""
 _TELL_S = 5.0
 """How often the operator is told what is missing, s."""
-_PUBLISH_S = 1.0
-"""Shortest time between two messages of a topic that shows the whole map, s."""
-_SHARE = 0.05
-"""Largest share of the time that goes into making them."""
 _GRID_WAIT_S = 30.0
 KNOWN_MAP = "known_map"
 """Name of the frame of a finished map; the frame of the drive's own map is its child."""
@@ -111,8 +105,8 @@ class RobotNode:
         self._threads: list[threading.Thread] = []
         self._told_s = 0.0
         self._corrected_ns = 0  # stamp of the last `map -> odom`
-        self._map_shown = _Shown(options.map_every_s)
-        self._graph_shown = _Shown(_PUBLISH_S)
+        self._map_shown = Shown(options.map_every_s)
+        self._graph_shown = Shown(PUBLISH_S)
 
     def start(self) -> None:
         """Look for the robot's topics, and offer the services; returns at once."""
@@ -121,8 +115,9 @@ class RobotNode:
         self._ros.offer(services.table)
         pose_type = "geometry_msgs/msg/PoseWithCovarianceStamped"
         self._ros.subscribe(ros.INITIAL_POSE, pose_type, lambda *_: self._refuse_initial_pose())
-        for name, every_s, do in (("find", _LOOK_S, self._find), ("map", _LOOK_S, self._show), ("tf", None, self._correct)):
-            wait_s = every_s or 1.0 / self._options.rate_hz
+        repeated = {"find": self._find, "map": self._show, "status": self._diagnose, "tf": self._correct}
+        for name, do in repeated.items():
+            wait_s = 1.0 / self._options.rate_hz if name == "tf" else _LOOK_S
             thread = threading.Thread(target=self._repeat, args=(wait_s, do), name=f"hybridmap-{name}", daemon=True)
             thread.start()
             self._threads.append(thread)
@@ -310,10 +305,9 @@ class RobotNode:
             return None
 
     def _show(self) -> None:
-        """Publish the map where it has changed, and how the node is doing."""
-        mapper, stamp_ns = self._mapper, self._newest[0] if self._newest is not None else time.time_ns()
+        """Publish the map where it has changed. A grid of a large map takes seconds."""
+        mapper = self._mapper
         if mapper is None:
-            self._ros.publish(ros.DIAGNOSTICS, contents.diagnostics(stamp_ns, "hybridmap", None, self.missing))
             return
         snapshot = mapper.snapshot
         if self._graph_shown.is_due(snapshot):
@@ -323,20 +317,30 @@ class RobotNode:
         if self._map_shown.is_due(snapshot):
             with self._map_shown.of(snapshot):
                 self._show_map(mapper, snapshot.stamp_ns)
-        report, sentences = mapper.report, mapper.doctor()
-        if report.state == "failed":
-            self.ended.set()  # `finish` says why
-        if self._refused:
-            sentences.append(f"{self._refused} messages could not be used")
-        self._ros.publish(ros.DIAGNOSTICS, contents.diagnostics(stamp_ns, "hybridmap", report, sentences))
 
     def _show_map(self, mapper: LiveMapper, stamp_ns: int) -> None:
         try:
             grid = mapper.grid(self._options.resolution_m, timeout_s=_GRID_WAIT_S)
         except ExportError:
             return  # nothing to draw yet
+        except LiveError as error:
+            self._ros.warn(f"/map is not shown this time: {error}")
+            return
         self._ros.publish(ros.MAP, contents.occupancy(stamp_ns, self._options.map_frame, grid))
         self._ros.publish(ros.MAP_METADATA, contents.metadata(stamp_ns, grid))
+
+    def _diagnose(self) -> None:
+        """Publish how the node is doing."""
+        mapper, stamp_ns = self._mapper, self._newest[0] if self._newest is not None else time.time_ns()
+        if mapper is None:
+            self._ros.publish(ros.DIAGNOSTICS, contents.diagnostics(stamp_ns, "hybridmap", None, self.missing))
+            return
+        report, sentences = mapper.report, mapper.doctor()
+        if report.state == "failed":
+            self.ended.set()  # `finish` says why
+        if self._refused:
+            sentences.append(f"{self._refused} messages could not be used")
+        self._ros.publish(ros.DIAGNOSTICS, contents.diagnostics(stamp_ns, "hybridmap", report, sentences))
 
     # ------------------------------------------------------------------ threads
 
@@ -359,35 +363,3 @@ class RobotNode:
         if self._mapper is None:
             raise RosError(f"not mapping yet: {'; '.join(self.missing)}")
         return self._mapper
-
-
-class _Shown:
-    """When a topic that shows the whole map is due again: after changes, and so that it costs a small share of the time."""
-
-    def __init__(self, every_s: float) -> None:
-        self._every_s = every_s
-        self._nodes, self._loops = 0, 0
-        self._poses: np.ndarray | None = None
-        self._next_s = 0.0
-        self._began_s = 0.0
-
-    def is_due(self, snapshot: Snapshot) -> bool:
-        """Whether the map has changed and it is time; a new loop closure need not wait for the usual time."""
-        now_s = time.monotonic()
-        if snapshot.poses is self._poses or not len(snapshot.poses) or now_s < self._next_s:
-            return False
-        closed = int(np.count_nonzero(snapshot.kinds == EdgeKind.LOOP)) > self._loops
-        return closed or now_s - self._began_s >= self._every_s
-
-    def of(self, snapshot: Snapshot) -> _Shown:
-        """Note what is being shown; the context measures what it costs."""
-        self._poses = snapshot.poses
-        self._loops = int(np.count_nonzero(snapshot.kinds == EdgeKind.LOOP))
-        return self
-
-    def __enter__(self) -> None:
-        self._began_s = time.monotonic()
-
-    def __exit__(self, *_: object) -> None:
-        now_s = time.monotonic()
-        self._next_s = now_s + max(_PUBLISH_S, (now_s - self._began_s) / _SHARE)

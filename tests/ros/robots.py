@@ -41,7 +41,9 @@ class PlayedRobot:
         self.services = {service.name: service for service in services}
 
     def warn(self, text: str) -> None:
-        self.warnings.append(text)
+        with self.told:
+            self.warnings.append(text)
+            self.told.notify_all()
 
     def inform(self, text: str) -> None:
         """Say nothing."""

@@ -1,5 +1,6 @@
 """A node maps what a robot publishes into the map of a bag of it, and publishes and serves that."""
 
+import threading
 import time
 from pathlib import Path
 
@@ -8,9 +9,9 @@ import pytest
 
 from hybridmap import session
 from hybridmap.config import Config
-from hybridmap.errors import OutputError, RosError, StoreError, StreamError
+from hybridmap.errors import LiveError, OutputError, RosError, StoreError, StreamError
 from hybridmap.geometry import compose
-from hybridmap.live import LiveLimits
+from hybridmap.live import LiveLimits, LiveMapper
 from hybridmap.ros.robot import NodeOptions, RobotNode
 from hybridmap.streams.base import SelfMotion
 from hybridmap.streams.laser import LaserScan
@@ -129,6 +130,30 @@ def test_a_paused_node_leaves_views_out_and_takes_odometry_in(bag: Path, tmp_pat
     whole = [sample for sample in BagStream(bag, Config()) if isinstance(sample, SelfMotion)]
     until_ns = whole[0].stamp_ns + 12 * NS
     assert stream["odometry"] == sum(sample.stamp_ns <= until_ns for sample in whole)
+
+
+def test_a_grid_that_does_not_come_ends_no_drive_and_holds_up_no_diagnostics(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = threading.Event()
+
+    def grid(*_: object, **__: object) -> None:
+        asked.set()
+        time.sleep(2.0)
+        raise LiveError("no grid in this time")
+
+    monkeypatch.setattr(LiveMapper, "grid", grid)
+    robot = PlayedRobot(bag)
+    node = RobotNode(robot, NodeOptions(tmp_path / "live", limits=NO_LIMIT))
+    node.start()
+    robot.wait_for(lambda: "/tf_static" in robot.takers)
+    robot.play(40.0, until_s=8.0)
+    assert asked.wait(30.0)
+    before = len(robot.published["/diagnostics"])
+    robot.wait_for(lambda: len(robot.published["/diagnostics"]) >= before + 2, timeout_s=1.9)
+    robot.wait_for(lambda: bool(robot.warnings))
+    assert not node.ended.is_set()
+    assert node.finish().head["graph_hash"]
 
 
 def check_published(robot: PlayedRobot, bag: Path) -> None:
