@@ -5,8 +5,11 @@
 
 The source, a bag or the name of a simulated world, is cut to its first seconds and written as a ROS 1 bag. `hybridmap map` maps
 that bag. Then a `rosmaster` runs on a port of the loopback device, `hybridmap ros1` maps what `rosbag play` plays at
-the rate, and this program listens beside it. It exits with 1 if the graphs differ, odometry was lost, or poses are late at
-rate 1. ROS 1 comes from Debian's packages (`tools/ros1.py`), into the folder `--ros-folder`.
+the rate, and this program listens beside it: it calls every service, holds the transforms against the trajectory, reads
+`/map` back, and times poses (`live_checks.py`). It exits with 1 if the graphs differ, odometry was lost, a check fails, or
+poses are late at rate 1. With `--overload 3` mapping is made 3 times too slow: then lag, what is left out, and the error of the
+map against `--reference` are what must be right. ROS 1 comes from Debian's packages (`tools/ros1.py`), into the folder
+`--ros-folder`.
 
 With `--ros 2` the same bag is played to `hybridmap ros2` by `ros2_play.py`, with wheels of ROS 2 (`tools/ros2.py`).
 """
@@ -15,53 +18,31 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import signal
 import subprocess
 import sys
 import tempfile
-import threading
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import live_ros2
 import numpy as np
-from ros1 import Ros1, Ros1Error, fetch, master
+from live_checks import planar
+from live_ros1 import Drive, Heard, play
+from overload import ERROR_RATIO, LAG_S, error_m, slowness
+from ros1 import Ros1Error, fetch
 from ros2 import Ros2Error
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from hybridmap.config import Config
+from hybridmap.geometry import interpolate
 from hybridmap.streams.rosbag import BagStream
 from hybridmap.trajectory import NS_PER_S
 
 PROGRAM = (sys.executable, "-c", "from hybridmap.cli import main; main()")
 P99_S = 0.02
 """Bar at rate 1: 99 % of the poses come sooner after their odometry."""
-_CONNECT_S = 5
-"""How long `rosbag play` waits after it has advertised its topics, s: the node looks twice before it subscribes."""
-_AFTER_S = 3.0
-_END_S = 600.0
-
-
-@dataclass
-class Heard:
-    """What was heard beside the node.
-
-    Attributes:
-        came_s: stamp of an odometry message, ns -> when it came.
-        late_s: how long after its odometry each pose came.
-        status: last diagnostics of the node, by name.
-    """
-
-    came_s: dict[int, float] = field(default_factory=dict)
-    late_s: list[float] = field(default_factory=list)
-    status: dict[str, str] = field(default_factory=dict)
-    messages: int = 0
 
 
 def recording(source: str, seconds: float | None, settings: list[str], folder: Path) -> Path:
@@ -104,69 +85,6 @@ def _with(ros1: Any, ros2: Any, msgtype: str) -> Any:
     return ros1
 
 
-def listen(environment: dict[str, str], ros: Ros1, odometry_topic: str, heard: Heard) -> Any:
-    """Listen to odometry, poses and diagnostics, in threads of rospy."""
-    os.environ.update(environment)
-    sys.path.append(str(ros.python_path))
-    import rospy
-    from diagnostic_msgs.msg import DiagnosticArray
-
-    rospy.init_node("live_proof", disable_signals=True)
-    lock = threading.Lock()
-
-    def moved(message: Any) -> None:
-        _, s, ns = np.frombuffer(message._buff, "<u4", 3)
-        with lock:
-            heard.came_s[int(s) * NS_PER_S + int(ns)] = time.monotonic()
-            heard.messages += 1
-
-    def placed(message: Any) -> None:
-        now_s = time.monotonic()
-        _, s, ns = np.frombuffer(message._buff, "<u4", 3)
-        with lock:
-            came_s = heard.came_s.get(int(s) * NS_PER_S + int(ns))
-            if came_s is not None:
-                heard.late_s.append(now_s - came_s)
-
-    def diagnosed(message: Any) -> None:
-        heard.status = {value.key: value.value for value in message.status[0].values}
-
-    if odometry_topic not in ("/tf", "/tf_static"):
-        rospy.Subscriber(odometry_topic, rospy.AnyMsg, moved, tcp_nodelay=True)
-        rospy.Subscriber("/hybridmap/pose", rospy.AnyMsg, placed, tcp_nodelay=True)
-    rospy.Subscriber("/diagnostics", DiagnosticArray, diagnosed)
-    return rospy
-
-
-def play(bag: Path, ros: Ros1, rate: float, odometry: str, settings: list[str], heard: Heard, folder: Path) -> dict[str, Any]:
-    """Map what `rosbag play` plays; returns the head of the session."""
-    out = folder / "live"
-    with master(ros) as environment:
-        rospy = listen(environment, ros, odometry, heard)
-        more = [word for setting in settings for word in ("--set", setting)]
-        log = (folder / "node.log").open("w")
-        node = subprocess.Popen([*PROGRAM, "ros1", "--out", str(out), *more], env=environment, stdout=log, stderr=log)
-        _wait_for(lambda: "state" in heard.status or node.poll() is not None)
-        player = [str(ros.player), "--quiet", f"--rate={rate}", f"--delay={_CONNECT_S}", str(bag)]
-        subprocess.run(player, env=environment, check=True, stdout=subprocess.DEVNULL)
-        time.sleep(_AFTER_S)
-        node.send_signal(signal.SIGINT)
-        node.wait(_END_S)
-        rospy.signal_shutdown("done")
-    if node.returncode:
-        raise Ros1Error(f"hybridmap ros1 ended with exit code {node.returncode}: {(folder / 'node.log').read_text()[-500:]}")
-    head: dict[str, Any] = json.loads((out / "metrics.json").read_text())
-    return head
-
-
-def _wait_for(there: Callable[[], bool]) -> None:
-    until_s = time.monotonic() + _END_S
-    while not there():
-        if time.monotonic() > until_s:
-            raise Ros1Error(f"waited {_END_S:g} s in vain")
-        time.sleep(0.1)
-
-
 def _pairs(settings: list[str]) -> list[tuple[str, str]]:
     return [(key, value) for key, _, value in (one.partition("=") for one in settings if one.startswith("sensors."))]
 
@@ -180,27 +98,30 @@ def offline(bag: Path, settings: list[str], folder: Path) -> dict[str, Any]:
     return head
 
 
-def prove(
-    source: str, version: int, ros_folder: Path, rate: float, seconds: float | None, settings: list[str], keep: Path
-) -> dict[str, Any]:
+def prove(given: argparse.Namespace, keep: Path) -> dict[str, Any]:
     """Map a source both ways; returns the figures."""
-    bag = recording(source, seconds, settings, keep)
-    before, heard = offline(bag, settings, keep), Heard()
-    odometry = BagStream(bag, Config.load(None, dict(_pairs(settings)))).uses["odometry"]
-    if version == 2:
-        now, told = live_ros2.play(bag, ros_folder, rate, odometry, settings, keep)
+    bag = recording(given.source, given.seconds, given.settings, keep)
+    if given.odometry_hz is not None:
+        bag = with_odometry_at(bag, given.odometry_hz, given.settings, keep / "denser.bag")
+    before, heard = offline(bag, given.settings, keep), Heard()
+    odometry = BagStream(bag, Config.load(None, dict(_pairs(given.settings)))).uses["odometry"]
+    slow = slowness(keep / "offline", given.rate, given.overload)
+    folder = given.ros_folder or Path.home() / ".cache" / "hybridmap" / f"ros{given.ros}"
+    if given.ros == 2:
+        now, told = live_ros2.play(bag, folder, given.rate, odometry, given.settings, keep)
         heard.late_s, heard.status = told["late_s"], told["status"]
     else:
-        now = play(bag, fetch(ros_folder), rate, odometry, settings, heard, keep)
+        drive = Drive(bag, given.rate, odometry, given.settings, keep)
+        now = play(drive, fetch(folder), slow, heard, checks=not given.overload and not given.no_checks)
     late_ms = 1000.0 * np.array(heard.late_s or [np.nan])
     sent, taken = int(before["stream"]["odometry"]), int(now["stream"].get("odometry", 0))
     p99_ms = float(np.percentile(late_ms, 99))
     same = before["graph_hash"] == now["graph_hash"]
-    return {
-        "source": source,
-        "ros": version,
-        "rate": rate,
-        "seconds": seconds,
+    found = {
+        "source": given.source,
+        "ros": given.ros,
+        "rate": given.rate,
+        "seconds": given.seconds,
         "same_graph": same,
         "graph_hash_offline": before["graph_hash"],
         "graph_hash_live": now["graph_hash"],
@@ -213,8 +134,68 @@ def prove(
         "pose_after_odometry_p99_ms": p99_ms,
         "pose_after_odometry_max_ms": float(late_ms.max()),
         "last_diagnostics": heard.status,
-        "passed": bool(same and sent == taken and (rate > 1.0 or p99_ms <= 1000.0 * P99_S)),
+        **heard.checks,
     }
+    checked = all(value for name, value in heard.checks.items() if name.endswith("_passed"))
+    if given.overload:
+        found |= overloaded(now, heard, slow, given.reference, keep)
+        found["passed"] = bool(found["overload_passed"] and sent == taken)
+    else:
+        found["passed"] = bool(same and sent == taken and checked and (given.rate > 1.0 or p99_ms <= 1000.0 * P99_S))
+    return found
+
+
+def overloaded(now: dict[str, Any], heard: Heard, slow: float, reference: Path | None, keep: Path) -> dict[str, Any]:
+    """The figures of a machine that is too slow: its lag, what was left out, where that is said, and the error of its map."""
+    lag_s = max(*heard.lags_s, float(heard.status["largest lag, s"]))
+    told = {name: count for name, count in heard.status.items() if name.endswith("too slow")}
+    counted = {name: count for name, count in now["stream"].items() if "too slow" in name}
+    said = [reason for reason in now["reasons"] if reason["kind"] == "views dropped"]
+    found: dict[str, Any] = {"slower": slow, "largest_lag_s": lag_s, "told": told, "counted": counted, "verdict": said}
+    well = lag_s <= LAG_S and bool(told) == bool(counted) == bool(said)
+    if reference is not None:
+        found["error_live_m"], found["error_offline_m"] = (error_m(keep / name, reference) for name in ("live", "offline"))
+        well = well and found["error_live_m"] <= ERROR_RATIO * found["error_offline_m"]
+    return {**found, "overload_passed": well}
+
+
+def with_odometry_at(bag: Path, rate_hz: float, settings: list[str], out: Path) -> Path:
+    """The bag with odometry at another rate, interpolated between its messages."""
+    stream = BagStream(bag, Config.load(None, dict(_pairs(settings))))
+    topic = stream.uses["odometry"]
+    with AnyReader([bag]) as reader, Writer(out) as writer:
+        topics = {
+            one.id: writer.add_connection(one.topic, one.msgtype, typestore=reader.typestore) for one in reader.connections
+        }
+        kept = [(at_ns, one.id, data) for one, at_ns, data in reader.messages() if one.topic != topic]
+        (moving,) = (one for one in reader.connections if one.topic == topic)
+        moves = [reader.deserialize(data, moving.msgtype) for _, _, data in reader.messages([moving])]
+        stamps_ns = np.array([one.header.stamp.sec * NS_PER_S + one.header.stamp.nanosec for one in moves])
+        poses = np.array([planar(one.pose.pose.position, one.pose.pose.orientation) for one in moves])
+        dense_ns = np.arange(stamps_ns[0], stamps_ns[-1], round(NS_PER_S / rate_hz))
+        for stamp_ns in dense_ns.tolist():
+            after = max(int(np.searchsorted(stamps_ns, stamp_ns)), 1)
+            share = (stamp_ns - stamps_ns[after - 1]) / (stamps_ns[after] - stamps_ns[after - 1])
+            kept.append(
+                (
+                    stamp_ns,
+                    moving.id,
+                    _moved(reader.typestore, moves[0], moving.msgtype, stamp_ns, poses[after - 1 : after + 1], share),
+                )
+            )
+        for at_ns, connection, data in sorted(kept, key=lambda row: row[0]):
+            writer.write(topics[connection], at_ns, bytes(data))
+    return out
+
+
+def _moved(store: Any, like: Any, msgtype: str, stamp_ns: int, poses: Any, share: float) -> bytes:
+    x, y, yaw_rad = interpolate(poses[0], poses[1], share)
+    like.header.stamp.sec, like.header.stamp.nanosec = divmod(stamp_ns, NS_PER_S)
+    position, turned = like.pose.pose.position, like.pose.pose.orientation
+    position.x, position.y = float(x), float(y)
+    turned.x = turned.y = 0.0
+    turned.z, turned.w = float(np.sin(yaw_rad / 2)), float(np.cos(yaw_rad / 2))
+    return bytes(store.serialize_ros1(like, msgtype))
 
 
 def main() -> int:
@@ -225,6 +206,10 @@ def main() -> int:
     parser.add_argument("--rate", type=float, default=1.0)
     parser.add_argument("--seconds", type=float, default=None, help="of the recording")
     parser.add_argument("--set", action="append", default=[], dest="settings", metavar="KEY=VALUE")
+    parser.add_argument("--odometry-hz", type=float, default=None, help="odometry at this rate, interpolated")
+    parser.add_argument("--overload", type=float, default=0.0, metavar="N", help="make mapping N times too slow for the rate")
+    parser.add_argument("--reference", type=Path, default=None, help="true trajectory (TUM), for the errors under overload")
+    parser.add_argument("--no-checks", action="store_true", help="the graph and the times alone, no services and transforms")
     parser.add_argument("--ros-folder", type=Path, default=None, help="default: ~/.cache/hybridmap/ros1 or ros2")
     parser.add_argument("--keep", type=Path, default=None, help="folder for the bag and both sessions; default: none is kept")
     parser.add_argument("--json", action="store_true")
@@ -232,8 +217,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as scratch:
         keep = given.keep or Path(scratch)
         keep.mkdir(parents=True, exist_ok=True)
-        ros_folder = given.ros_folder or Path.home() / ".cache" / "hybridmap" / f"ros{given.ros}"
-        found = prove(given.source, given.ros, ros_folder, given.rate, given.seconds, given.settings, keep)
+        found = prove(given, keep)
     if given.json:
         print(json.dumps(found, indent=2))
     else:

@@ -39,9 +39,10 @@ _AHEAD = 1
 """Views that are given to the mapper while it is busy with one, so that it need not wait for the next."""
 _MOST_WAITING = 90
 """Views that may wait for odometry: 3 s of a camera."""
-_WORK_SHARE = 0.5
-"""Share of the largest lag that the views which wait may need by their mean, or that one may be old when it is given. The rest
-is for those that need longer than any before."""
+_WORK_SHARE = 0.7
+"""Share of the largest lag that the views which wait may need by their mean."""
+_LONGER, _MARGIN_SHARE = 1.5, 0.25
+"""The next step may take so many times as long as the longest of late, and at least this share of the largest lag."""
 _RECENT = 10
 """Newest gaps of a source that its patience is learnt from, and offsets of its stamps."""
 
@@ -246,15 +247,20 @@ class Inbox:
             ways = [self._given_way, *(one.way for one in views)]
             gaps = [after - earlier for earlier, after in zip(ways, ways[2:], strict=False)]
             self._leave_out(views.pop(gaps.index(min(gaps))), SLOW)
-        while len(views) > 1 and now_s - views[0].since_s + max(pace.longest_s, (1.0 - _WORK_SHARE) * limit_s) > limit_s:
+        while len(views) > 1 and now_s - views[0].since_s + self._longest_s > limit_s:
             self._leave_out(views.pop(0), SLOW)
+
+    @property
+    def _longest_s(self) -> float:
+        """How long the next step may take."""
+        return max(_LONGER * self._pace.longest_s, _MARGIN_SHARE * self._limits.lag_s)
 
     def _may_give(self, waiting: _Waiting, now_s: float) -> bool:
         """Whether the mapper may have it now: a view that would be late waits until the mapper has nothing to do."""
         pace = self._pace
         if not waiting.is_view or waiting.left_out or pace.count == pace.consumed:
             return True
-        in_time = now_s - waiting.since_s + pace.remaining_s + pace.longest_s <= self._limits.lag_s
+        in_time = now_s - waiting.since_s + pace.remaining_s + self._longest_s <= self._limits.lag_s
         return in_time and pace.views_ahead < _AHEAD
 
     def _turn(self, waiting: _Waiting) -> _Turn:

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 _RECENT_VIEWS, _MEMORY_VIEWS = 30, 300
 """Newest views whose mean tells how long the next ones will take, and whose longest tells how long one may."""
 
+_COLD_VIEWS = 2
+"""The first views take longer than any later ones, as code is loaded for them."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Given:
@@ -30,7 +33,7 @@ class Pace:
 
     def __init__(self) -> None:
         self.mean_s = self.longest_s = self.motion_s = 0.0
-        self.count = self.consumed = 0
+        self.count = self.consumed = self._mapped = 0
         self._pending: deque[_Given] = deque()  # not taken in yet, from the first view on that is not on the map
         self._unmapped: deque[_Given] = deque()  # views that are not on the map
         self._busy_s: deque[float] = deque(maxlen=_MEMORY_VIEWS)
@@ -59,7 +62,8 @@ class Pace:
         first = self._unmapped[0].number if self._unmapped else self.count + 1
         while self._pending and self._pending[0].number < max(consumed + 1, first):
             self._pending.popleft()
-        if mapped:
+        self._mapped += mapped
+        if mapped and self._mapped > _COLD_VIEWS:
             self._busy_s.extend([busy_s / mapped] * mapped)
             recent = list(self._busy_s)[-_RECENT_VIEWS:]
             self.mean_s, self.longest_s = sum(recent) / len(recent), max(self._busy_s)
