@@ -118,6 +118,7 @@ def figures_of(mapper: Mapper, largest_correction_m: float, duration_s: float) -
     count = {status: float(sum(edge.status is status for edge in loops)) for status in Status}
     rows = [
         figure("nodes", len(mapper.map)),
+        *([figure("nodes_reused", mapper.known_places.followed)] if mapper.known_places.followed else []),
         figure("loops_accepted", count[Status.ACCEPTED]),
         figure("loops_pending", count[Status.PENDING]),
         figure("loops_rejected", count[Status.REJECTED]),

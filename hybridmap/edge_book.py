@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hybridmap.config.mapping import EdgesConfig
-from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose
+from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, compose_relative, inverse
 from hybridmap.graph.edges import Edge, EdgeKind
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.paths import covariances_from, odometry_covariance
@@ -32,6 +32,7 @@ class Update:
         new_node: number of the node made now; None if none was made.
         edges: numbers of new and changed edges, whatever their status.
         reason: why a node was made, or why not.
+        followed: whether the robot was found at an older node now, so that no new one is needed.
     """
 
     stamp_ns: int
@@ -43,6 +44,16 @@ class Update:
     reason: str
     new_node: int | None = None
     edges: tuple[int, ...] = ()
+    followed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """Where the robot was found at an older node: its pose in the frame of the node, in `odom` (3,), and `Position.driven`."""
+
+    relative: RelativePose
+    pose_odom: Array
+    driven: tuple[float, float]
 
 
 class Position:
@@ -57,6 +68,7 @@ class Position:
         at_node: the node from which the robot is seen, -1 before the first.
         pose_odom_at_node: (3,) of that node in `odom`.
         pose_map_at_node: (3,) of that node by every back-end, by name.
+        followed: whether that node is an older one, at which the robot was found.
     """
 
     def __init__(self, config: EdgesConfig, primary: str) -> None:
@@ -71,6 +83,12 @@ class Position:
         self.at_node = -1
         self.pose_odom_at_node: Array = IDENTITY
         self.pose_map_at_node: Mapping[str, Array] = {}
+        self._found: _Found | None = None
+
+    @property
+    def followed(self) -> bool:
+        """Whether the robot is seen from an older node, at which it was found."""
+        return self._found is not None
 
     @property
     def moved(self) -> Array:
@@ -85,8 +103,16 @@ class Position:
         self.driven = (self.driven[0] + travel_m, self.driven[1] + turn_rad)
 
     def odometry(self, pose_odom_before: Array) -> RelativePose:
-        """The motion from the newest node, at a pose (3,) in `odom`, to here, with the configured noise of odometry."""
-        return RelativePose(between(pose_odom_before, self.pose_odom), odometry_covariance(self._config, *self.driven))
+        """The motion from the newest node, at a pose (3,) in `odom`, to here, with the configured noise of odometry.
+
+        Where the robot was found at an older node: the pose from there, with the noise since then and that of finding it.
+        """
+        found = self._found
+        if found is None:
+            return RelativePose(between(pose_odom_before, self.pose_odom), odometry_covariance(self._config, *self.driven))
+        travel_m, turn_rad = self.driven[0] - found.driven[0], self.driven[1] - found.driven[1]
+        since = RelativePose(between(found.pose_odom, self.pose_odom), odometry_covariance(self._config, travel_m, turn_rad))
+        return compose_relative(found.relative, since)
 
     def restart(self) -> None:
         """Set the path length since the last node to zero: a node was made here."""
@@ -94,11 +120,17 @@ class Position:
 
     def attach(self, node: int, pose_odom_node: Array) -> None:
         """From now on, see the robot from a node that lies at a pose (3,) in `odom`."""
-        self.at_node, self.pose_odom_at_node = node, pose_odom_node
+        self.at_node, self.pose_odom_at_node, self._found = node, pose_odom_node, None
 
-    def retime(self, pose_odom_at_node: Array, pose_odom: Array) -> None:
-        """Replace the poses (3,) of the node that the robot is at, and of the robot, in `odom`: odometry was measured again."""
-        self.pose_odom_at_node, self.pose_odom = pose_odom_at_node, pose_odom
+    def follow(self, node: int, relative: RelativePose) -> None:
+        """From now on, see the robot from an older node, in whose frame its pose was measured."""
+        self.attach(node, compose(self.pose_odom, inverse(relative.delta)))
+        self._found = _Found(relative, self.pose_odom, self.driven)
+
+    def retime(self, pose_odom_newest: Array, pose_odom: Array) -> None:
+        """Replace the poses (3,) of the newest node and of the robot in `odom`: odometry was measured again."""
+        at_node = pose_odom_newest if self._found is None else compose(pose_odom, inverse(self.moved))
+        self.pose_odom_at_node, self.pose_odom = at_node, pose_odom
 
     def correct(self, poses_of: Mapping[str, Array]) -> None:
         """Take in new poses (N, 3) of all nodes by each back-end, by name."""
@@ -109,11 +141,13 @@ class Position:
         at_node = self.pose_map_at_node.get(self._primary)
         return pose_odom if at_node is None else compose(at_node, between(self.pose_odom_at_node, pose_odom))
 
-    def update(self, reason: str, node: int | None = None, edges: Sequence[int] = ()) -> Update:
+    def update(self, reason: str, node: int | None = None, edges: Sequence[int] = (), *, followed: bool = False) -> Update:
         """Make the `Update` of this instant; `node` is the number of the node made now, if any. Nothing changes."""
         moved, pose_map = self.moved, self.pose_map(self.pose_odom)
         on_map = {name: compose(pose, moved) for name, pose in self.pose_map_at_node.items()}
-        return Update(self.stamp_ns, self.pose_odom, pose_map, on_map, self.at_node, moved, reason, node, tuple(edges))
+        return Update(
+            self.stamp_ns, self.pose_odom, pose_map, on_map, self.at_node, moved, reason, node, tuple(edges), followed
+        )
 
 
 class EdgeBook:

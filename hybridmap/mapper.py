@@ -13,9 +13,10 @@ from hybridmap.backends.ensemble import Ensemble
 from hybridmap.calibration.online import OdometryWatch
 from hybridmap.config import Config
 from hybridmap.edge_book import EdgeBook, Position, Update
-from hybridmap.geometry import IDENTITY, Array, between, compose, inverse
+from hybridmap.geometry import IDENTITY, Array, RelativePose, between, compose, inverse
 from hybridmap.graph.edges import Edge, Status
 from hybridmap.graph.experience_map import ExperienceMap, Node, Novelty
+from hybridmap.known_places import KnownPlaces
 from hybridmap.metrics import StageClock
 from hybridmap.neural.composition import Composition, Integrator
 from hybridmap.neural.path_integrator import PathIntegrator, Reanchoring
@@ -45,6 +46,7 @@ class Mapper:
         backends: the back-ends with their latest solutions and failures.
         anchors: poses of frames between nodes; none before `finish`.
         clock: CPU time of each stage.
+        known_places: where the map is so dense that the robot is followed on it.
     """
 
     def __init__(self, config: Config, rig: Rig | None = None, backends: Sequence[str | Backend] | None = None) -> None:
@@ -76,6 +78,7 @@ class Mapper:
         self._synchroniser = Synchroniser(config.sensors.latency_s, config.sensors.odometry_delay_s or 0.0)
         self.calibration = OdometryWatch(config, self.integrator, self._synchroniser)
         self._novelty = Novelty(config.nodes)
+        self.known_places = KnownPlaces(config, self.vision)
         self._position = Position(config.edges, self.backends.primary)
         self._steps_ended = 0
 
@@ -129,10 +132,13 @@ class Mapper:
         reason = self._novelty.reason(self._position.moved, lambda: self.integrator.place_code, new_view)
         if reason is None:
             return self._position.update("nothing new")
+        if view is not None and self._follow():
+            return self._position.update("a known place", followed=True)
         with self.clock.stage("graph"):
+            odometry = self._position.odometry(self.map.node(len(self.map) - 1).pose_odom) if len(self.map) else None
             node, edges = self._make_node(view)
             if view is not None:
-                edges += self._refine_self_motion(node, view)
+                edges += self._refine_self_motion(node, view, odometry)
                 edges += self._close_loops(node)
             self._position.restart()
             self._correct()
@@ -281,24 +287,47 @@ class Mapper:
         with self.clock.stage("profile"):
             return self.vision.observe(ready.observation, self._position.moved if len(self.map) else IDENTITY)
 
+    def _follow(self) -> bool:
+        """Find the robot at an older node where there are enough of them, and see it from there; returns whether it was found.
+
+        Costs a search of the shortest paths where there are enough nodes, and a registration as that of a new node.
+        """
+        solution = self.backends.solutions.get(self.backends.primary)
+        if solution is None or len(solution.poses) < len(self.map):  # it failed
+            return False
+        with self.clock.stage("tracking"):
+            stamps_ns, here = self.map.stamps_ns, self.pose_map_robot
+            found = self.known_places.find(stamps_ns, solution.poses, self._position, here, self.belief)
+        if found is None:
+            return False
+        self._position.follow(found.node, found.relative)
+        self.cells.recalibrate(found.node, found.relative.delta)
+        graph = self.map.pose_graph()
+        self._position.correct({name: self.backends.poses(graph, name) for name in self.backends.names})
+        return True
+
     def _make_node(self, view: View | None) -> tuple[int, list[int]]:
-        """Make a node, join it to the one that the robot was at, and attach the robot to it."""
-        at, code = self._position, self.integrator.place_code
-        initial = compose(self.map.initial[at.at_node], at.moved) if len(self.map) else at.pose_odom
+        """Make a node, join it to the one that the robot was at, and attach the robot to it.
+
+        Where the robot was followed on older nodes, it is joined to the newest one: odometry leads from node to node.
+        """
+        at, code, spans = self._position, self.integrator.place_code, self._position.followed
+        before = len(self.map) - 1 if spans else at.at_node
+        moved = between(self.map.node(before).pose_odom, at.pose_odom) if spans else at.moved
+        initial = compose(self.map.initial[before], moved) if len(self.map) else at.pose_odom
         node = self.map.add_node(
             Node(at.stamp_ns, at.pose_odom, code, -1 if view is None else view.template, at.travel_m), initial
         )
         self._novelty.remember(code)
         self.cells.remember(node)
-        edges = self.book.motion.join(at.at_node, node, at.moved, at.driven) if node > 0 else []
+        edges = self.book.motion.join(before, node, moved, at.driven, spans) if node > 0 else []
         at.attach(node, at.pose_odom)
         return node, edges
 
-    def _refine_self_motion(self, node: int, view: View) -> list[int]:
+    def _refine_self_motion(self, node: int, view: View, odometry: RelativePose | None) -> list[int]:
         assert self.vision is not None
         with self.clock.stage("tracking"):
             self.vision.add_node(node, view)
-            odometry = self._position.odometry(self.map.node(node - 1).pose_odom) if node > 0 else None
             proposals = self.vision.track(node, odometry)
         return self.book.enter(proposals) if self.config.edges.hanging == "chain" else []
 

@@ -47,6 +47,7 @@ class Metric:
 
 FIGURES: dict[str, tuple[str, str]] = {
     "nodes": ("1", "nodes of the map"),
+    "nodes_reused": ("1", "times that the robot was found at a node that existed, so that none was made"),
     "sessions": ("1", "drives that the map was made of"),
     "pieces": ("1", "pieces of the map that are not joined, each in a frame of its own; 1 if all is one map"),
     "loops_accepted": ("1", "loop closures in the graph"),

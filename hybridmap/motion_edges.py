@@ -27,15 +27,17 @@ class MotionEdges:
         self._driven: dict[int, tuple[float, float]] = {}  # of each odometry edge
         self._measured: dict[int, Edge] = {}  # registrations as they were proposed
         self._contradicted: set[int] = set()  # odometry edges
+        self._spanning: set[int] = set()  # odometry edges over stretches on which the robot was followed on older nodes
         self.wheels = WheelNoise(config)
 
-    def join(self, source: int, target: int, delta: Array, driven: tuple[float, float]) -> list[int]:
+    def join(self, source: int, target: int, delta: Array, driven: tuple[float, float], spans: bool = False) -> list[int]:
         """Add the odometry edge from the node that the robot was at to a new node, with the noise that was learnt.
 
         Args:
             source, target: the two nodes.
             delta: (3,) the motion between them, m and rad.
             driven: path length of the motion, m, and angle turned, rad.
+            spans: whether the robot was followed on older nodes on the way: no registration is weighed against this motion.
 
         Returns:
             The number of the new edge, then those of edges that changed because the noise of the wheels was learnt anew.
@@ -44,6 +46,8 @@ class MotionEdges:
         edge = Edge.decided(source, target, EdgeKind.ODOMETRY, odometry, method=Method.ODOMETRY, search=Search.CHAIN)
         number = self._map.add_edge(edge)
         self._driven[number] = driven
+        if spans:
+            self._spanning.add(number)
         changes = self.wheels.drive(*driven, delta)
         return [number, *(self._weigh_again() if changes else [])]
 
@@ -151,7 +155,8 @@ class MotionEdges:
 
     def _own_odometry(self, node: int) -> int | None:
         """Number of the odometry edge from the node before to a node; None if there is none."""
-        return next((n for n in self._map.edges_into(node) if n in self._driven and self._map.edge(n).source == node - 1), None)
+        own = (n for n in self._map.edges_into(node) if n in self._driven and n not in self._spanning)
+        return next((n for n in own if self._map.edge(n).source == node - 1), None)
 
     def _contradict(self, proposal: Edge) -> list[int]:
         """Drop the odometry edges that an edge contradicts; where the wheels are trusted, only a kidnapped robot's."""

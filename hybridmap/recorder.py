@@ -45,7 +45,7 @@ class Recorder:
             self._write_track(early, 0, between(self._mapper.map.node(0).pose_odom, early.pose_odom_robot))
         self._before_first_node.clear()
         self._write_track(update, update.at_node, update.delta_node_robot)
-        if update.new_node is not None:
+        if update.new_node is not None or update.followed:
             self.store.commit()
 
     def rewrite_odometry(self) -> None:
@@ -59,7 +59,10 @@ class Recorder:
         if again.gains is not None:
             self.store.put_info(GAIN_CHANGES, [[int(track.stamps_ns[0]), *again.gains.to_array().tolist()]])
         poses, nodes = again.poses_at(track.stamps_ns, track.poses_odom), np.array([n.pose_odom for n in experiences.nodes])
-        moved = replace(track, deltas=between(nodes[track.nodes], poses), poses_odom=poses)
+        made = np.searchsorted(experiences.stamps_ns, track.stamps_ns, side="right").clip(1) - 1
+        followed = (track.nodes != made)[:, None]  # seen from an older node: by registration, not by the odometry since then
+        deltas = np.where(followed, track.deltas, between(nodes[track.nodes], poses))
+        moved = replace(track, deltas=deltas, poses_odom=poses)
         self.store.replace_odometry(moved, experiences)
 
     def _write_node(self, number: int) -> None:

@@ -174,7 +174,7 @@ def _drive(stream: Stream, drive: Drive, checkpoints: Checkpoints, progress: Pro
             recorder.record(update)
         if progress is not None and isinstance(sample, Observation):
             progress(drive.observations, stream.expected_observations)
-        if any(update.new_node is not None for update in updates):
+        if any(update.new_node is not None or update.followed for update in updates):
             checkpoints.follow(drive)
     for name, (gone, stated) in stream.report.lost.items():
         of = counted(stated, "message")
@@ -206,6 +206,8 @@ def _conclude(stream: Stream, mapper: Mapper, recorder: Recorder, folder: Sessio
     duration_s = float(track.stamps_ns[-1] - track.stamps_ns[0]) / NS_PER_S
     metrics = figures_of(mapper, recorder.largest_correction_m, duration_s)
     folder.write_metrics(head, metrics)
+    if mapper.known_places.followed:
+        store.put_info("known_places", mapper.known_places.account)
     for key in ("graph_hash", "primary_backend"):
         store.put_info(key, head[key])
     return Session(folder, head, metrics)

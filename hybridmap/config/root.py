@@ -45,7 +45,7 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if self.neural.modules == 0 and self.nodes.rule not in ("travel", "views"):
+        if self.neural.modules == 0 and self.nodes.rule not in ("travel", "every-visit", "views"):
             expected = "expected travel or views where neural.modules is 0 (no place code)"
             raise ValueError(f"nodes.rule: {expected}, found {self.nodes.rule}")
         if self.nodes.rule == "views":

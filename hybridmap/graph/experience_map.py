@@ -266,14 +266,14 @@ class Novelty:
         """Why a new node must be made now, in words; None if none is needed.
 
         Args:
-            delta_node_robot: (3,) pose of the robot in the frame of the node that it is at, m and rad; for the rule `travel`,
-                and the turn since that node for `passage`.
+            delta_node_robot: (3,) pose of the robot in the frame of the node that it is at, m and rad; for the rules
+                `travel` and `every-visit`, and the turn since that node for `passage`.
             place_code: returns the present rates (P,) of the place cells; not called under the rules `travel` and `views`.
             new_template: `View.new_template` of the current frame; without effect under the rule `travel`.
         """
         if self._count == 0:
             return "first experience"
-        if self._config.rule == "travel":
+        if self._config.rule in ("travel", "every-visit"):
             return self._travelled(delta_node_robot)
         if new_template:
             return "new view template"

@@ -44,13 +44,16 @@ class SimulatedStream:
     that much earlier: scans and frames are late against it.
     """
 
-    def __init__(self, config: SimulationConfig, seed: int, window: Window = WHOLE) -> None:
+    def __init__(
+        self, config: SimulationConfig, seed: int, window: Window = WHOLE, world: World | None = None
+    ) -> None:
         """Prepare a drive; the world is rendered while iterating.
 
         Args:
             config: world, drive, sensors.
             seed: of the sensors' errors, and of a world that is drawn by chance.
             window: the part of the drive to give; its samples are those of the whole drive.
+            world: the world and its drive; default: those that the configuration names.
 
         Raises:
             ConfigError: there is no such world, no visited place in it to which the robot could be kidnapped, or nothing in it
@@ -59,7 +62,7 @@ class SimulatedStream:
         """
         self._config = config
         self._seed = seed
-        self._world: World = build_world(config.world, seed)
+        self._world: World = world or build_world(config.world, seed)
         if self._world.laser_only and config.sensors != "laser":
             raise ConfigError(
                 f"simulation.sensors: found {config.sensors!r}, but {config.world} has nothing for a camera to see; "

@@ -23,6 +23,7 @@ _OURS = (
     "hybridmap.edge_book",
     "hybridmap.geometry",
     "hybridmap.graph",
+    "hybridmap.known_places",
     "hybridmap.mapper",
     "hybridmap.metrics",
     "hybridmap.motion_edges",

@@ -255,6 +255,28 @@ class MeetingFrontEnd(FrontEnd, Protocol):
 
 
 @runtime_checkable
+class FollowingFrontEnd(FrontEnd, Protocol):
+    """A front-end that can follow the robot on nodes that exist, without making new ones."""
+
+    @property
+    def follows(self) -> bool:
+        """Whether it can tell now where the robot is: not where it may be lost, nor where it does not register nodes."""
+
+    def recognise(self, node: int, expected: Array) -> RelativePose | None:
+        """Register the frame that was observed last to the views about an older node; nothing is changed.
+
+        `expected` (3,) is the pose of the robot in the frame of that node, m and rad. Returns the measured one; None if the
+        views do not fit there.
+        """
+
+    def follow(self, node: int) -> None:
+        """From now on the robot is seen from an earlier node, until the next `add_node`.
+
+        Then `track` registers the new node to this one, and its `odometry` is the pose in the frame of this one.
+        """
+
+
+@runtime_checkable
 class Overruling(Protocol):
     """A front-end that can judge again whether its registrations contradict the odometry."""
 

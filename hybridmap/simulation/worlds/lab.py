@@ -12,10 +12,10 @@ LENGTH_M, WIDTH_M, HEIGHT_M = 10.0, 3.0, 2.7
 LAPS = 2.35
 
 
-def lab() -> World:
-    """The laboratory: a room of 10 x 3 m, driven round more than twice; the same at every call."""
+def lab(laps: float = LAPS) -> World:
+    """The laboratory: a room of 10 x 3 m, driven round more than twice, or so many times; the same at every call."""
     return World(
-        "lab", (*_shell(), *_benches(), *_along_the_walls(), *_on_the_walls()), (_round_the_benches(),), texture_seed=11
+        "lab", (*_shell(), *_benches(), *_along_the_walls(), *_on_the_walls()), (_round_the_benches(laps),), texture_seed=11
     )
 
 
@@ -84,14 +84,14 @@ def _on_the_walls() -> list[Facet]:
     ]
 
 
-def _round_the_benches() -> Array:
-    """Way points of an oval at 0.78 m from its middle line, `LAPS` times round."""
+def _round_the_benches(laps: float) -> Array:
+    """Way points of an oval at 0.78 m from its middle line, so many times round."""
     near, far, radius, middle = 2.1, 7.9, 0.78, 0.5 * WIDTH_M
     arc = np.linspace(-np.pi / 2, np.pi / 2, 13)
     east = np.column_stack([far + radius * np.cos(arc), middle + radius * np.sin(arc)])
     west = np.column_stack([near - radius * np.cos(arc), middle - radius * np.sin(arc)])
     lap = np.vstack([east, west])
-    points = np.vstack([[near, middle - radius], np.tile(lap, (int(LAPS) + 1, 1))])
+    points = np.vstack([[near, middle - radius], np.tile(lap, (int(laps) + 1, 1))])
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     lap_m = 2.0 * (far - near) + 2.0 * np.pi * radius
-    return points[travelled <= LAPS * lap_m]
+    return points[travelled <= laps * lap_m]

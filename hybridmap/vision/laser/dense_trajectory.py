@@ -33,11 +33,15 @@ NOWHERE_M = 1e6
 
 @dataclass(frozen=True, slots=True)
 class ObservedScan:
-    """A scan, the last node before it (-1 before the first), and the robot's pose (3,) in that node's frame by odometry."""
+    """A scan, the node from which the robot was seen (-1 before the first), and its pose (3,) in that node's frame by odometry.
+
+    That is the last node before the scan, or an older one on which the robot was followed.
+    """
 
     scan: LaserScan
     node: int
     motion: Array
+    followed: bool = False
 
 
 class DenseTrajectory:
@@ -55,12 +59,14 @@ class DenseTrajectory:
 
         Args:
             scans: every scan since the first node, in order of time; the scan of a node itself has zero motion.
-            steps: (N - 1, 3) pose of the next node in the frame of each, by the path integrator, m and rad.
+            steps: (N - 1, 3) pose of the next node in the frame of each, by the path integrator, m and rad; NaN where the robot
+                was followed on older nodes in between.
             poses: (N, 3) of the nodes in the final map, m and rad.
         """
         nodes = np.array([s.node for s in scans], dtype=np.int64)
         motions = np.array([s.motion for s in scans]).reshape(-1, 3)
-        expected, jumped = _expected(nodes, motions, steps.reshape(-1, 3), poses)
+        onward = ~np.array([s.followed for s in scans], dtype=bool)
+        expected, jumped = _expected(nodes, motions, steps.reshape(-1, 3), poses, onward)
         found, fits = expected[0].copy(), np.zeros(len(scans))
         for first, stop in self._blocks():
             block = np.flatnonzero((nodes >= first) & (nodes < stop))
@@ -73,6 +79,8 @@ class DenseTrajectory:
                 block = block[jumped[block]]
         good = fits >= INLIERS_MIN
         for piece in self._atlas.pieces[1:]:
+            if piece.start in self._atlas.resumed:
+                continue
             good[(nodes == piece.start - 1) & (_way(motions) > 0.0)] = False
         stamps = np.array([s.scan.stamp_ns for s in scans], dtype=np.int64)
         return anchors_on(poses, stamps[good], nodes[good], between(poses[nodes[good]], found[good]))
@@ -111,16 +119,19 @@ def _stacked(clouds: list[Cloud]) -> tuple[Cloud, NDArray[np.int64]]:
     return Cloud(points, normals), counts
 
 
-def _expected(nodes: NDArray[np.int64], motions: Array, steps: Array, poses: Array) -> tuple[list[Array], NDArray[np.bool_]]:
+def _expected(
+    nodes: NDArray[np.int64], motions: Array, steps: Array, poses: Array, onward: NDArray[np.bool_]
+) -> tuple[list[Array], NDArray[np.bool_]]:
     """Poses on the map by odometry, (S, 3) each, from which scans are registered, and where (S,) the latter two are wanted.
 
     The first are propagated from the node before, and blended with those propagated back from the node after. Where these two
     differ by more than a scan may be off, the robot slid or was carried at one moment, and each of them is right on one side
-    of it.
+    of it. `onward` (S,) are the scans after which the next node was made; the others are only propagated from the node before.
     """
     forward = compose(poses[nodes], motions)
     blended, backward, jumped = forward.copy(), forward.copy(), np.zeros(len(nodes), dtype=bool)
-    inside = np.flatnonzero(nodes < len(poses) - 1)
+    inside = np.flatnonzero(onward & (nodes < len(poses) - 1))
+    inside = inside[np.isfinite(steps[nodes[inside], 0])]
     if len(inside) == 0:
         return [blended], jumped
     node, motion = nodes[inside], motions[inside]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +42,7 @@ MOST_BETWEEN = 30
 
 class LaserFrontEnd:
     """Loop closure by registration of laser submaps; implements `vision.base.DenseFrontEnd`, `VerifyingFrontEnd`,
-    `PartingFrontEnd`, `MeetingFrontEnd` and `second_opinion.LocalisingFrontEnd`.
+    `PartingFrontEnd`, `MeetingFrontEnd`, `FollowingFrontEnd` and `second_opinion.LocalisingFrontEnd`.
 
     Attributes:
         atlas: the scans of the nodes, from which submaps are made.
@@ -79,6 +80,7 @@ class LaserFrontEnd:
         self._steps: list[Array] = []
         self._between: list[ObservedScan] = []
         self._node: tuple[int, Cloud, LaserScan] | None = None
+        self._seen_from = self._before = -1  # now; when the newest node was made
         self._last_probe_m = 0.0
         self._keys = 0
 
@@ -94,7 +96,8 @@ class LaserFrontEnd:
             beams = len(self._laser.bearings_rad)
             raise StreamError(f"laser: scan at {frame.stamp_ns} ns: expected {beams} ranges, found {frame.ranges_m.shape}")
         self.atlas.scene.observe(frame.ranges_m)
-        self._scans.append(ObservedScan(frame, len(self._profiles) - 1, np.array(delta_node_robot, dtype=np.float64)))
+        motion, followed = np.array(delta_node_robot, dtype=np.float64), self._seen_from != len(self._profiles) - 1
+        self._scans.append(ObservedScan(frame, self._seen_from, motion, followed))
         profile = laser_profile(frame.ranges_m, self._laser.bearings_rad, self._profile_width)
         if not self._config.scan.templates:
             return View(frame.stamp_ns, profile, -1, False)
@@ -104,15 +107,18 @@ class LaserFrontEnd:
     def add_node(self, node: int, view: View) -> None:
         """Make a node of the scan that was observed last; see `FrontEnd.add_node`."""
         seen = self._scans.pop()
-        self._between = [s for s in self._scans[-MOST_BETWEEN:] if s.node == node - 1 and node > 0]
+        self._between = [s for s in self._scans[-MOST_BETWEEN:] if s.node == seen.node >= 0 and s.followed == seen.followed]
         if node > 0:
-            self._steps.append(seen.motion)
+            self._steps.append(np.full(3, np.nan) if seen.followed else seen.motion)
+        self._before, self._seen_from = self._seen_from, node
         self._scans.append(ObservedScan(seen.scan, node, IDENTITY))
         self._profiles.append(view.profile)
         self._node = (node, self._cloud(seen.scan), seen.scan)
 
     def track(self, node: int, odometry: RelativePose | None) -> list[Edge]:
-        """Register the new node to the submap of the nodes just before it; see `FrontEnd.track`.
+        """Register the new node to the submap of the nodes just before it, or about the one that it was followed on.
+
+        See `FrontEnd.track` and `FollowingFrontEnd.follow`.
 
         Returns no edges for the first node, nor where `vision.tracking.enabled` is false.
         """
@@ -125,8 +131,10 @@ class LaserFrontEnd:
         if not self._refines:
             self.atlas.add(cloud, scan.ranges_m, compose(self.atlas.chain[-1], odometry.delta), odometry.covariance)
             return []
-        step = self._tracker.step(cloud, odometry, self._clouds_between)
-        self.atlas.add(cloud, scan.ranges_m, compose(self.atlas.chain[-1], step.relative.delta), step.scatter)
+        before = self._before
+        step = self._tracker.step(cloud, odometry, self._clouds_between, before)
+        pose = compose(self.atlas.chain[before], step.relative.delta)
+        self.atlas.add(cloud, scan.ranges_m, pose, step.scatter, before)
         broken = self._continuity.broken(node, step, odometry, [(seen.motion, seen.scan) for seen in self._between])
         return self.localisation.tracked(self._registration(node, step), broken, odometry.delta)
 
@@ -184,12 +192,26 @@ class LaserFrontEnd:
 
     def way(self, node: int) -> tuple[Check, ...]:
         """Check whether the scan of a node (not the first) and that of the node before look through each other's walls."""
-        motion = between(self.atlas.chain[node - 1], self.atlas.chain[node])
+        motion = between(self.atlas.chain[self.atlas.before(node)], self.atlas.chain[node])
         return checks.of_way(None, violation_of_step(node, motion, self.atlas, self._laser))
 
     def unexpected(self, loop: Edge) -> bool:
         """Whether a loop was refused only because of the gate, or as too few others agreed with it, or others did not."""
         return loop.lack in UNEXPECTED and checks.unexpected(loop.failed)
+
+    @property
+    def follows(self) -> bool:
+        """Whether registrations tell where the robot is; see `FollowingFrontEnd.follows`."""
+        return self._refines and not self.localisation.lost
+
+    def recognise(self, node: int, expected: Array) -> RelativePose | None:
+        """Register the newest scan to those about an older node; see `FollowingFrontEnd.recognise`."""
+        return self._tracker.recognise(node, self._cloud(self._scans[-1].scan), expected)
+
+    def follow(self, node: int) -> None:
+        """From now on the robot is seen from an earlier node; see `FollowingFrontEnd.follow`."""
+        self._seen_from = node
+        self._scans[-1] = replace(self._scans[-1], followed=True)
 
     def divided(self, place: int, poses: Array) -> Division | None:
         """Ask single scans on which side of a kidnapping they were taken; see `division.divide`."""
@@ -236,6 +258,7 @@ class LaserFrontEnd:
         cloud = cloud_of_scan(ranges_m, self._laser, Scale(float(state["cell_m"]) / CELL_M))
         self.atlas.take_up(cloud, ranges_m, np.asarray(state["chain"]), np.asarray(state["scatter"]), begins)
         self._profiles.append(np.asarray(keyframe["profile"], dtype=np.float32))
+        self._seen_from = node
 
     def arrive(self, first: int) -> None:
         """A session begins whose place on the map is to be found; see `MeetingFrontEnd.arrive`."""
@@ -260,13 +283,14 @@ class LaserFrontEnd:
         return ((seen.motion, self._cloud(seen.scan)) for seen in self._between)
 
     def _registration(self, node: int, step: Step) -> Edge:
+        by_wheels = not step.measured and self._before != node - 1  # nothing else joins it to the node that it was seen from
         return Edge.decided(
-            node - 1,
+            self._before,
             node,
             EdgeKind.REGISTRATION,
-            step.relative if step.measured else None,
-            step.checks,
-            method=Method.SCANS,
+            step.relative if step.measured or by_wheels else None,
+            () if by_wheels else step.checks,
+            method=Method.ODOMETRY if by_wheels else Method.SCANS,
             search=Search.CHAIN,
             figures={"fit": step.fit},
             key=self._next_key(),

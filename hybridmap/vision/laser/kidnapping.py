@@ -112,11 +112,11 @@ class Continuity:
         Returns:
             True if it drove on, False if it is elsewhere; None if the scans do not fit well enough to tell.
         """
-        last = breaks[0].node - 1
+        last = breaks[0].registration.source
         self._hints = self._hints if self._hinted_at == breaks[-1].node else 0
         self._hinted_at = breaks[-1].node
         by_wheels, expected = {b.node: b.odometry for b in breaks}, IDENTITY
-        for i in range(last + 1, node + 1):
+        for i in range(breaks[0].node, node + 1):
             chain = self._atlas.chain
             expected = compose(expected, by_wheels[i] if i in by_wheels else between(chain[i - 1], chain[i]))
         here = self._atlas.submap(node, range(breaks[-1].node, node + 1))
@@ -195,8 +195,9 @@ class Continuity:
         """Whether each scan from the last node to the newest fits the one before it."""
         atlas = self._atlas
         clouds = [cloud_of_scan(scan.ranges_m, self._laser, atlas.scene.scale) for _, scan in on_the_way]
-        clouds = [atlas.clouds[node - 1], *clouds, atlas.clouds[node]]
-        ranges = [atlas.ranges[node - 1], *(scan.ranges_m for _, scan in on_the_way), atlas.ranges[node]]
+        last = atlas.before(node)
+        clouds = [atlas.clouds[last], *clouds, atlas.clouds[node]]
+        ranges = [atlas.ranges[last], *(scan.ranges_m for _, scan in on_the_way), atlas.ranges[node]]
         wheels = [IDENTITY, *(motion for motion, _ in on_the_way), odometry]
         for i in range(len(clouds) - 1):
             found = self._tracker.pair(clouds[i], clouds[i + 1], between(wheels[i], wheels[i + 1]))
@@ -261,6 +262,11 @@ class GlobalLocalisation:
     def lost_since(self) -> int | None:
         """Node before which the robot was kidnapped last, if it has not been found on the map since; else None."""
         return self._broken_at
+
+    @property
+    def lost(self) -> bool:
+        """Whether the robot's pose on the map may be wrong: also where it was not kidnapped for sure."""
+        return self._whereabouts.lost or self._broken_at is not None
 
     @property
     def since(self) -> int:

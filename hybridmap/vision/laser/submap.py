@@ -84,7 +84,8 @@ class _Recent(Generic[Key, Value]):
 class Atlas:
     """The clouds of all nodes and the poses that scan matching gives them one after the other; makes submaps.
 
-    A new piece begins after a kidnapping; no submap holds nodes of two pieces.
+    A new piece begins after a kidnapping, and where nodes are made again after the robot was followed on older ones; no submap
+    holds nodes of two pieces.
 
     Attributes:
         clouds, ranges: of each node's scan, the points in its frame, and the ranges (B,) as received, m.
@@ -92,6 +93,7 @@ class Atlas:
         scatter: covariance (3, 3) of each node's pose relative to the nodes around it, in the node's own frame, m^2 and rad^2.
         travel_m: path length from node 0 to each node along `chain`, m.
         scene: how far the walls are; the scale of clouds that are made now.
+        resumed: of each node that was made after the robot was followed on older ones, the one it was seen from last.
     """
 
     def __init__(self) -> None:
@@ -104,21 +106,26 @@ class Atlas:
         self.scatter: list[Array] = []
         self.travel_m: list[float] = []
         self.scene = Scene()
+        self.resumed: dict[int, int] = {}
         self._pieces = [0]
         self._moved = IDENTITY  # of the session that is taken up: its chain in this one
 
     def __len__(self) -> int:
         return len(self.clouds)
 
-    def add(self, cloud: Cloud, ranges_m: NDArray[np.float32], pose: Array, scatter: Array) -> None:
-        """Append a node.
+    def add(self, cloud: Cloud, ranges_m: NDArray[np.float32], pose: Array, scatter: Array, seen_from: int = -1) -> None:
+        """Append a node; where it was not seen from the last node, but from an older one, it begins a new piece.
 
         Args:
             cloud, ranges_m: its scan, as points and as measured.
             pose: (3,) in the frame of node 0, by scan matching from node to node, m and rad.
             scatter: (3, 3) covariance of its pose relative to the submap to which it was registered, m^2 and rad^2.
+            seen_from: the node from which it was seen; -1: the last one.
         """
-        step = float(np.hypot(*(pose - self.chain[-1])[:2])) if self.chain else 0.0
+        step = float(np.hypot(*(pose - self.chain[seen_from])[:2])) if self.chain else 0.0
+        if seen_from >= 0 and seen_from != len(self) - 1:
+            self.part(len(self))
+            self.resumed[len(self)] = seen_from
         self.travel_m.append(self.travel_m[-1] + step if self.travel_m else 0.0)
         self.clouds.append(cloud)
         self.ranges.append(ranges_m)
@@ -152,17 +159,25 @@ class Atlas:
         edge = compose_relative(RelativePose(IDENTITY, self.scatter[target]), RelativePose(pose, covariance))
         return edge if probe is None else compose_relative(edge, RelativePose(IDENTITY, self.scatter[probe]))
 
+    def before(self, node: int) -> int:
+        """The node from which a node was seen when it was made: the one before it, or an older one (`resumed`)."""
+        return self.resumed.get(node, node - 1)
+
     def part(self, node: int) -> None:
-        """Begin a new piece at a node: the robot was kidnapped before it."""
-        insort(self._pieces, node)
+        """Begin a new piece at a node: the robot was kidnapped before it, or seen from an older node."""
+        if node not in self.resumed:
+            insort(self._pieces, node)
 
     def join(self, node: int) -> None:
         """Join the piece that begins at a node with the one before it: the robot was not kidnapped there after all.
 
+        Where the robot was followed on older nodes before, the piece stays.
+
         Raises:
             ValueError: no piece begins there.
         """
-        self._pieces.remove(node)
+        if node not in self.resumed:
+            self._pieces.remove(node)
 
     @property
     def pieces(self) -> list[range]:
@@ -274,7 +289,7 @@ def violation_of_step(node: int, motion: Array, atlas: Atlas, laser: Laser) -> f
 
     `motion` (3,) is the pose of the node in the frame of the one before, m and rad.
     """
-    last, here = (alone(atlas.clouds[i], i) for i in (node - 1, node))
+    last, here = (alone(atlas.clouds[i], i) for i in (atlas.before(node), node))
     return violation_both_ways(here, last, motion, atlas.ranges, laser)
 
 

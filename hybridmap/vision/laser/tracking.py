@@ -53,6 +53,8 @@ PULL = 0.05
 """Loss of a start's score at one standard deviation of the odometry's heading, or at two of its translation."""
 WEAK_M, WEAK_DEG = 0.05, 1.5
 """Standard deviations that are added to a registration which is not good, m and degrees."""
+ABOUT_M = 1.0
+"""Travel to either side of a node whose scans show a place, m: what one scan does not see, its neighbours do."""
 SCORED_POINTS = 90
 """Points that score the starts."""
 WIDE_GAIN, LOST_GAIN = 0.03, 0.1
@@ -90,23 +92,44 @@ class Tracker:
     def __init__(self, atlas: Atlas) -> None:
         self._atlas = atlas
 
-    def step(self, cloud: Cloud, odometry: RelativePose, between_nodes: Callable[[], Iterable[tuple[Array, Cloud]]]) -> Step:
-        """Measure the motion from the last node of the atlas to a new one; the atlas is not changed.
+    def step(
+        self,
+        cloud: Cloud,
+        odometry: RelativePose,
+        between_nodes: Callable[[], Iterable[tuple[Array, Cloud]]],
+        last: int,
+    ) -> Step:
+        """Measure the motion from the last node to a new one; the atlas is not changed.
 
         Args:
             cloud: scan of the new node, in its frame.
             odometry: pose of the new node in the frame of the last node, by the wheels.
             between_nodes: returns the scans between the two nodes in order: the robot's pose (3,) in the frame of the last node
                 by the wheels, and the cloud in the robot's frame. It is called only where the first search is weak.
+            last: the last node: that of the atlas, or the one on which the robot was followed.
         """
-        field = self._field()
+        field = self._field(last)
         best = self._search(field, cloud, odometry.delta)
         if self._is_weak(best, odometry.delta):
-            stepped = self._step_by_step(field, cloud, odometry.delta, between_nodes())
+            stepped = self._step_by_step(field, cloud, odometry.delta, between_nodes(), last)
             best = _better(best, stepped, 0.0)
         if self._is_weak(best, odometry.delta):
             best = _better(best, self._grid(field, cloud, odometry.delta, LOST), LOST_GAIN)
-        return self._judge(best, odometry)
+        return self._judge(best, odometry, last)
+
+    def recognise(self, node: int, cloud: Cloud, expected: Array) -> RelativePose | None:
+        """Register a scan to those about an older node, near an expected pose (3,) in its frame; nothing is changed.
+
+        Returns the pose of the scan in the frame of the node; None if it does not fit well, not surely, or not near there.
+        """
+        nodes = self._atlas.along(node, ABOUT_M, ABOUT_M)
+        found = self._grid(self._field_of(self._atlas.submap(node, nodes).cloud), cloud, expected, NARROW)
+        covariance = found.covariance(0, FLOOR_M, np.deg2rad(FLOOR_DEG))
+        loosest_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1]))
+        fits = found.inliers[0] >= checks.INLIERS_MIN and loosest_m <= checks.LOOSEST_MAX_M
+        if not fits or contradicts(found.poses[0], expected):
+            return None
+        return self._atlas.joining(node, found.poses[0], covariance)
 
     def pair(self, cloud: Cloud, following: Cloud, odometry: Array) -> Alignment:
         """Register one scan (`following`) to the scan before it (`cloud`), each in the robot's own frame.
@@ -132,10 +155,13 @@ class Tracker:
         inliers = alignment.inliers[0]
         return bool(inliers < checks.INLIERS_MIN or (inliers < INLIERS_SURE and contradicts(alignment.poses[0], expected)))
 
-    def _field(self, extra: Sequence[Cloud] = ()) -> LikelihoodField:
-        n = len(self._atlas)
-        nodes = range(max(n - SUBMAP_NODES, self._atlas.piece(n - 1).start), n)
-        cloud = self._atlas.submap(n - 1, nodes).cloud
+    def _field(self, last: int, extra: Sequence[Cloud] = ()) -> LikelihoodField:
+        piece = self._atlas.piece(last)
+        first, stop = last + 1 - SUBMAP_NODES, last + 1
+        if stop < len(self._atlas):  # the robot was followed on it: what came after it is as near as what came before
+            first, stop = last - SUBMAP_NODES // 2, last + 1 + SUBMAP_NODES // 2
+        nodes = range(max(first, piece.start), min(stop, piece.stop))
+        cloud = self._atlas.submap(last, nodes).cloud
         if extra:
             cloud = merged([cloud, *extra])
         return self._field_of(cloud)
@@ -162,7 +188,12 @@ class Tracker:
         return align(field, cloud, start[None], prior)
 
     def _step_by_step(
-        self, field: LikelihoodField, cloud: Cloud, odometry: Array, between_nodes: Iterable[tuple[Array, Cloud]]
+        self,
+        field: LikelihoodField,
+        cloud: Cloud,
+        odometry: Array,
+        between_nodes: Iterable[tuple[Array, Cloud]],
+        last_node: int,
     ) -> Alignment:
         """Register the scans between the nodes one by one, each becoming part of the submap of the next."""
         pose, last = IDENTITY, IDENTITY
@@ -172,10 +203,10 @@ class Tracker:
             pose, last = alignment.poses[0], motion
             if alignment.inliers[0] >= checks.INLIERS_WEAK:
                 seen.append(scan.moved(pose))
-                field = self._field(seen)
+                field = self._field(last_node, seen)
         return self._search(field, cloud, compose(pose, between(last, odometry)))
 
-    def _judge(self, alignment: Alignment, odometry: RelativePose) -> Step:
+    def _judge(self, alignment: Alignment, odometry: RelativePose, last: int) -> Step:
         pose, inliers, fit = alignment.poses[0], float(alignment.inliers[0]), float(alignment.fit[0])
         off_m = float(np.hypot(*(pose - odometry.delta)[:2]))
         asked = checks.of_step(inliers, off_m)
@@ -185,7 +216,7 @@ class Tracker:
         if self._is_weak(alignment, odometry.delta):
             covariance = covariance + np.diag([WEAK_M**2, WEAK_M**2, np.deg2rad(WEAK_DEG) ** 2])
         wrong = bool(inliers >= checks.INLIERS_MIN and contradicts(pose, odometry.delta))
-        edge = self._atlas.joining(len(self._atlas) - 1, pose, covariance)
+        edge = self._atlas.joining(last, pose, covariance)
         return Step(edge, asked, wrong, inliers, fit, covariance)
 
 

@@ -31,7 +31,9 @@ class Drive:
         self.pose = compose(self.pose, truth)
         ranges = cast(self.world, self.pose, self.rng)
         cloud = self.cloud(ranges)
-        step = self.tracker.step(cloud, RelativePose(np.asarray(odometry, float), LOOSE), lambda: between_nodes)
+        step = self.tracker.step(
+            cloud, RelativePose(np.asarray(odometry, float), LOOSE), lambda: between_nodes, len(self.atlas) - 1
+        )
         self.atlas.add(cloud, ranges, compose(self.atlas.chain[-1], step.relative.delta), step.scatter)
         return step
 
