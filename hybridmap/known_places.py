@@ -85,7 +85,7 @@ class KnownPlaces:
         vision = self._vision
         if vision is None or len(poses) < VISITS or not vision.follows:
             return None
-        visits = self._visits(stamps_ns, poses, robot.stamp_ns, pose_map_robot)
+        visits = self._visits(stamps_ns, poses, robot.stamp_ns, pose_map_robot, vision.lost_since or 0)
         if len(visits) < VISITS:
             return None
         covariance = belief().covariance_from(robot.at_node)
@@ -101,11 +101,17 @@ class KnownPlaces:
             self._failed(node)
         return None
 
-    def _visits(self, stamps_ns: NDArray[np.int64], poses: Array, now_ns: int, pose_map_robot: Array) -> list[Nodes]:
-        """The nodes at the robot's place that are of use, by visit, in the order of time; not those of the present visit."""
+    def _visits(
+        self, stamps_ns: NDArray[np.int64], poses: Array, now_ns: int, pose_map_robot: Array, since: int
+    ) -> list[Nodes]:
+        """The nodes at the robot's place that are of use, by visit, in the order of time; not those of the present visit.
+
+        Nodes before `since` are of none: the robot was carried since then.
+        """
         near = _away_m(poses, pose_map_robot) <= self._near_m
         near &= stamps_ns < now_ns - VISIT_S * NS_PER_S
         near[-1] = False
+        near[:since] = False
         nodes = np.flatnonzero(near)
         nodes = nodes[np.abs(wrap_angle(poses[nodes, 2] - pose_map_robot[2])) <= self._turn_rad]
         visits: list[list[int]] = []

@@ -23,11 +23,11 @@ WALLS = np.array(  # x0, y0, x1, y1; a niche, a pillar and a slanted wall make a
 )  # fmt: skip
 
 
-def scan(pose: np.ndarray) -> np.ndarray:
-    """Return the ranges (B,) that a laser measures from a pose in the room."""
+def scan(pose: np.ndarray, walls: np.ndarray = WALLS) -> np.ndarray:
+    """Return the ranges (B,) that a laser measures from a pose in the room, or between other walls."""
     angle = pose[2] + BEARINGS
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)[:, None]
-    start, along = WALLS[:, :2] - pose[:2], WALLS[:, 2:] - WALLS[:, :2]
+    start, along = walls[:, :2] - pose[:2], walls[:, 2:] - walls[:, :2]
     cross = direction[..., 0] * along[:, 1] - direction[..., 1] * along[:, 0]
     cross = np.where(cross == 0, 1e-12, cross)
     t = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / cross

@@ -123,9 +123,9 @@ class NodesConfig(Section):
 
     rule: Literal["travel", "every-visit", "novelty", "passage", "views"] = "travel"
     """`travel`: after some distance or rotation, but not where four earlier visits left nodes and the view fits one of them:
-    there the map grows no more; `every-visit`: the same, there too; `novelty`: the paper's rule, by place code and
-    view template, against every node; `passage`: the same against the newest node alone, place code and head direction together; `views`: by
-    the views alone, for a new view template or, with `vision.closing.by: ratslam`, another experience.
+    there the map grows no more; `every-visit`: the same, there too; `novelty`: the paper's rule, by place code and view
+    template, against every node; `passage`: the same against the newest node alone, place code and head direction together;
+    `views`: by the views alone, for a new view template or, with `vision.closing.by: ratslam`, another experience.
 
     Watch: under `novelty` a known place makes no node, and hence no loop closure; under `passage` it makes one at each visit.
     `views` makes nodes by nothing else: it needs a sensor, and by laser `vision.laser.scan.templates` (not with `ratslam` and

@@ -260,7 +260,10 @@ class FollowingFrontEnd(FrontEnd, Protocol):
 
     @property
     def follows(self) -> bool:
-        """Whether it can tell now where the robot is: not where it may be lost, nor where it does not register nodes."""
+        """Whether it can tell now where the robot is among the nodes since `lost_since`: not where it doubts that.
+
+        Nor where it does not register nodes.
+        """
 
     def recognise(self, node: int, expected: Array) -> RelativePose | None:
         """Register the frame that was observed last to the views about an older node; nothing is changed.

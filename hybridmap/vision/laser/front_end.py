@@ -202,7 +202,7 @@ class LaserFrontEnd:
     @property
     def follows(self) -> bool:
         """Whether registrations tell where the robot is; see `FollowingFrontEnd.follows`."""
-        return self._refines and not self.localisation.lost
+        return self._refines and not self.localisation.doubts
 
     def recognise(self, node: int, expected: Array) -> RelativePose | None:
         """Register the newest scan to those about an older node; see `FollowingFrontEnd.recognise`."""

@@ -264,9 +264,9 @@ class GlobalLocalisation:
         return self._broken_at
 
     @property
-    def lost(self) -> bool:
-        """Whether the robot's pose on the map may be wrong: also where it was not kidnapped for sure."""
-        return self._whereabouts.lost or self._broken_at is not None
+    def doubts(self) -> bool:
+        """Whether the robot's pose relative to the newest nodes may be wrong: nothing says since when."""
+        return self._whereabouts.lost and self._broken_at is None
 
     @property
     def since(self) -> int:
