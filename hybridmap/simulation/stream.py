@@ -44,9 +44,7 @@ class SimulatedStream:
     that much earlier: scans and frames are late against it.
     """
 
-    def __init__(
-        self, config: SimulationConfig, seed: int, window: Window = WHOLE, world: World | None = None
-    ) -> None:
+    def __init__(self, config: SimulationConfig, seed: int, window: Window = WHOLE, world: World | None = None) -> None:
         """Prepare a drive; the world is rendered while iterating.
 
         Args:
