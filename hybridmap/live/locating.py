@@ -59,12 +59,18 @@ class Locator:
         self.pose_base_map: Array | None = None
         self.error: HybridMapError | None = None
         self._folders, self._poses = (base, out), poses
+        self._guess: Array | None = None
         self._news, self._ended = threading.Event(), False
         self._process = PipedProcess("hybridmap.live.locating", yields=True)
         threading.Thread(target=self._run, name="hybridmap-locate", daemon=True).start()
 
     def look(self) -> None:
         """There may be new nodes."""
+        self._news.set()
+
+    def guess(self, pose_base_map: Array) -> None:
+        """Look at once, and first where the map of the drive is said to be, (3,) m and rad; believed only if views agree."""
+        self._guess = pose_base_map
         self._news.set()
 
     def close(self) -> None:
@@ -79,10 +85,11 @@ class Locator:
             self._news.wait()
             self._news.clear()
             poses = self._poses()
-            if self._ended or len(poses) < wanted:
+            guess = self._guess
+            if self._ended or len(poses) < (wanted if guess is None else 1):
                 continue
-            wanted = int(GROWTH * len(poses)) + 1
-            self._process.send([(*self._folders, poses)])
+            wanted, self._guess = int(GROWTH * len(poses)) + 1, None
+            self._process.send([(*self._folders, poses, guess)])
             try:
                 found = self._process.pipe.recv()
             except (EOFError, OSError):
@@ -90,7 +97,8 @@ class Locator:
             if isinstance(found, HybridMapError):
                 self.error, self._ended = None if self._ended else found, True
                 return
-            self.pose_base_map = found
+            if found is not None or guess is None:  # too few views, or a wrong guess, are no reason to give a place up
+                self.pose_base_map = found
 
 
 def require_map(base: Path) -> None:
@@ -103,13 +111,14 @@ def require_map(base: Path) -> None:
         Part.of(known)
 
 
-def locate(base: Path, out: Path, poses: Array) -> Array | HybridMapError | None:
+def locate(base: Path, out: Path, poses: Array, guess: Array | None = None) -> Array | HybridMapError | None:
     """(3,) pose of the map of a drive in the frame of a finished one, m and rad; None if it is not found.
 
     Args:
         base: session folder of the finished map.
         out: session folder of the drive, which may go on.
         poses: (N, 3) of its first nodes, m and rad.
+        guess: (3,) where the map of the drive may be, m and rad; None: nothing is known.
     """
     try:
         with MapStore.open(base) as known, MapStore.open(out) as drive:
@@ -117,7 +126,7 @@ def locate(base: Path, out: Path, poses: Array) -> Array | HybridMapError | None
             joint = JointMap(config, known.rig)
             joint.take_up(Part.of(known))
             nodes = joint.take_up(Part("the drive", _first(drive.map(), len(poses)), poses, drive.keyframe, drive.state))
-            if joint.join(nodes) is None:
+            if joint.join(nodes, guess) is None:
                 return None
             there, sure = on_map(joint, nodes, config)
     except HybridMapError as error:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from hybridmap.config import Config
 from hybridmap.errors import HybridMapError, LiveError
 from hybridmap.export.keyframes import OccupancyGrid
-from hybridmap.geometry import Array, compose
+from hybridmap.geometry import Array, compose, inverse
 from hybridmap.live import doctor
 from hybridmap.live.drawing import Artist
 from hybridmap.live.drive import LiveDrive, LiveReport
@@ -254,6 +254,14 @@ class LiveMapper:
             before.close()
         if locator is not None:
             locator.look()
+
+    def guess(self, pose_base_robot: ArrayLike) -> None:
+        """Say where the robot may be on the map that `localise` was given, (3,) m and rad: it is looked for there first.
+
+        It is believed only if views agree; a wrong one costs a search. Without `localise` it does nothing.
+        """
+        if self._locator is not None:
+            self._locator.guess(compose(np.asarray(pose_base_robot, dtype=np.float64), inverse(self.pose_map_robot())))
 
     def reset(self) -> None:
         """Leave the map and begin a new one in its place; waits until the step that is being done has ended."""

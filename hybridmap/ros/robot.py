@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -24,7 +25,7 @@ from hybridmap.ros.shown import PUBLISH_S, Shown
 from hybridmap.session import Session
 from hybridmap.streams.base import Rig, Sample, SelfMotion
 from hybridmap.streams.incoming import Incoming
-from hybridmap.streams.messages import Topic
+from hybridmap.streams.messages import Messages, RawMessage, Topic
 from hybridmap.streams.sensors import config_for
 from hybridmap.trajectory import NS_PER_S
 
@@ -114,7 +115,7 @@ class RobotNode:
         services = Services(self._require_mapper, given.out, given.map_frame, given.resolution_m, given.known_map)
         self._ros.offer(services.table)
         pose_type = "geometry_msgs/msg/PoseWithCovarianceStamped"
-        self._ros.subscribe(ros.INITIAL_POSE, pose_type, lambda *_: self._refuse_initial_pose())
+        self._ros.subscribe(ros.INITIAL_POSE, pose_type, self._guess)
         repeated = {"find": self._find, "map": self._show, "status": self._diagnose, "tf": self._correct}
         for name, do in repeated.items():
             wait_s = 1.0 / self._options.rate_hz if name == "tf" else _LOOK_S
@@ -263,8 +264,23 @@ class RobotNode:
             self._refused += 1
             self._ros.warn(f"left out: {error}")
 
-    def _refuse_initial_pose(self) -> None:
-        self._ros.warn("initialpose: ignored: the robot is looked for on the whole of the map that --map gives")
+    def _guess(self, data: bytes, definition: str | None) -> None:
+        """Look for the robot where an operator says that it is on the finished map."""
+        try:
+            messages = Messages(self._ros.source, self._ros.is_ros1, "its publisher sends another type than it says")
+            messages.define(ros.INITIAL_POSE, ros.POSE.msgtype, definition)
+            said = messages.decode(RawMessage(ros.INITIAL_POSE, 0, data))
+            pose = contents.pose_in(said)
+        except StreamError as error:
+            self._ros.warn(f"left out: {error}")
+            return
+        frame = said.header.frame_id.lstrip("/")
+        if self._options.known_map is None or self._mapper is None or frame != KNOWN_MAP or not all(map(math.isfinite, pose)):
+            wanted = f"finite numbers in the frame {KNOWN_MAP}, while mapping with --map"
+            self._ros.warn(f"initialpose: ignored: found {pose.round(2).tolist()} in the frame {frame!r}, expected {wanted}")
+            return
+        self._mapper.guess(pose)
+        self._ros.inform(f"initialpose: looking for the robot at {pose.round(2).tolist()} in {KNOWN_MAP} first")
 
     # ------------------------------------------------------------------ out
 

@@ -127,15 +127,22 @@ class JointMap:
         """
         return self._enter(self._vision.meet(node, self._belief(node)))
 
-    def join(self, nodes: range) -> float | None:
+    def join(self, nodes: range, guess: Array | None = None) -> float | None:
         """Look for the place of the map that was taken up last, which has these nodes, on those before it.
 
         Every node is compared, in order. If it is found, all poses are those of the joint map.
 
+        Args:
+            nodes: its nodes.
+            guess: (3,) pose of its frame in that of the map before, m and rad, where it is looked for first; None: anywhere.
+
         Returns:
             Travel from its first node to the one at which its place was known, m; None if it was not found.
         """
-        self._vision.arrive(nodes.start)
+        if guess is not None:
+            self.poses = self.poses.copy()
+            self.poses[nodes.start : nodes.stop] = compose(guess, self.poses[nodes.start : nodes.stop])
+        self._vision.arrive(nodes.start, guessed=guess is not None)
         found_m: float | None = None
         for node in nodes:
             accepted = self.meet(node)

@@ -232,8 +232,11 @@ class MeetingFrontEnd(FrontEnd, Protocol):
             StreamError: the arrays are not those of this sensor.
         """
 
-    def arrive(self, first: int) -> None:
-        """From now on, `meet` looks for loops from the nodes from `first` on to those before it, whose place is known."""
+    def arrive(self, first: int, *, guessed: bool = False) -> None:
+        """From now on, `meet` looks for loops from the nodes from `first` on to those before it, whose place is known.
+
+        If the poses of the new nodes are guessed, what is near there is compared first. It takes as much to believe it.
+        """
 
     def meet(self, node: int, belief: Belief) -> list[Edge]:
         """Look for loops of one node of the session that arrived, in the order of its nodes; all of them may be restored.

@@ -144,11 +144,18 @@ def test_a_robot_is_found_on_a_finished_map_which_stays_as_it_is(drive, recorded
         mapper.localise(recorded.folder.path)
         for sample in samples:
             mapper.add(sample)
+        mapper.guess((30.0, -20.0, 2.0))  # wrong: it is found all the same
         until(lambda: mapper.pose_base_map is not None)
         until(lambda: mapper.report.lag_s == 0.0)
         pose_base_map = mapper.pose_base_map
         assert pose_base_map is not None
         there = compose(pose_base_map, mapper.pose_map_robot())
+        mapper.localise(recorded.folder.path)
+        mapper.guess(there)  # right: looked for at once
+        until(lambda: mapper.pose_base_map is not None)
+        guessed = mapper.pose_base_map
+        assert guessed is not None
+        np.testing.assert_allclose(between(pose_base_map, guessed), np.zeros(3), atol=0.1)
         mapper.localise(None)
         assert mapper.pose_base_map is None
     off = between(read_tum(recorded.folder.trajectory / f"{recorded.head['primary_backend']}.tum").poses[-1], there)

@@ -260,9 +260,9 @@ class LaserFrontEnd:
         self._profiles.append(np.asarray(keyframe["profile"], dtype=np.float32))
         self._seen_from = node
 
-    def arrive(self, first: int) -> None:
+    def arrive(self, first: int, *, guessed: bool = False) -> None:
         """A session begins whose place on the map is to be found; see `MeetingFrontEnd.arrive`."""
-        self._meeting.arrive(first)
+        self._meeting.arrive(first, guessed=guessed)
 
     def meet(self, node: int, belief: Belief) -> list[Edge]:
         """Look for loops of a node to earlier sessions; see `MeetingFrontEnd.meet`."""

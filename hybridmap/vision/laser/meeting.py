@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.config.vision import VisionConfig
-from hybridmap.geometry import between
+from hybridmap.geometry import Array, between
 from hybridmap.graph.edges import Edge, Lack, Status
 from hybridmap.vision.base import Belief, known_nodes
 from hybridmap.vision.laser.commitment import Commitment
@@ -45,13 +45,14 @@ class ScanMeeting:
         self._new_key = new_key
         self._arrive(0)
 
-    def arrive(self, first: int) -> None:
-        """Look for the place of the nodes from `first` on; those before it are the map."""
+    def arrive(self, first: int, *, guessed: bool = False) -> None:
+        """Look for the place of the nodes from `first` on, first where they are guessed; those before it are the map."""
         self._panoramas.extend(to_the_end=True)
         self._arrive(first)
+        self._guessed = guessed
 
     def _arrive(self, first: int) -> None:
-        self._first, self._found = first, False
+        self._first, self._found, self._guessed = first, False, False
         self._relocaliser = Relocaliser(Whereabouts(0), self._new_key, SPAN_M)
         self._relocaliser.arrived(first)
         self._commitment = Commitment(self._atlas.travel_m.__getitem__)
@@ -73,27 +74,30 @@ class ScanMeeting:
         anchors = self._prober.anchors_before(self._first)
         if not anchors:
             return []
-        found = self._prober.probe_anywhere(
+        found = self._asked_there(node, belief, belief.poses_map_node.__getitem__) if self._guessed else []
+        found += self._prober.probe_anywhere(
             self._atlas.submap(node, self._recent(node)), self._localisation.most_similar(node, anchors)
         )
         settlement = self._relocaliser.settle(self._localisation.matches(found), belief)
         proposals = settlement.proposals
         if self._relocaliser.leading:
-            settlement = self._relocaliser.settle(self._localisation.matches(self._asked_there(node, belief)), belief)
+            leading, poses = self._relocaliser.leading, belief.poses_map_node
+            self._asked.update((edge.source, edge.target) for edge in leading)
+            asked = self._asked_there(node, belief, lambda one: placed_by(leading, one, poses))
+            settlement = self._relocaliser.settle(self._localisation.matches(asked), belief)
             proposals = proposals + settlement.proposals
         self._found = bool(settlement.accepted)
         return proposals
 
-    def _asked_there(self, node: int, belief: Belief) -> list[Hypothesis]:
-        """Register every node of the session up to a node where the matches that agree so far put it, once to each old submap.
+    def _asked_there(self, node: int, belief: Belief, placed: Callable[[int], Array]) -> list[Hypothesis]:
+        """Register every node of the session up to a node where `placed` puts it, once to each old submap.
 
         A search of the whole map looks closely at the few places that look most alike. The first metres look like many.
         """
         poses, anchors = belief.poses_map_node, np.array(self._prober.anchors_before(self._first))
-        self._asked.update((edge.source, edge.target) for edge in self._relocaliser.leading)
         found = []
         for asked in range(self._first, node + 1):
-            expected = between(poses[anchors], placed_by(self._relocaliser.leading, asked, poses))
+            expected = between(poses[anchors], placed(asked))
             nearest = np.argsort(np.hypot(expected[:, 0], expected[:, 1]), kind="stable")[:NEAREST].tolist()
             new = [i for i in nearest if (asked, int(anchors[i])) not in self._asked]
             self._asked.update((asked, int(anchors[i])) for i in new)

@@ -210,8 +210,9 @@ class RgbdFrontEnd:
         stance = Stance(np.asarray(keyframe["T_base_camera"]), tilt_sigma_rad, height_sigma_m, bool(was_held))
         self._keep(Keyframe(np.asarray(keyframe["profile"], dtype=np.float32), features, place(grid, stance)))
 
-    def arrive(self, first: int) -> None:
-        """A session begins whose place on the map is to be found; see `MeetingFrontEnd.arrive`."""
+    def arrive(self, first: int, *, guessed: bool = False) -> None:
+        """A session begins whose place on the map is to be found; see `MeetingFrontEnd.arrive`. All are compared anyway."""
+        del guessed
         self._meeting.arrive(first)
 
     def meet(self, node: int, belief: Belief) -> list[Edge]:
