@@ -28,6 +28,8 @@ from hybridmap.trajectory import NS_PER_S
 _DEEP, _PICTURES = 5000, 200
 _CONNECT_S = 120.0
 _SETTLE_S = 1.0
+_SWITCH_S = 0.0005
+"""As in the node: a pose that comes while a picture is sent is not to wait for it."""
 
 
 @dataclass
@@ -142,6 +144,7 @@ class Player:
 
 def main() -> None:
     """Play, and print what was heard."""
+    sys.setswitchinterval(_SWITCH_S)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("bag", type=Path)
     parser.add_argument("--rate", type=float, default=1.0)
