@@ -38,6 +38,18 @@ class Table(Generic[T]):
             raise self._error(f"{self._what} {name!r}: the name is taken; choose another name")
         self._registered[name] = factory
 
+    def require_elsewhere(self, name: str) -> None:
+        """Check that a process which runs no code of this program has the name, if this one has it.
+
+        Raises:
+            HybridMapError: it was registered by a call.
+        """
+        if name in self._registered:
+            raise self._error(
+                f"{self._what} {name!r}: registered by a call in this program, which the mapping process does not run; expected"
+                f" an entry point of the group {self._group} in an installed package"
+            )
+
     def names(self) -> tuple[str, ...]:
         """All names: ours first, then registered ones and those of installed packages."""
         return tuple(dict.fromkeys((*self._own, *self._registered, *(point.name for point in self._entry_points()))))

@@ -153,6 +153,7 @@ def overloaded(now: dict[str, Any], heard: Heard, slow: float, reference: Path |
     said = [reason for reason in now["reasons"] if reason["kind"] == "views dropped"]
     found: dict[str, Any] = {"slower": slow, "largest_lag_s": lag_s, "told": told, "counted": counted, "verdict": said}
     well = lag_s <= LAG_S and bool(told) == bool(counted) == bool(said)
+    reference = reference or next((keep / "offline" / "reference").glob("*.tum"), None)
     if reference is not None:
         found["error_live_m"], found["error_offline_m"] = (error_m(keep / name, reference) for name in ("live", "offline"))
         well = well and found["error_live_m"] <= ERROR_RATIO * found["error_offline_m"]
@@ -208,7 +209,12 @@ def main() -> int:
     parser.add_argument("--set", action="append", default=[], dest="settings", metavar="KEY=VALUE")
     parser.add_argument("--odometry-hz", type=float, default=None, help="odometry at this rate, interpolated")
     parser.add_argument("--overload", type=float, default=0.0, metavar="N", help="make mapping N times too slow for the rate")
-    parser.add_argument("--reference", type=Path, default=None, help="true trajectory (TUM), for the errors under overload")
+    parser.add_argument(
+        "--reference",
+        type=Path,
+        default=None,
+        help="true trajectory (TUM), for the errors under overload; default: the source's",
+    )
     parser.add_argument("--no-checks", action="store_true", help="the graph and the times alone, no services and transforms")
     parser.add_argument("--ros-folder", type=Path, default=None, help="default: ~/.cache/hybridmap/ros1 or ros2")
     parser.add_argument("--keep", type=Path, default=None, help="folder for the bag and both sessions; default: none is kept")

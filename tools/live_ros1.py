@@ -119,8 +119,11 @@ def play(drive: Drive, ros: Ros1, slow: float, heard: Heard, *, checks: bool) ->
         rospy = listen(ros, environment, drive.odometry, heard)
         client = Client(drive.odometry) if checks else None
         with _node(drive, out, environment, heard) as node:
-            with slowed(_mapping(node), slow):
-                _played(drive, ros, environment)
+            player = threading.Thread(target=_played, args=(drive, ros, environment))
+            player.start()
+            _wait_for(lambda: heard.status["state"] == "mapping" or not player.is_alive(), node)
+            with slowed(_mapping(node), slow):  # its start is no part of the drive
+                player.join()
             _wait_for(lambda: heard.status.get("lag, s") == "0.000", node)
             if client is not None:
                 heard.checks |= call_services(out, drive.folder)

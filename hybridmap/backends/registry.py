@@ -70,6 +70,11 @@ def register(name: str, factory: Factory) -> None:
     _TABLE.register(name, factory)
 
 
+def require_elsewhere(name: str) -> None:
+    """Check that a process which runs no code of this program has the back-end; see `Table.require_elsewhere`."""
+    _TABLE.require_elsewhere(name)
+
+
 def create(backend: str | Backend, config: BackendsConfig | None = None) -> Backend:
     """Make a back-end by its name, in its initial state, with the pre-filter before it if configured.
 

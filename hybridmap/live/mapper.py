@@ -25,7 +25,7 @@ from hybridmap.live.locating import Locator
 from hybridmap.live.messages import Ask, Begin, Done, Dropped, End, Ready, Reset, Save, Saved, Snapshot
 from hybridmap.live.odometry import SmoothedCorrection
 from hybridmap.live.process import MappingProcess
-from hybridmap.live.samples import check, check_kind, stamp_ns_of, used
+from hybridmap.live.samples import check, check_kind, require_elsewhere, stamp_ns_of, used
 from hybridmap.session import Session
 from hybridmap.streams.base import Observation, Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.laser import LaserScan
@@ -75,10 +75,12 @@ class LiveMapper:
             process: one that was started before, so that less has to be waited for.
 
         Raises:
-            ConfigError, BackendError, StreamError: the configuration names something that does not exist.
+            ConfigError, BackendError, StreamError: the configuration names something that does not exist, or that is registered
+                in this program alone.
             OutputError: the folder cannot be used, or another run is writing there.
             LiveError: the mapping process cannot be started.
         """
+        require_elsewhere(config, rig)
         self._limits, self._rig = limits or LiveLimits(), used(rig, config.vision.sensor)
         self._changed = threading.Condition()
         self._outgoing: list[Any] = []  # messages that go before any sample

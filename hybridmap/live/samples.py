@@ -6,18 +6,34 @@ import math
 
 import numpy as np
 
+from hybridmap.backends import registry
+from hybridmap.config import Config
 from hybridmap.errors import StreamError
 from hybridmap.streams.base import Motion, Rig, Sample, SelfMotion, Velocity
 from hybridmap.streams.laser import LaserScan
 from hybridmap.streams.rgbd import RgbdFrame, checked_frame
-from hybridmap.streams.sensors import carried, kind_of, wanted
+from hybridmap.streams.sensors import SENSORS, carried, kind_of, wanted
 from hybridmap.trajectory import format_stamp, stamp_ns_from_s
+from hybridmap.vision import FRONT_ENDS
 
 
 def used(rig: Rig, sensor: str) -> Rig:
     """The sensors of a rig that a value of `vision.sensor` maps with: for `auto`, the first kind of the table."""
     chosen = [(kind.sensor_name, one) for kind, one in carried(rig) if kind in wanted(sensor)]
     return Rig(**dict(chosen[:1] if sensor == "auto" else chosen))
+
+
+def require_elsewhere(config: Config, rig: Rig) -> None:
+    """Refuse sensors, front-ends and back-ends that the mapping process cannot have.
+
+    Raises:
+        ConfigError, BackendError: one is registered by a call in this program, and not by an entry point.
+    """
+    for name in config.backends.names:
+        registry.require_elsewhere(name)
+    FRONT_ENDS.require_elsewhere(config.vision.sensor)
+    for kind, _ in carried(rig):
+        SENSORS.require_elsewhere(kind.name)
 
 
 def stamp_ns_of(stamp_s: float) -> int:

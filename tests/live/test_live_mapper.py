@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from hybridmap import session
+from hybridmap.backends import registry
 from hybridmap.config import Config
-from hybridmap.errors import ExportError, LiveError, OutputError, StoreError, StreamError
+from hybridmap.errors import BackendError, ExportError, LiveError, OutputError, StoreError, StreamError
 from hybridmap.export.formats import ExportOptions, open_view
 from hybridmap.geometry import between, compose, inverse
 from hybridmap.live import LiveLimits, LiveMapper
@@ -216,6 +217,14 @@ def test_a_robot_whose_program_dies_keeps_its_map(tmp_path):
         assert store.ended
     recorded = session.run(RoomDrive(laps=0.5), CONFIG, tmp_path / "recorded")
     assert SessionFolder(tmp_path / "s").read_metrics().head["graph_hash"] == recorded.head["graph_hash"]
+
+
+def test_what_is_registered_in_this_program_alone_is_refused_at_the_start(tmp_path, monkeypatch):
+    monkeypatch.setattr(registry._TABLE, "_registered", {})  # as there is no way to take a name back
+    registry.register("mine", lambda config: registry.create("gtsam-gnc", config))
+    with pytest.raises(BackendError, match=r"'mine'.*hybridmap\.backends"):
+        LiveMapper(Config.load("laser", {"backends.names": ["gtsam-gnc", "mine"]}), RoomDrive().rig, tmp_path / "s")
+    assert not (tmp_path / "s").exists()
 
 
 @pytest.mark.parametrize("repeatable", [True, False])
