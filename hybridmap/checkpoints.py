@@ -50,7 +50,7 @@ class Drive:
         recorder: writes what the mapper did.
         taken: number of samples so far.
         observations: how many of them are observations.
-        first_ns: stamps of the first few samples, ns.
+        first_ns: stamps of the first few samples, ns, as they were taken.
         report: what reading the stream has found so far.
         mark: how far the map file was written at the last checkpoint.
     """
@@ -208,8 +208,9 @@ def _last(folder: SessionFolder, stream: Stream, config: Config) -> Resumable:
             raise _another(
                 folder, f"hybridmap: found {version('hybridmap')}, expected the same code as before ({origin.version})"
             )
-        here = _origin(stream, config, tuple(sample.stamp_ns for sample in islice(stream, len(origin.first_ns))))
-        if here != origin:
+        seekable = isinstance(stream, SeekableStream)  # which is not opened for this
+        first = () if seekable else tuple(sample.stamp_ns for sample in islice(stream, len(origin.first_ns)))
+        if _origin(stream, config, first) != origin:
             raise _another(folder, f"source: {stream.name} has other samples than before")
         found = checkpoint.read(folder.checkpoint, {"store": None, **_sections(config)})
         drive = found.state
@@ -232,7 +233,7 @@ def _origin(stream: Stream, config: Config, first_ns: tuple[int, ...]) -> Origin
         config=config.to_yaml(),
         source=stream.name,
         expected=stream.expected_observations,
-        first_ns=first_ns,
+        first_ns=stream.first_stamps(_FIRST) if isinstance(stream, SeekableStream) else first_ns,
     )
 
 

@@ -20,11 +20,14 @@ from hybridmap.cli.app import app
 from hybridmap.config import Config
 from hybridmap.errors import BackendError, ConfigError, OutputError, StoreError, StreamError
 from hybridmap.mapper import Mapper
+from hybridmap.simulation import SimulatedStream
+from hybridmap.simulation.sensor_models import CameraModel
 from hybridmap.store import SessionFolder, checkpoint
 from hybridmap.store.checkpoint import UnusableError
 from hybridmap.streams import open_stream
 from hybridmap.streams.base import SeekableStream
 from hybridmap.streams.rgbd import RgbdFrame
+from hybridmap.trajectory import NS_PER_S
 from tests.streams_for_tests import RoomDrive
 
 CONFIG = Config.load("laser", {"backends.names": ["gtsam-gnc", "relaxation-ratslam"]})
@@ -255,6 +258,7 @@ def test_a_stream_goes_on_with_the_same_samples(taken):
     assert isinstance(stream, SeekableStream)
     whole = list(stream)
     counts = dict(stream.report.counts)
+    assert stream.first_stamps(3) == tuple(sample.stamp_ns for sample in whole[:3])
     samples = iter(stream)
     for _ in range(taken):
         next(samples)
@@ -263,6 +267,69 @@ def test_a_stream_goes_on_with_the_same_samples(taken):
     frames = [[one for one in samples if isinstance(one, RgbdFrame)] for samples in (onward, whole[taken:])]
     assert all(np.array_equal(a.color, b.color) for a, b in zip(*frames, strict=True))
     assert stream.report.counts == counts
+
+
+def test_a_part_of_a_simulated_drive_is_that_of_the_whole_and_is_not_rendered_again(monkeypatch):
+    config = Config.load("lab", {"simulation.duration_s": 2.0, "simulation.sensors": "rgbd", "simulation.camera.rate_hz": 5.0})
+    whole = list(open_stream("lab", config))
+    part = open_stream("lab", config, start_s=0.5, end_s=1.5)
+    samples, first = list(part), whole[0].stamp_ns
+    expected = [sample for sample in whole if 0.5 <= (sample.stamp_ns - first) / 1e9 <= 1.5]
+    assert [sample.stamp_ns for sample in samples] == [sample.stamp_ns for sample in expected]
+    frames = [[one for one in some if isinstance(one, RgbdFrame)] for some in (samples, expected)]
+    assert len(frames[0]) == part.expected_observations == part.report.counts["frames"]
+    assert all(np.array_equal(a.color, b.color) for a, b in zip(*frames, strict=True))
+    rendered: list[int] = []
+    frame = CameraModel.frame
+
+    def counted(*given):
+        rendered.append(given[1])
+        return frame(*given)
+
+    monkeypatch.setattr(CameraModel, "frame", counted)
+    assert isinstance(part, SeekableStream)
+    assert len(list(part.onward(len(samples) - 8, part.report))) == 8
+    assert len(rendered) < 3
+    with pytest.raises(StreamError, match="no odometry between --start and --end"):
+        open_stream("lab", config, start_s=100.0)
+
+
+@pytest.mark.parametrize("left", [0, 10, 5000, -20000])
+def test_a_run_whose_map_is_damaged_is_not_resumed_and_what_to_do_is_said(unbroken, tmp_path, left):
+    """Cut to so many bytes, or damaged in so many bytes before its end."""
+    broken_off(tmp_path / "s")
+    path = tmp_path / "s" / "map.db"
+    with sqlite3.connect(path) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    connection.close()
+    content = path.read_bytes()
+    path.write_bytes(content[:left] if left >= 0 else content[:left] + bytes(-left))
+    with pytest.raises(StoreError, match=r"map\.db.*--overwrite"):
+        session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "s", resume=True)
+    assert path.is_file()
+    session.run(RoomDrive(laps=2.2), CONFIG, tmp_path / "s", overwrite=True)
+    assert contents(tmp_path / "s") == unbroken
+
+
+@pytest.mark.usefixtures("often")
+def test_a_resumed_run_opens_its_source_once(tmp_path):
+    config = Config.load("lab", {"simulation.duration_s": 4.0, "vision.sensor": "none", "backends.names": ["odometry"]})
+    opened: list[int] = []
+
+    class Counted(SimulatedStream):
+        def onward(self, taken, report):
+            opened.append(taken)
+            for sample in super().onward(taken, report):
+                if sample.stamp_ns > self.first_stamps(1)[0] + 3 * NS_PER_S and len(opened) == 1:
+                    raise StreamError("the cable is loose")
+                yield sample
+
+    stream = Counted(config.simulation, 0)
+    with pytest.raises(StreamError, match="cable"):
+        session.run(stream, config, tmp_path / "s")
+    session.run(stream, config, tmp_path / "s", resume=True)
+    assert len(opened) == 2
+    assert opened[1] > 60
 
 
 ROOM = ("laser", "scan-to-map", "bionic-laser", "campus")

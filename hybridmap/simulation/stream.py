@@ -139,6 +139,10 @@ class SimulatedStream:
         """Yield odometry, frames and scans by stamp; at equal stamps in this order."""
         return self.onward(0, StreamReport(remarks=self._remarks()))
 
+    def first_stamps(self, count: int) -> tuple[int, ...]:
+        """Stamps of the first samples, ns; see `SeekableStream`."""
+        return tuple(stamp for _, stamp, _ in islice(self._in_order(), count))
+
     def onward(self, taken: int, report: StreamReport) -> Iterator[Sample]:
         """Iterate without the first `taken` samples, which are not rendered; see `SeekableStream`."""
         self._report = report

@@ -65,7 +65,7 @@ def _reading(
             return method(self, *args, **named)
         except _DAMAGE as error:
             raise StoreError(
-                f"{self.path}: damaged: {quoted(f'{error or type(error).__name__}')[1:-1]}; map the source again"
+                f"{self.path}: damaged: {quoted(f'{error or type(error).__name__}')[1:-1]}; {schema.AGAIN}"
             ) from None
 
     return update_wrapper(guarded, method)

@@ -31,6 +31,9 @@ APPLICATION_ID = 0x68796D70
 
 MAP_NAME = "map.db"
 
+AGAIN = "map the source again, into the same folder with --overwrite"
+"""What to do about a damaged map."""
+
 RATSLAM_ACTIONS = "ratslam_actions"
 """Key of the TopologicalActions that an imported map was made of: [sample of the track, stamp ns, action, src, dest, rad]."""
 DURATION_S = "duration_s"
@@ -138,19 +141,23 @@ def check(connection: sqlite3.Connection, path: Path) -> None:
     except sqlite3.Error as error:
         found = str(error)
     if found != "ok":
-        raise StoreError(f"{path}: damaged: {' '.join(found.split())}; map the source again")
+        raise StoreError(f"{path}: damaged: {' '.join(found.split())}; {AGAIN}")
 
 
 def _opened(path: Path, mode: str, versions: tuple[int, ...]) -> tuple[sqlite3.Connection, int]:
     """Open a map file of one of these versions in a mode of SQLite; returns its version, too."""
     if not path.is_file():
         raise StoreError(f"{path}: no such map file; expected a session folder, as `hybridmap map SOURCE --out DIR` writes it")
+    if path.stat().st_size == 0:
+        raise StoreError(f"{path}: is empty; {AGAIN}")
     try:
         connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode={mode}", uri=True)
         application = connection.execute("PRAGMA application_id").fetchone()[0]
         version = connection.execute("PRAGMA user_version").fetchone()[0]
     except sqlite3.Error as error:
-        raise StoreError(f"{path}: not a map file ({error}); expected one that `hybridmap map` wrote") from None
+        raise StoreError(
+            f"{path}: not a map file ({error}); expected one that `hybridmap map` wrote; if it is damaged, {AGAIN}"
+        ) from None
     if application != APPLICATION_ID:
         connection.close()
         raise StoreError(f"{path}: an SQLite file, but not a map of hybridmap; expected the one in a session folder")

@@ -323,6 +323,9 @@ class Stream(Protocol):
 class SeekableStream(Stream, Protocol):
     """A stream that can leave out its first samples without the work of making them."""
 
+    def first_stamps(self, count: int) -> tuple[int, ...]:
+        """Stamps of the first samples, ns, of `count` or all, also of those that turn out to be damaged; nothing is read."""
+
     def onward(self, taken: int, report: StreamReport) -> Iterator[Sample]:
         """Iterate as always, but without the first `taken` samples.
 

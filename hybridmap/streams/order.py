@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -116,6 +117,11 @@ def check_overlap(motion_ns: Stamps, observation_ns: Stamps, what: str) -> None:
 
 def _span(stamps_ns: Stamps) -> str:
     return f"{format_stamp(int(stamps_ns[0]))} to {format_stamp(int(stamps_ns[-1]))} s"
+
+
+def first_of(count: int, *stamps_ns: Iterable[int]) -> tuple[int, ...]:
+    """The first stamps of sorted lists together, ns; `count` of them, or all."""
+    return tuple(int(stamp) for stamp in islice(heapq.merge(*stamps_ns), count))
 
 
 class Stamped(Protocol):

@@ -27,7 +27,7 @@ from hybridmap.streams.base import (
 )
 from hybridmap.streams.layout import plan_sensor, self_motion
 from hybridmap.streams.messages import TRANSFORM, RawMessage
-from hybridmap.streams.order import Window, check_overlap, merge
+from hybridmap.streams.order import Window, check_overlap, first_of, merge
 from hybridmap.streams.sensors import kind_of, kinds, message_types
 from hybridmap.trajectory import Trajectory
 
@@ -115,6 +115,10 @@ class BagStream:
             StreamError: a message is damaged; the message names topic and place.
         """
         return self.onward(0, StreamReport(dict(self.losses), list(self.remarks), dict(self.lost)))
+
+    def first_stamps(self, count: int) -> tuple[int, ...]:
+        """Stamps of the first samples, ns; see `SeekableStream`."""
+        return first_of(count, self._motion_ns, (planned.stamp_ns for planned in self._planned))
 
     def onward(self, taken: int, report: StreamReport) -> Iterator[Sample]:
         """Iterate without the first `taken` samples, whose messages are read and not decoded; see `SeekableStream`.

@@ -27,7 +27,7 @@ from hybridmap.streams.cameras import (
     mounted,
 )
 from hybridmap.streams.mounting import invert, matrix, planar
-from hybridmap.streams.order import Window, check_overlap, merge, sorted_order
+from hybridmap.streams.order import Window, check_overlap, first_of, merge, sorted_order
 from hybridmap.streams.pairing import pair_nearest
 from hybridmap.streams.rgbd import RGBD, RgbdFrame, pinhole
 from hybridmap.streams.sensors import wanted
@@ -98,6 +98,10 @@ class TumStream:
             StreamError: an image is damaged, or of another size or kind than expected.
         """
         return self.onward(0, StreamReport(dict(self.losses), list(self.remarks)))
+
+    def first_stamps(self, count: int) -> tuple[int, ...]:
+        """Stamps of the first samples, ns; see `SeekableStream`."""
+        return first_of(count, self._odometry.stamps_ns, (pair.stamp_ns for pair in self._pairs))
 
     def onward(self, taken: int, report: StreamReport) -> Iterator[Sample]:
         """Iterate without the first `taken` samples, whose pictures are not read; see `SeekableStream`.
