@@ -2,48 +2,88 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from hybridmap.backends import objective
-from hybridmap.backends.base import ODOMETRY, SolveReport
+from hybridmap.backends.base import ODOMETRY, Solution, SolveReport
 from hybridmap.calibration.clock import ClockOffset
 from hybridmap.graph.edges import Edge, EdgeKind, Proposer, Status
+from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.graph.gaps import kidnappings, unobserved
 from hybridmap.graph.io import graph_hash
 from hybridmap.mapper import Mapper
 from hybridmap.metrics import Metric, figure
 from hybridmap.streams.base import Stream, StreamReport
-from hybridmap.verdict import Facts, reasons_of, said_of
+from hybridmap.verdict import Facts, Reason, reasons_of, said_of
 
 CORRECTED_ODOMETRY = "odometry, gains corrected"
 """Title of odometry where gains that were found while driving are in it: it is better than what the wheels said."""
 
 
-def head_of(mapper: Mapper, stream: Stream) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """What is known of how a map was made beside its graph.
+
+    Attributes:
+        titles: what back-ends are called for people, where it is not their name.
+        failed_backends: back-end -> why it failed.
+        stream: kind of message -> how many were read.
+        lost: topic -> [messages that are missing or damaged, messages in all].
+        remarks: what people should know.
+    """
+
+    titles: dict[str, str] = field(default_factory=dict)
+    failed_backends: dict[str, str] = field(default_factory=dict)
+    stream: dict[str, int] = field(default_factory=dict)
+    lost: dict[str, list[int]] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+
+def head_of_map(
+    experiences: ExperienceMap, reasons: Sequence[Reason], backends: Sequence[str], source: str, origin: Origin
+) -> dict[str, Any]:
     """The keys of `metrics.json` beside the list of metrics: the verdict, the hash of the graph, what was read and assumed.
 
-    Both are as they are at the end of the drive.
+    Args:
+        experiences: the map.
+        reasons: what speaks against it.
+        backends: names of the back-ends, the primary one first.
+        source: what was mapped, for people.
+        origin: how it was made.
     """
-    offset = mapper.calibration.clock.offset
     return {
-        **said_of(reasons_of(facts_of(mapper, stream.report))),
-        "graph_hash": graph_hash(mapper.map),
-        "primary_backend": mapper.backends.primary,
-        "backends": list(mapper.backends.names),
-        "titles": {ODOMETRY: CORRECTED_ODOMETRY} if mapper.calibration.changes else {},
-        "source": stream.name,
-        "failed_backends": dict(mapper.backends.failures),
-        "stream": dict(stream.report.counts),
-        "lost": {name: list(counts) for name, counts in stream.report.lost.items()},
-        "remarks": [
+        **said_of(reasons),
+        "graph_hash": graph_hash(experiences),
+        "primary_backend": backends[0],
+        "backends": list(backends),
+        "titles": origin.titles,
+        "source": source,
+        "failed_backends": origin.failed_backends,
+        "stream": origin.stream,
+        "lost": origin.lost,
+        "remarks": origin.remarks,
+    }
+
+
+def head_of(mapper: Mapper, stream: Stream) -> dict[str, Any]:
+    """The keys of `metrics.json` beside the list of metrics, as they are at the end of a drive."""
+    offset = mapper.calibration.clock.offset
+    origin = Origin(
+        titles={ODOMETRY: CORRECTED_ODOMETRY} if mapper.calibration.changes else {},
+        failed_backends=dict(mapper.backends.failures),
+        stream=dict(stream.report.counts),
+        lost={name: list(counts) for name, counts in stream.report.lost.items()},
+        remarks=[
             *stream.report.remarks,
             *stream.report.skips,
             *map(str, mapper.calibration.changes),
             *([str(offset)] if offset.used_s else []),
             *map(str, kidnappings(mapper.map)),
         ],
-    }
+    )
+    return head_of_map(mapper.map, reasons_of(facts_of(mapper, stream.report)), mapper.backends.names, stream.name, origin)
 
 
 def facts_of(mapper: Mapper, report: StreamReport) -> Facts:
@@ -96,6 +136,36 @@ def _measured_again(mapper: Mapper) -> list[Metric]:
     ]
 
 
+def counts_of(experiences: ExperienceMap) -> list[Metric]:
+    """How many nodes and loops a map has."""
+    loops = [edge for edge in experiences.edges if edge.kind is EdgeKind.LOOP]
+    count = {status: float(sum(edge.status is status for edge in loops)) for status in Status}
+    return [
+        figure("nodes", len(experiences)),
+        figure("loops_accepted", count[Status.ACCEPTED]),
+        figure("loops_pending", count[Status.PENDING]),
+        figure("loops_rejected", count[Status.REJECTED]),
+        figure("loops_retracted", count[Status.RETRACTED]),
+        *_proposed_by(loops),
+    ]
+
+
+def solved(experiences: ExperienceMap, solutions: Mapping[str, Solution]) -> list[Metric]:
+    """How well each back-end's solution of a map meets its edges, and what it rejected."""
+    graph = experiences.pose_graph()
+    chain = objective.chi2(graph, graph.initial)
+    rows = [figure(f"chi2_initial/{ODOMETRY}", chain), figure(f"chi2/{ODOMETRY}", chain)]
+    for name, solution in solutions.items():
+        if name != ODOMETRY:
+            rows += [
+                figure(f"chi2_initial/{name}", chain),
+                figure(f"chi2/{name}", objective.chi2(graph, solution.poses)),
+                figure(f"loops_rejected/{name}", len(solution.report.rejected_edge_ids)),
+                *_weak(name, solution.report),
+            ]
+    return rows
+
+
 def _learnt_noise(mapper: Mapper) -> list[Metric]:
     learnt = mapper.book.motion.wheels.learnt
     if learnt is None:
@@ -112,18 +182,10 @@ def figures_of(mapper: Mapper, largest_correction_m: float, duration_s: float) -
         largest_correction_m: largest shift of a node by one update.
         duration_s: time from the first to the last stamp.
     """
-    edges = mapper.map.edges
-    loops = [edge for edge in edges if edge.kind is EdgeKind.LOOP]
-    dropped = [edge for edge in edges if edge.kind is EdgeKind.ODOMETRY and edge.status is not Status.ACCEPTED]
-    count = {status: float(sum(edge.status is status for edge in loops)) for status in Status}
+    dropped = [e for e in mapper.map.edges if e.kind is EdgeKind.ODOMETRY and e.status is not Status.ACCEPTED]
     rows = [
-        figure("nodes", len(mapper.map)),
+        *counts_of(mapper.map),
         *([figure("nodes_reused", mapper.known_places.followed)] if mapper.known_places.followed else []),
-        figure("loops_accepted", count[Status.ACCEPTED]),
-        figure("loops_pending", count[Status.PENDING]),
-        figure("loops_rejected", count[Status.REJECTED]),
-        figure("loops_retracted", count[Status.RETRACTED]),
-        *_proposed_by(loops),
         *_measured_again(mapper),
         figure("odometry_dropped", len(dropped)),
         *_learnt_noise(mapper),
@@ -132,19 +194,7 @@ def figures_of(mapper: Mapper, largest_correction_m: float, duration_s: float) -
         figure("travel", mapper.map.node(len(mapper.map) - 1).travel_m),
         figure("duration", duration_s),
     ]
-    graph = mapper.map.pose_graph()
-    chain = objective.chi2(graph, graph.initial)
-    rows += [figure(f"chi2_initial/{ODOMETRY}", chain), figure(f"chi2/{ODOMETRY}", chain)]
-    for name, solution in mapper.backends.solutions.items():
-        if name == ODOMETRY:
-            continue
-        report = solution.report
-        rows += [
-            figure(f"chi2_initial/{name}", chain),
-            figure(f"chi2/{name}", objective.chi2(graph, solution.poses)),
-            figure(f"loops_rejected/{name}", len(report.rejected_edge_ids)),
-            *_weak(name, report),
-        ]
+    rows += solved(mapper.map, mapper.backends.solutions)
     rows += [figure(f"cpu_s/{stage}", cpu_s, what="the stage") for stage, cpu_s in mapper.clock.cpu_s.items()]
     total = sum(mapper.clock.cpu_s.values())
     rows.append(figure("cpu_s/mapping", total, what="all stages"))

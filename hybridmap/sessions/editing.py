@@ -16,7 +16,8 @@ from hybridmap.geometry import Array, RelativePose
 from hybridmap.graph.edges import Edge, EdgeKind, Lack, Method, Status
 from hybridmap.graph.io import graph_hash
 from hybridmap.output import write_bytes, write_text
-from hybridmap.sessions.joining import FIGURES, Joined, conclude, config_of, describe, write_trajectories
+from hybridmap.sessions.drives import FIGURES
+from hybridmap.sessions.joining import Joined, conclude, config_of, describe, write_trajectories
 from hybridmap.sessions.joint_map import solutions_of
 from hybridmap.sessions.part import finished
 from hybridmap.store import MapStore
@@ -145,12 +146,11 @@ def _written(
     primary = finished(whole).poses
     ends = [*(one.first_node for one in sessions[1:]), len(primary)]
     poses = np.concatenate([primary[sessions[number].first_node : ends[number]] for number in numbers])
+    alone = read.read_metrics().head
     with folder.writing(overwrite=overwrite):
         folder.write_config(whole.config_yaml)
         for there, truth in truths.items():
-            if len(numbers) > 1:
-                write_bytes(folder.groundtruth_of(there, newest=False), truth)
-            write_bytes(folder.groundtruth, truth)
+            write_bytes(folder.groundtruth_of(there, newest=False) if len(numbers) > 1 else folder.groundtruth, truth)
         with MapStore.create(folder.path, whole.config_yaml, whole.rig, whole.source) as store:
             copy_sessions(whole, store, numbers)
             if kept is not None and len(numbers) == 1 and store.info("graph_hash") == graph_hash(store.map()):
@@ -159,7 +159,7 @@ def _written(
                 store.put_edge(number, edge)
             describe(store, whole, " + ".join(one.source for one in store.sessions()))
             solutions = solutions_of(store.map(), poses, config.backends.names, config.backends)
-            return conclude(store, folder, solutions, config)
+            return conclude(store, folder, solutions, config, alone if len(sessions) == 1 else None)
 
 
 def _as_before(store: MapStore, folder: SessionFolder) -> Joined:
@@ -169,8 +169,6 @@ def _as_before(store: MapStore, folder: SessionFolder) -> Joined:
     store.commit()
     folder.write_config(store.config_yaml)
     write_trajectories(store, folder, {name: solution.poses for name, solution in store.solutions().items()})
-    for name in store.online_backends():
-        folder.write_trajectory(f"{name}_online", store.online(name))
     if figures is not None:
         write_text(folder.metrics_json, figures)
     found = folder.read_metrics()

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from hybridmap.backends.base import ODOMETRY, Solution
+from hybridmap.conclusion import counts_of, head_of_map, solved
 from hybridmap.config import Config
 from hybridmap.config.gone import without_gone
 from hybridmap.errors import StoreError, counted
 from hybridmap.geometry import IDENTITY, Array, compose, inverse
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.experience_map import ExperienceMap
-from hybridmap.graph.io import graph_hash
 from hybridmap.metrics import Metric, figure
 from hybridmap.output import write_bytes
 from hybridmap.session import Progress, run
 from hybridmap.sessions.assembly import assembled, changed_by_hand
+from hybridmap.sessions.drives import FIGURES, Drives
 from hybridmap.sessions.joint_map import joined_sessions, solutions_of
 from hybridmap.sessions.part import finished
 from hybridmap.store import MapStore
@@ -30,10 +30,8 @@ from hybridmap.store.records import rig_to_json
 from hybridmap.store.session_folder import SessionFolder
 from hybridmap.store.track import trajectory_of
 from hybridmap.streams.base import Rig, Stream
-from hybridmap.verdict import Facts, Reason, reasons_of, said_of
-
-FIGURES = "metrics_json"
-"""Key of the facts of a session under which `metrics.json` is kept as it was before the session was joined to others."""
+from hybridmap.trajectory import NS_PER_S
+from hybridmap.verdict import Facts, Reason, Verdict, reasons_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +127,13 @@ def map_onto(
         return _joined([base, Path(alone) / "session"], out, overwrite, onto=True)
 
 
-def conclude(store: MapStore, folder: SessionFolder, solutions: Mapping[str, Solution], config: Config) -> Joined:
+def conclude(
+    store: MapStore,
+    folder: SessionFolder,
+    solutions: Mapping[str, Solution],
+    config: Config,
+    alone: dict[str, Any] | None = None,
+) -> Joined:
     """Write what is known of a map of several sessions once it is solved: frames, solutions, trajectories, figures, verdict.
 
     Args:
@@ -137,34 +141,42 @@ def conclude(store: MapStore, folder: SessionFolder, solutions: Mapping[str, Sol
         folder: where it is.
         solutions: poses of all nodes by each back-end.
         config: names the back-ends; the first is the primary one.
+        alone: of a map of one session, what its `metrics.json` held beside the metrics.
     """
     primary = config.backends.names[0]
     _write_frames(store, solutions[primary].poses)
-    experiences, sessions = store.map(), store.sessions()
-    pieces, lost = joined_sessions(experiences), _lost(store)
+    experiences, drives = store.map(), Drives.of(store, alone)
+    pieces = joined_sessions(experiences)
     for name, solution in solutions.items():
         store.put_solution(name, solution.poses, solution.report)
     write_trajectories(store, folder, {name: solution.poses for name, solution in solutions.items()})
-    head = {
-        **said_of(_reasons(experiences, solutions[primary], primary, pieces, lost)),
-        "graph_hash": graph_hash(experiences),
-        "primary_backend": primary,
-        "backends": list(solutions),
-        "source": store.source,
-        "sessions": [
-            {"number": one.number, "name": one.name, "source": one.source, "piece": _piece_of(one.number, pieces)}
-            for one in sessions
-        ],
-        "joined": len(pieces) == 1,
-        "lost": lost,
-        "remarks": [] if len(pieces) == 1 else [_not_joined(store, pieces)],
-    }
-    metrics = _figures(experiences, pieces)
+    show_truth(folder, len(store.sessions()))
+    lost = {name: (gone, stated) for name, (gone, stated) in drives.origin.lost.items()}
+    head = head_of_map(
+        experiences,
+        _reasons(experiences, solutions[primary], primary, pieces, lost),
+        [primary, *(name for name in solutions if name != primary)],
+        store.source,
+        replace(drives.origin, remarks=[*([_not_joined(store, pieces)] if len(pieces) > 1 else []), *drives.origin.remarks]),
+    )
+    head["reasons"] = [*head["reasons"], *drives.doubts]
+    verdicts = [Verdict(reason["verdict"]) for reason in head["reasons"]]
+    head["verdict"] = str(max(verdicts, key=lambda verdict: verdict.grade, default=Verdict.TRUSTED))
+    if len(store.sessions()) > 1:
+        head |= {"sessions": _sessions(store, pieces), "joined": len(pieces) == 1}
+    metrics = _figures(store, experiences, pieces, solutions)
     folder.write_metrics(head, metrics)
     for key in ("graph_hash", "primary_backend"):
         store.put_info(key, head[key])
     store.commit()
     return Joined(folder, len(pieces) == 1, head, metrics)
+
+
+def show_truth(folder: SessionFolder, sessions: int) -> None:
+    """Make the truth of the newest of several sessions that of the folder, if it is known; that of another judges nothing."""
+    newest = folder.groundtruth_of(sessions - 1, newest=False)
+    if newest.is_file():
+        write_bytes(folder.groundtruth, newest.read_bytes())
 
 
 def write_trajectories(store: MapStore, folder: SessionFolder, poses_of: Mapping[str, Array]) -> None:
@@ -176,6 +188,8 @@ def write_trajectories(store: MapStore, folder: SessionFolder, poses_of: Mapping
         for name, poses in poses_of.items():
             if name != ODOMETRY:
                 folder.write_trajectory(f"{place}{name}", trajectory_of(track, poses))
+    for name in store.online_backends() if len(sessions) == 1 else ():
+        folder.write_trajectory(f"{name}_online", store.online(name))
 
 
 def describe(store: MapStore, like: MapStore, source: str) -> None:
@@ -199,7 +213,6 @@ def keep_files(part: SessionFolder, source: MapStore, folder: SessionFolder, sto
         own = part.groundtruth_of(number, newest=number == count - 1)
         if own.is_file():
             write_bytes(folder.groundtruth_of(first + number, newest=False), own.read_bytes())
-            write_bytes(folder.groundtruth, own.read_bytes())
 
 
 def config_of(store: MapStore) -> Config:
@@ -250,25 +263,25 @@ def _reasons(
     return reasons_of(Facts.of_drive(experiences, solution, primary, lost=lost))
 
 
-def _lost(store: MapStore) -> dict[str, tuple[int, int]]:
-    """What the streams of all sessions lost: name -> (messages that were lost, messages that there were)."""
-    lost: dict[str, tuple[int, int]] = {}
-    for (text,) in store.rows("SELECT value FROM info WHERE key = ? ORDER BY session", (FIGURES,)):
-        for name, (gone, stated) in json.loads(text).get("lost", {}).items():
-            before = lost.get(name, (0, 0))
-            lost[name] = before[0] + gone, before[1] + stated
-    return lost
+def _sessions(store: MapStore, pieces: list[list[int]]) -> list[dict[str, Any]]:
+    return [
+        {"number": one.number, "name": one.name, "source": one.source, "piece": _piece_of(one.number, pieces)}
+        for one in store.sessions()
+    ]
 
 
-def _figures(experiences: ExperienceMap, pieces: list[list[int]]) -> list[Metric]:
+def _figures(
+    store: MapStore, experiences: ExperienceMap, pieces: list[list[int]], solutions: Mapping[str, Solution]
+) -> list[Metric]:
     of_node = {node: number for number, session in enumerate(experiences.sessions) for node in session}
-    loops = [edge for edge in experiences.edges if edge.kind is EdgeKind.LOOP]
-    accepted = [edge for edge in loops if edge.status is Status.ACCEPTED]
+    accepted = [edge for edge in experiences.edges if edge.kind is EdgeKind.LOOP and edge.status is Status.ACCEPTED]
+    stamps_ns = [store.track(one.number).stamps_ns for one in store.sessions()]
     return [
         figure("sessions", len(experiences.sessions)),
         figure("pieces", len(pieces)),
-        figure("nodes", len(experiences)),
-        figure("loops_accepted", len(accepted)),
+        *counts_of(experiences),
         figure("loops_between_sessions", sum(of_node[edge.source] != of_node[edge.target] for edge in accepted)),
         figure("travel", sum(experiences.node(session[-1]).travel_m for session in experiences.sessions)),
+        figure("duration", sum(float(stamps[-1] - stamps[0]) / NS_PER_S for stamps in stamps_ns if len(stamps))),
+        *solved(experiences, solutions),
     ]
