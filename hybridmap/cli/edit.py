@@ -44,7 +44,7 @@ def edit(
     An edge that is taken out stays in the map file as retracted. What it joined alone becomes a piece of its own, which the
     verdict says. If all sessions but one are taken out, that one is again as it was before it was joined, bit for bit.
     """
-    from hybridmap.report import write_report
+    from hybridmap.cli.map import judged
     from hybridmap.sessions import editing
 
     given = [value for value in (remove_edge, remove_session, add_edge) if value is not None]
@@ -57,8 +57,9 @@ def edit(
         done = editing.remove_session(folder, remove_session, target, overwrite=replaced)
     else:
         done = editing.add_edge(folder, _measured(add_edge or ""), target, overwrite=replaced)
-    write_report(done.folder)
-    emit(done.head, done.metrics, as_json=as_json, title=str(target))
+    as_it_was = remove_session is not None and "sessions" not in done.head  # before it was joined, bit for bit
+    head, metrics = judged(done.folder, errors=not as_it_was)
+    emit(head, metrics, as_json=as_json, title=str(target))
 
 
 def _measured(text: str) -> Measured:

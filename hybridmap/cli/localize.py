@@ -31,10 +31,17 @@ def localize(
     place there is known. Where it is not known, that is said, and the trajectory has no pose.
     """
     from hybridmap.cli.choose import choose, parse_settings
+    from hybridmap.cli.map import judged
     from hybridmap.sessions.localizing import localize as localize_drive
+    from hybridmap.store.session_folder import ON_MAP
 
     overrides = {**({} if seed is None else {"seed": seed}), **parse_settings(setting)}
     chosen = choose(source, config, overrides, start_s=start, end_s=end)
     with progress(f"localising {chosen.stream.name}") as advance:
         done = localize_drive(chosen.stream, chosen.config, map_, out, overwrite=overwrite, progress=advance)
-    emit(done.head, done.metrics, as_json=as_json, title=f"{out}: {chosen.stream.name} on {map_}")
+    head, metrics = judged(done.folder)
+    if not as_json:
+        head = {**head, "backends": [*head["backends"], ON_MAP]}  # a column of its own
+    emit(head, metrics, as_json=as_json, title=f"{out}: {chosen.stream.name} on {map_}")
+    if not as_json:
+        typer.echo(f"page: {out / 'report.html'}")

@@ -121,13 +121,11 @@ def _mapped(chosen: Any, out: Path, onto: Path | None, *, overwrite: bool, resum
         raise ConfigError("--resume goes on with a session as it is; give it without --overwrite and --onto")
     if onto is None:
         return map_and_report(chosen.stream, chosen.config, out, overwrite=overwrite, resume=resume)
-    from hybridmap.report import write_report
     from hybridmap.sessions.joining import map_onto
 
     with progress(f"mapping {chosen.stream.name}") as advance:
         joined = map_onto(chosen.stream, chosen.config, onto, out, overwrite=overwrite, progress=advance)
-    write_report(joined.folder)
-    return joined.head, joined.metrics
+    return judged(joined.folder)
 
 
 def map_and_report(
@@ -142,16 +140,26 @@ def map_and_report(
         The two parts of `metrics.json`: the facts about the run, and the list of metrics.
     """
     from hybridmap import session
-    from hybridmap.evaluate import evaluate_session
-    from hybridmap.report import write_report
 
     with progress(f"mapping {stream.name}") as advance:
         finished = session.run(stream, config, out, overwrite=overwrite, resume=resume, progress=advance)
-    if stream.groundtruth is not None:
+    return judged(finished.folder)
+
+
+def judged(folder: Any, *, errors: bool = True) -> tuple[dict[str, Any], list[Any]]:
+    """Evaluate a session that was written, if its ground truth is known and `errors` is set, and write its page.
+
+    Returns:
+        As `map_and_report`.
+    """
+    from hybridmap.evaluate import evaluate_session
+    from hybridmap.report import write_report
+
+    if errors and folder.groundtruth.is_file():
         try:
-            evaluate_session(finished.folder.path)
+            evaluate_session(folder.path)
         except EvaluationError as error:
             log.warning("mapped, but not evaluated: %s", error)
-    write_report(finished.folder)
-    written = finished.folder.read_metrics()
+    write_report(folder)
+    written = folder.read_metrics()
     return written.head, written.metrics

@@ -28,9 +28,9 @@ def merge(
     """
     if len(maps) < 2:
         raise ConfigError("merge: found 1 map, expected two or more")
-    from hybridmap.report import write_report
+    from hybridmap.cli.map import judged
     from hybridmap.sessions.joining import merge as merge_maps
 
     joined = merge_maps(maps, out, overwrite=overwrite)
-    write_report(joined.folder)
-    emit(joined.head, joined.metrics, as_json=as_json, title=f"{out}: {joined.head['source']}")
+    head, metrics = judged(joined.folder)
+    emit(head, metrics, as_json=as_json, title=f"{out}: {head['source']}")

@@ -20,6 +20,7 @@ from hybridmap.geometry import Array, compose, inverse
 from hybridmap.graph.gaps import grounded, pieces
 from hybridmap.metrics import ONLINE, Metric, figure
 from hybridmap.store import MapStore, SessionFolder, trajectory_of
+from hybridmap.store.session_folder import ON_MAP
 from hybridmap.trajectory import Trajectory, read_tum
 
 log = logging.getLogger(__name__)
@@ -80,6 +81,7 @@ def evaluate_session(
 def session_trajectories(session: SessionFolder, store: MapStore) -> dict[str, Trajectory]:
     """The estimated trajectories of a session: `odometry`, `<back-end>` (final) and `<back-end>_online` -> trajectory.
 
+    Beside them `on_map`, in the frame of the map that the drive was localised on, if it was.
     They are read from `trajectory/`, or from the map file if the run was killed. Poses while the robot was kidnapped are left
     out where the map records the kidnapping.
     """
@@ -98,6 +100,8 @@ def session_trajectories(session: SessionFolder, store: MapStore) -> dict[str, T
             estimates[name + ONLINE] = written[name + ONLINE]
         elif name in followed:
             estimates[name + ONLINE] = store.online(name)
+    if ON_MAP in written:
+        estimates[ON_MAP] = written[ON_MAP]
     experiences = store.map()
     return {name: grounded(estimate, experiences) for name, estimate in estimates.items()}
 
@@ -127,7 +131,7 @@ def _names(estimate: str) -> tuple[str, str, str]:
     """Suffix of the measure, back-end, and words for people."""
     if estimate.endswith(ONLINE):
         return ONLINE, estimate.removesuffix(ONLINE), "as the robot believed it at the time"
-    return "", estimate, "over the whole recording"
+    return "", estimate, "where its place on the map is known" if estimate == ON_MAP else "over the whole recording"
 
 
 def against_truth(estimate: str, trajectory: Trajectory, truth: Trajectory) -> list[Metric]:

@@ -20,6 +20,7 @@ from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.metrics import Metric
 from hybridmap.output import staged
 from hybridmap.store import MapStore, SessionFolder, trajectory_of
+from hybridmap.store.track import Track
 from hybridmap.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -79,9 +80,21 @@ class SessionView:
         return frozenset() if self.backend == ODOMETRY else frozenset(self.solution.report.rejected_edge_ids)
 
     @cached_property
+    def track(self) -> Track:
+        """Where the robot was between nodes: of the newest session alone, which is said."""
+        count = len(self.experiences.sessions)
+        if count > 1:
+            log.warning(
+                "%s: of %d sessions the way of the newest one is written; those of the others are in trajectory/session-K/",
+                self.store.path,
+                count,
+            )
+        return self.store.track()
+
+    @cached_property
     def trajectory(self) -> Trajectory:
         """Poses of `base_link` in `map` at every stamp of the session, by the chosen back-end."""
-        track = self.store.track()
+        track = self.track
         return track.odometry if self.backend == ODOMETRY else trajectory_of(track, self.poses)
 
 

@@ -60,7 +60,7 @@ def _duration_ns(view: SessionView, edge: Edge) -> int:
 
 def _driven(view: SessionView, make: _Messages, actions: list[list[Any]]) -> Iterator[_Written]:
     """The odometry of the session, and each action after the message that it came after."""
-    track = view.store.track()
+    track = view.track
     waiting = list(reversed(actions))
     for sample, (stamp_ns, pose) in enumerate(zip(track.stamps_ns.tolist(), track.poses_odom, strict=True)):
         yield ODOMETRY_TOPIC, _ODOMETRY, stamp_ns, make.odometry(stamp_ns, pose)

@@ -33,6 +33,8 @@ from hybridmap.verdict import Facts, reasons_of, said_of
 
 RECORDED = "openratslam"
 """Name under which a session keeps the poses of the experiences on the recorded map, beside the solutions of back-ends."""
+TAKEN = "a ROS 1 bag (.bag), a ROS 2 bag (folder with metadata.yaml, .mcap, .db3), or a table NAME_nodes.csv or NAME_links.csv"
+"""What can be imported."""
 _SIGMA_RAD = 0.5 * CELL_RAD
 
 
@@ -53,9 +55,9 @@ def import_map(source: Path, config: Config, out: Path, *, overwrite: bool = Fal
         BackendError: a back-end does not exist.
         OutputError: the folder cannot be used.
     """
-    kind = kind_of(source)
+    kind = kind_of(source, TAKEN)
     if kind == "TUM RGB-D folder":
-        raise StreamError(f"{source}: a {kind}; expected a bag, or a table NAME_nodes.csv or NAME_links.csv")
+        raise StreamError(f"{source}: a {kind}; expected {TAKEN}")
     recorded = read_tables(source) if source.suffix.lower() == ".csv" else read_bag(source, config.sensors)
     clock = StageClock()
     backends = Ensemble(config.backends, clock)

@@ -62,6 +62,31 @@ def draw_trajectories(axes: Any, scene: SessionScene, building: Raster | None) -
     style.metric_axes(axes)
 
 
+def known_map_figure(known: Array, way: Trajectory) -> str:
+    """Draw the way of a drive, in the frame of the map that it was localised on.
+
+    Args:
+        known: (K, 3) poses of the nodes of that map, m and rad; (0, 3) if it is not at hand.
+        way: where the drive was on it.
+
+    Returns:
+        A `data:` URI.
+    """
+    shown = np.concatenate([known, way.poses])[:, :2]
+    with style.figure(*_size(shown, None)) as picture:
+        axes = picture.add_subplot()
+        axes.plot(*known[:, :2].T, ".", color=_GREY, markersize=5, label="nodes of the map", zorder=3)
+        axes.plot(
+            *style.thinned(way.poses)[:, :2].T, color=style.PRIMARY, linewidth=1.8, label="the drive on the map", zorder=6
+        )
+        axes.plot(
+            *way.poses[0, :2], marker="o", markersize=7, color="white", markeredgecolor="black", zorder=8, label="first known"
+        )
+        style.metric_axes(axes)
+        picture.legend(loc="outside upper left", ncols=6)
+        return style.svg_uri(picture)
+
+
 def _draw_ways(axes: Any, trajectory: Trajectory, scene: SessionScene, *, label: str, **looks: Any) -> None:
     """Draw a trajectory; no line is drawn where the robot was kidnapped."""
     for i, piece in enumerate(pieces(trajectory, scene.experiences)):

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hybridmap.backends.base import ODOMETRY
+from hybridmap.errors import StoreError
 from hybridmap.graph.gaps import kidnappings
 from hybridmap.metrics import Metric
 from hybridmap.output import write_text
@@ -15,9 +19,16 @@ from hybridmap.report import page_tables as tables
 from hybridmap.report.loop_examples import examples
 from hybridmap.report.outline import outlines, raster
 from hybridmap.report.page_tables import rendered
-from hybridmap.report.session_figures import correction_figure, error_figure, graph_figure, trajectories_figure
+from hybridmap.report.session_figures import (
+    correction_figure,
+    error_figure,
+    graph_figure,
+    known_map_figure,
+    trajectories_figure,
+)
 from hybridmap.report.session_scene import SessionScene, load_scene
 from hybridmap.store import MapStore, SessionFolder
+from hybridmap.store.session_folder import ON_MAP
 from hybridmap.trajectory import NS_PER_S
 
 _TEMPLATE = "report.html.j2"
@@ -46,7 +57,7 @@ def write_report(folder: SessionFolder) -> Path:
     folder.require_map()
     with MapStore.open(folder.path) as store:
         scene = load_scene(folder, store)
-        text = rendered(_TEMPLATE, **_content(scene, store))
+        text = rendered(_TEMPLATE, **_content(scene, store), **_on_map(folder, scene.head.get("localized")))
     write_text(folder.report, text)
     return folder.report
 
@@ -84,6 +95,17 @@ def _content(scene: SessionScene, store: MapStore) -> dict[str, Any]:
         "graph_hash": scene.head.get("graph_hash", ""),
         "version": version("hybridmap"),
     }
+
+
+def _on_map(folder: SessionFolder, localized: dict[str, Any] | None) -> dict[str, Any]:
+    """Where a drive was on the map that it was localised on: what the page shows of it; nothing of another drive."""
+    way = folder.trajectories().get(ON_MAP)
+    if localized is None or way is None:
+        return {"localized": localized, "known_map": None}
+    known = np.zeros((0, 3))
+    with suppress(StoreError), MapStore.open(Path(localized["map"])) as store:
+        known = store.solutions()[store.primary].poses
+    return {"localized": localized, "known_map": known_map_figure(known, way)}
 
 
 def tiles(scene: SessionScene) -> list[Tile]:

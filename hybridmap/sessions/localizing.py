@@ -22,13 +22,11 @@ from hybridmap.sessions.joining import config_of, require_sensors
 from hybridmap.sessions.joint_map import JointMap
 from hybridmap.sessions.part import Part, finished
 from hybridmap.store import MapStore
-from hybridmap.store.session_folder import SessionFolder
+from hybridmap.store.session_folder import ON_MAP, SessionFolder
 from hybridmap.store.track import Track, trajectory_of
 from hybridmap.streams.base import Stream
 from hybridmap.trajectory import NS_PER_S, Trajectory
 
-ON_MAP = "on_map"
-"""Name of the trajectory of a drive in the frame of the map that it was localised on."""
 KNOWN_M = 0.5
 """Largest standard deviation of a pose on the map at which it counts as known, m."""
 

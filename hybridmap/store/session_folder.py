@@ -36,6 +36,10 @@ _FILES = (
 )
 
 
+ON_MAP = "on_map"
+"""Name of the trajectory of a drive in the frame of the map that it was localised on."""
+
+
 def _is_session(folder: Path) -> bool:
     return (folder / MAP_NAME).is_file() or holds_only(folder, _FILES)  # a run that was killed early had no map yet
 

@@ -54,8 +54,12 @@ def world_of(source: str | Path) -> str | None:
     return None
 
 
-def kind_of(path: Path) -> str:
+def kind_of(path: Path, expected: str = "") -> str:
     """The kind of a source by its name and content: ROS 1 bag, ROS 2 bag, TUM RGB-D folder or velocity table.
+
+    Args:
+        path: the source.
+        expected: what is taken, for messages; empty: all that can be mapped.
 
     Raises:
         StreamError: the path does not exist, is empty, or is of no readable kind.
@@ -69,12 +73,13 @@ def kind_of(path: Path) -> str:
         hint = f"; it holds {', '.join(bags[:5])}: give one of these" if bags else ""
         raise StreamError(f"{path}: a folder that is neither a ROS 2 bag nor a TUM RGB-D folder{hint}")
     if not path.exists():
-        raise StreamError(f"{path}: no such file, folder or simulated world; expected {EXPECTED}")
+        found = "no such file or folder" if expected else "no such file, folder or simulated world"
+        raise StreamError(f"{path}: {found}; expected {expected or EXPECTED}")
     if path.stat().st_size == 0:
         raise StreamError(f"{path}: the file is empty")
     kind = _KIND_OF_SUFFIX.get(path.suffix.lower())
     if kind is None:
-        raise StreamError(f"{path}: unknown kind of file {path.suffix!r}; expected {EXPECTED}")
+        raise StreamError(f"{path}: unknown kind of file {path.suffix!r}; expected {expected or EXPECTED}")
     return kind
 
 

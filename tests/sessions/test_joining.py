@@ -22,6 +22,7 @@ from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.io import graph_hash
 from hybridmap.mapper import Mapper
 from hybridmap.report import write_report
+from hybridmap.report.session_figures import known_map_figure
 from hybridmap.report.session_scene import load_scene
 from hybridmap.session import run
 from hybridmap.sessions import joining, localizing
@@ -335,6 +336,11 @@ def test_pieces_do_not_look_joined(drives, tmp_path):
     export_session(apart.path, "tum", tmp_path / "newest.tum")
 
 
+def test_an_export_of_one_way_says_that_there_are_others(joined, tmp_path, caplog):
+    export_session(joined.folder.path, "tum", tmp_path / "newest.tum")
+    assert "of 2 sessions the way of the newest one is written" in caplog.text
+
+
 def test_the_page_says_whose_trajectories_it_shows_and_that_pieces_lie_anywhere(drives, joined, tmp_path):
     apart = merge([drives[0], drives[2]], tmp_path / "apart").folder
     for folder, said in ((joined.folder, False), (apart, True)):
@@ -396,6 +402,14 @@ def test_a_drive_is_localised_on_a_map_that_stays_as_it_is(drives, tmp_path):
     assert np.sqrt(np.mean(error_m**2)) < 0.03
     assert done.head["localized"]["graph_hash_before"] == done.head["localized"]["graph_hash_after"]
     assert {metric.name: metric.value for metric in done.metrics}["found_after"] < 5.0
+    figures = {metric.name: metric.value for metric in evaluate_session(done.folder.path)}
+    assert figures["ate_rmse/on_map"] < 0.03
+    page = write_report(done.folder).read_text()
+    assert "<h2>On the known map</h2>" in page
+    assert "The way of the drive over the nodes of the known map" in page
+    with MapStore.open(drives[0]) as store:
+        known = store.solutions()["gtsam-gnc"].poses
+    assert known_map_figure(known, there) in page
 
 
 def test_a_place_that_some_views_agree_on_is_asked_about_at_all_nodes(drives):
@@ -441,6 +455,7 @@ def test_a_drive_elsewhere_is_not_localised_and_says_so(drives, tmp_path):
     assert not done.found
     assert not (tmp_path / "drive" / "trajectory" / "on_map.tum").exists()
     assert any("not localised" in remark for remark in done.head["remarks"])
+    assert "was not found.</p>" in write_report(done.folder).read_text()
     assert {metric.name: metric.value for metric in done.metrics}["known_on_map"] == 0.0
 
 
