@@ -16,9 +16,10 @@ from hybridmap.geometry import RelativePose, align, between, compose
 from hybridmap.graph.paths import require_connected
 from hybridmap.known_places import KnownPlaces
 from hybridmap.mapper import Mapper
+from hybridmap.sessions.joining import merge
 from hybridmap.store import MapStore
 from hybridmap.streams.base import Sample, SelfMotion, StreamReport
-from hybridmap.streams.laser import LaserScan
+from hybridmap.streams.laser import LASER, LaserScan
 from hybridmap.trajectory import NS_PER_S, Trajectory, read_tum
 from hybridmap.vision.base import Belief
 from hybridmap.vision.laser.front_end import LaserFrontEnd
@@ -44,6 +45,8 @@ class Laps(RoomDrive):
         if self.aside is not None:
             at = self.aside * LAP + LAP // 2
             steps[at:at] = [np.array([0.06, 0.0, -0.1])] * 63
+        if self.late_s:  # only where the turn rate varies can the clock be told
+            steps = [step * (1.0 + 0.7 * np.sin(2.0 * np.pi * i / 21)) for i, step in enumerate(steps)]
         poses = [np.array([0.0, -1.2, 0.0])]
         for step in steps:
             poses.append(compose(poses[-1], step))
@@ -137,6 +140,35 @@ def test_nodes_are_made_again_where_the_robot_leaves_the_known_way():
     truth = stream.groundtruth.at(mapper.map.stamps_ns)
     off = compose(align(truth, mapper.poses()), mapper.poses()) - truth
     assert np.hypot(off[:, 0], off[:, 1]).max() < 0.04
+
+
+def test_the_map_of_a_followed_robot_is_taken_up_as_it_was(tmp_path):
+    stream = Laps(laps=6.5, aside=5)
+    session.run(stream, config(), tmp_path / "a")
+    session.run(RoomDrive(laps=1.4), config(), tmp_path / "b")
+    joint = merge([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
+    assert joint.joined
+    with MapStore.open(tmp_path / "a") as store:
+        front_end = LaserFrontEnd(config().vision, store.rig.sensors[LASER.sensor_name])
+        count = len(store.map())
+        resumed = [node for node in range(count) if "back" in store.state(node)]
+        for node in range(count):
+            front_end.restore(node, store.keyframe(node), store.state(node), node == 0)
+    assert resumed == [piece.start for piece in front_end.atlas.pieces[1:]] != []
+    assert all(front_end.atlas.before(node) < node - 1 for node in resumed)
+    assert len(front_end.atlas) == count
+
+
+def test_the_odometry_of_a_followed_robot_is_measured_again_where_its_clock_was_off(tmp_path):
+    stream = Laps(laps=6.5, aside=5, late_s=0.15)
+    done = session.run(stream, config(), tmp_path / "s")
+    figures = {metric.name: metric.value for metric in done.metrics}
+    assert figures["clock_offset_used"] == pytest.approx(0.15, abs=0.03)
+    assert figures["nodes_reused"] > 10
+    trajectory = read_tum(done.folder.trajectory / "gtsam-gnc.tum")
+    late = Trajectory(stream.groundtruth.stamps_ns + round(0.15 * NS_PER_S), stream.groundtruth.poses)
+    inside = trajectory.stamps_ns >= late.stamps_ns[0]
+    assert error_m(Trajectory(trajectory.stamps_ns[inside], trajectory.poses[inside]), late) < 0.06
 
 
 def test_a_changed_room_is_mapped_anew_and_then_known_again():

@@ -240,9 +240,14 @@ class LaserFrontEnd:
         return {"profile": self._profiles[node], **LASER.compact(LaserScan(0, self.atlas.ranges[node]))}
 
     def state(self, node: int) -> dict[str, NDArray[np.generic]]:
-        """`chain` (3,), `scatter` (3, 3) and `cell_m` () of a node, as the atlas has them."""
+        """`chain` (3,), `scatter` (3, 3) and `cell_m` () of a node, as the atlas has them.
+
+        Of a node that was made after the robot was followed on older ones also `back` (): it was seen from the node so many
+        numbers before.
+        """
         atlas = self.atlas
-        return {"chain": atlas.chain[node], "scatter": atlas.scatter[node], "cell_m": np.array(atlas.clouds[node].cell_m)}
+        own = {"chain": atlas.chain[node], "scatter": atlas.scatter[node], "cell_m": np.array(atlas.clouds[node].cell_m)}
+        return own | ({"back": np.array(node - atlas.resumed[node])} if node in atlas.resumed else {})
 
     def restore(
         self, node: int, keyframe: Mapping[str, NDArray[np.generic]], state: Mapping[str, NDArray[np.generic]], begins: bool
@@ -256,7 +261,8 @@ class LaserFrontEnd:
                 f"{found}; map its source again"
             )
         cloud = cloud_of_scan(ranges_m, self._laser, Scale(float(state["cell_m"]) / CELL_M))
-        self.atlas.take_up(cloud, ranges_m, np.asarray(state["chain"]), np.asarray(state["scatter"]), begins)
+        back = int(state.get("back", 1))
+        self.atlas.take_up(cloud, ranges_m, np.asarray(state["chain"]), np.asarray(state["scatter"]), begins, back)
         self._profiles.append(np.asarray(keyframe["profile"], dtype=np.float32))
         self._seen_from = node
 

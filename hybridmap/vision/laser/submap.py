@@ -132,7 +132,9 @@ class Atlas:
         self.chain.append(pose)
         self.scatter.append(scatter)
 
-    def take_up(self, cloud: Cloud, ranges_m: NDArray[np.float32], pose: Array, scatter: Array, begins: bool) -> None:
+    def take_up(
+        self, cloud: Cloud, ranges_m: NDArray[np.float32], pose: Array, scatter: Array, begins: bool, back: int = 1
+    ) -> None:
         """Append a node of a finished session.
 
         Args:
@@ -140,7 +142,11 @@ class Atlas:
             pose: (3,) as it was in that session's atlas, m and rad.
             begins: whether nothing joins it to the node before. Then a new piece begins, so far along the chain that no search
                 looks back beyond it.
+            back: 1, or how many nodes before it the older one was made from which it was seen: then a new piece begins too.
         """
+        if back > 1:
+            self.add(cloud, ranges_m, compose(self._moved, pose), scatter, len(self) - back)
+            return
         if begins and self.chain:
             self.part(len(self))
             self._moved = compose(compose(self.chain[-1], np.array([APART_M, 0.0, 0.0])), inverse(pose))
