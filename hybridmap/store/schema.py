@@ -155,6 +155,11 @@ def _opened(path: Path, mode: str, versions: tuple[int, ...]) -> tuple[sqlite3.C
         application = connection.execute("PRAGMA application_id").fetchone()[0]
         version = connection.execute("PRAGMA user_version").fetchone()[0]
     except sqlite3.Error as error:
+        if error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_CANTOPEN and path.with_name(f"{path.name}-wal").exists():
+            raise StoreError(
+                f"{path}: its run did not end, and its log cannot be looked through here ({error}); copy the whole session"
+                " folder to where it can be written to"
+            ) from None
         raise StoreError(
             f"{path}: not a map file ({error}); expected one that `hybridmap map` wrote; if it is damaged, {AGAIN}"
         ) from None
