@@ -46,7 +46,7 @@ class Client:
         self.poses: list[Array] = []  # of odometry, at these stamps
         self.raw: list[tuple[int, Array]] = []
         self.smooth: list[tuple[float, Array, Array]] = []  # when it came; the correction; the newest odometry
-        self._by_tf = odometry_topic in ("/tf", "/tf_static")
+        self._by_tf = odometry_topic.startswith("/tf")
         if not self._by_tf:
             rospy.Subscriber(odometry_topic, Odometry, self._moved, tcp_nodelay=True)
         rospy.Subscriber("/hybridmap/map_to_odom", TransformStamped, self._corrected, tcp_nodelay=True)

@@ -113,9 +113,10 @@ def prove(given: argparse.Namespace, keep: Path) -> dict[str, Any]:
     else:
         drive = Drive(bag, given.rate, odometry, given.settings, keep)
         now = play(drive, fetch(folder), slow, heard, checks=not given.overload and not given.no_checks)
-    late_ms = 1000.0 * np.array(heard.late_s or [np.nan])
+    late_ms = 1000.0 * np.array(heard.late_s)
+    quantiles_ms = [round(float(one), 3) for one in np.percentile(late_ms, (50, 99, 100))] if len(late_ms) else None
     sent, taken = int(before["stream"]["odometry"]), int(now["stream"].get("odometry", 0))
-    p99_ms = float(np.percentile(late_ms, 99))
+    in_time = odometry.startswith("/tf") or (quantiles_ms is not None and quantiles_ms[1] <= 1000.0 * P99_S)
     same = before["graph_hash"] == now["graph_hash"]
     found = {
         "source": given.source,
@@ -130,9 +131,7 @@ def prove(given: argparse.Namespace, keep: Path) -> dict[str, Any]:
         "odometry_sent": sent,
         "odometry_lost": sent - taken,
         "poses_heard": len(heard.late_s),
-        "pose_after_odometry_p50_ms": float(np.percentile(late_ms, 50)),
-        "pose_after_odometry_p99_ms": p99_ms,
-        "pose_after_odometry_max_ms": float(late_ms.max()),
+        "pose_after_odometry_p50_p99_max_ms": quantiles_ms,
         "last_diagnostics": heard.status,
         **heard.checks,
     }
@@ -141,7 +140,7 @@ def prove(given: argparse.Namespace, keep: Path) -> dict[str, Any]:
         found |= overloaded(now, heard, slow, given.reference, keep)
         found["passed"] = bool(found["overload_passed"] and sent == taken)
     else:
-        found["passed"] = bool(same and sent == taken and checked and (given.rate > 1.0 or p99_ms <= 1000.0 * P99_S))
+        found["passed"] = bool(same and sent == taken and checked and (given.rate > 1.0 or in_time))
     return found
 
 

@@ -97,7 +97,7 @@ def listen(ros: Ros1, environment: dict[str, str], odometry_topic: str, heard: H
         if "lag, s" in heard.status:
             heard.lags_s.append(float(heard.status["lag, s"]))
 
-    if odometry_topic not in ("/tf", "/tf_static"):
+    if not odometry_topic.startswith("/tf"):
         rospy.Subscriber(odometry_topic, Odometry, moved, tcp_nodelay=True)
         rospy.Subscriber("/hybridmap/pose", rospy.AnyMsg, placed, tcp_nodelay=True)
     rospy.Subscriber("/diagnostics", DiagnosticArray, diagnosed)

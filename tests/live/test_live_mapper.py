@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from hybridmap import session
-from hybridmap.backends import registry
 from hybridmap.config import Config
-from hybridmap.errors import BackendError, ExportError, LiveError, OutputError, StoreError, StreamError
+from hybridmap.errors import ExportError, LiveError, OutputError, StoreError, StreamError
 from hybridmap.export.formats import ExportOptions, open_view
 from hybridmap.geometry import between, compose, inverse
 from hybridmap.live import LiveLimits, LiveMapper
@@ -219,11 +218,29 @@ def test_a_robot_whose_program_dies_keeps_its_map(tmp_path):
     assert SessionFolder(tmp_path / "s").read_metrics().head["graph_hash"] == recorded.head["graph_hash"]
 
 
-def test_what_is_registered_in_this_program_alone_is_refused_at_the_start(tmp_path, monkeypatch):
-    monkeypatch.setattr(registry._TABLE, "_registered", {})  # as there is no way to take a name back
-    registry.register("mine", lambda config: registry.create("gtsam-gnc", config))
-    with pytest.raises(BackendError, match=r"'mine'.*hybridmap\.backends"):
-        LiveMapper(Config.load("laser", {"backends.names": ["gtsam-gnc", "mine"]}), RoomDrive().rig, tmp_path / "s")
+REGISTERED = """
+import sys
+from pathlib import Path
+from hybridmap.backends import registry
+from hybridmap.config import Config
+from hybridmap.errors import BackendError
+from hybridmap.live import LiveMapper
+from tests.streams_for_tests import RoomDrive
+
+registry.register("mine", lambda config: registry.create("gtsam-gnc", config))
+try:
+    LiveMapper(Config.load("laser", {"backends.names": ["gtsam-gnc", "mine"]}), RoomDrive().rig, Path(sys.argv[1]))
+except BackendError as error:
+    print(error)
+"""
+
+
+def test_what_is_registered_in_this_program_alone_is_refused_at_the_start(tmp_path):
+    root = Path(__file__).resolve().parents[2]
+    command = [sys.executable, "-c", REGISTERED, str(tmp_path / "s")]
+    done = subprocess.run(command, cwd=root, check=True, timeout=60, capture_output=True, text=True)
+    assert "'mine'" in done.stdout
+    assert "hybridmap.backends" in done.stdout
     assert not (tmp_path / "s").exists()
 
 
