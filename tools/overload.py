@@ -39,7 +39,7 @@ def slowness(session: Path, rate: float, overload: float) -> float:
     """How many times slower a process must be, so that it needs `overload` times the time that a drive takes.
 
     Args:
-        session: of the whole drive; says how much CPU time it needs.
+        session: of the whole drive; says how much CPU time mapping needs. Recording comes on top, so the overload is larger.
         rate: times real time at which the drive is played.
         overload: 3: the machine is three times too slow.
     """
