@@ -108,6 +108,7 @@ def test_the_map_of_many_laps_is_that_of_four_and_no_node_moves():
     assert all(np.array_equal(poses, last[-1]) for poses in last)
 
 
+@pytest.mark.slow
 def test_a_node_at_every_visit_can_be_asked_for():
     mapper, nodes = mapped(Laps(laps=6.0), config(**{"nodes.rule": "every-visit", "backends.names": ["gtsam-gnc"]}))
     assert nodes[-1] > 1.15 * nodes[4]
@@ -159,6 +160,7 @@ def test_the_map_of_a_followed_robot_is_taken_up_as_it_was(tmp_path):
     assert len(front_end.atlas) == count
 
 
+@pytest.mark.slow
 def test_the_odometry_of_a_followed_robot_is_measured_again_where_its_clock_was_off(tmp_path):
     stream = Laps(laps=6.5, aside=5, late_s=0.15)
     done = session.run(stream, config(), tmp_path / "s")
@@ -171,6 +173,7 @@ def test_the_odometry_of_a_followed_robot_is_measured_again_where_its_clock_was_
     assert error_m(Trajectory(trajectory.stamps_ns[inside], trajectory.poses[inside]), late) < 0.06
 
 
+@pytest.mark.slow
 def test_a_changed_room_is_mapped_anew_and_then_known_again():
     _, nodes = mapped(Laps(laps=12.0, changed=6))
     assert nodes[4] == nodes[5]  # the room as it was is known
