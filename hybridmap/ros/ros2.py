@@ -183,13 +183,15 @@ class Ros2:
     def subscribe(self, topic: str, msgtype: str, take: Callable[[bytes, str | None], None]) -> None:
         """Have `take` called with the bytes of each message, in a thread of this topic.
 
-        The subscription is reliable and gets earlier messages where all publishers of the topic offer that.
+        The subscription is reliable and gets earlier messages where all publishers of the topic offer that; where there is
+        none yet it asks for neither, so that it hears any.
         """
         from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-        quality = QoSProfile(
-            depth=_DEEP, reliability=ReliabilityPolicy.BEST_AVAILABLE, durability=DurabilityPolicy.BEST_AVAILABLE
-        )
+        reliability, durability = ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE
+        if self._node.count_publishers(topic):
+            reliability, durability = ReliabilityPolicy.BEST_AVAILABLE, DurabilityPolicy.BEST_AVAILABLE
+        quality = QoSProfile(depth=_DEEP, reliability=reliability, durability=durability)
         worker = _Worker(topic, lambda data: take(data, None))
         worker.subscription = endpoint(
             self._node.create_subscription, msgtype, topic, worker.put, quality, raw=True, callback_group=self._group

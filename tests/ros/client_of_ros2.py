@@ -17,7 +17,7 @@ from ros2_play import Player
 from std_srvs.srv import Empty, SetBool, Trigger
 
 from hybridmap.geometry import compose
-from hybridmap.ros.ros2_types import endpoint
+from hybridmap.ros.ros2_types import endpoint, serialised
 from hybridmap.streams.bagfile import BagFile
 from hybridmap.streams.messages import Messages, RawMessage
 
@@ -87,6 +87,13 @@ class Client:
         state: str = self.call("/hybridmap/get_state", GetState).current_state.label
         return state if moved else f"still {state}"
 
+    def say_initial_pose(self) -> None:
+        """As rviz does."""
+        msgtype, contents = "geometry_msgs/msg/PoseWithCovarianceStamped", {"header": {"frame_id": "moon"}}
+        publisher = endpoint(self.node.create_publisher, msgtype, "/initialpose", 10)
+        self.wait_for(publisher.get_subscription_count)
+        publisher.publish(serialised(msgtype, contents))
+
     def services(self) -> dict[str, Any]:
         answers: dict[str, Any] = {}
         for name in ("save_map", "serialize_map", "deserialize_map"):
@@ -146,6 +153,7 @@ def main() -> None:
         "diagnostics": {one.key: one.value for one in status.values},
         "services": client.services(),
     }
+    client.say_initial_pose()
     states.append(client.move(Transition.TRANSITION_DEACTIVATE))
     time.sleep(1.0)
     before = len(client.heard["/diagnostics"])

@@ -118,6 +118,11 @@ def test_every_service_answers_a_client(drive) -> None:
 
 
 @pytest.mark.slow
+def test_an_initial_pose_is_heard(drive) -> None:
+    assert (drive["folder"] / "node.log").read_text().count("initialpose: ignored") == 1
+
+
+@pytest.mark.slow
 def test_the_node_follows_its_lifecycle_and_is_silent_while_inactive(drive) -> None:
     expected = ["unconfigured", "still unconfigured", "inactive", "active", "inactive", "active", "inactive", "unconfigured"]
     assert drive["heard"]["states"] == expected
