@@ -87,38 +87,19 @@ class JointMap:
         for number, node in enumerate(own.nodes):
             if number in begins:
                 self._begin(node)
-            self.add_node(node, own.initial[number], part.keyframe(number), part.state(number), number in begins | broken)
+            self._add_node(node, own.initial[number], part.keyframe(number), part.state(number), number in begins | broken)
         for edge in own.edges:
             self.map.add_edge(moved(edge, first))
         self.poses = np.concatenate([self.poses, part.poses])
         return range(first, len(self.map))
 
-    def begin(self, node: Node) -> None:
-        """Let a new session begin with a node, which is added next; its place is looked for by `meet`."""
-        self._begin(node)
-        self._vision.arrive(len(self.map))
-
-    def add_node(self, node: Node, initial: Array, keyframe: Arrays, state: Arrays, begins: bool) -> None:
-        """Add a node of the session that began last; its pose must be appended to `poses`.
-
-        Args:
-            node: the node.
-            initial: (3,) its pose along the chain of odometry edges, m and rad.
-            keyframe, state, begins: as for `MeetingFrontEnd.restore`.
-        """
+    def _add_node(self, node: Node, initial: Array, keyframe: Arrays, state: Arrays, begins: bool) -> None:
+        """Add a node of the session that began last; its pose must be appended to `poses`. See `MeetingFrontEnd.restore`."""
         number = self.map.add_node(node, initial)
         self._vision.restore(number, keyframe, state, begins)
         self._stamps_s.append(node.stamp_ns / NS_PER_S + self._shift_s)
         self._travel_m.append(node.travel_m + self._shift_m)
         self._covariance_from = None
-
-    def put_edge(self, number: int | None, edge: Edge) -> int:
-        """Add an edge of the session that began last (None), or replace the one of a number; returns its number."""
-        self._covariance_from = None
-        if number is None:
-            return self.map.add_edge(edge)
-        self.map.update_edge(number, edge)
-        return number
 
     def meet(self, node: int) -> list[Edge]:
         """Look for loops of a node to the sessions before its own; returns those that were accepted.

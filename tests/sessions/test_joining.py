@@ -20,14 +20,12 @@ from hybridmap.export.formats import export_session
 from hybridmap.geometry import align, between, compose
 from hybridmap.graph.edges import EdgeKind, Status
 from hybridmap.graph.io import graph_hash
-from hybridmap.mapper import Mapper
 from hybridmap.report import write_report
 from hybridmap.report.session_figures import known_map_figure
 from hybridmap.report.session_scene import load_scene
 from hybridmap.session import run
 from hybridmap.sessions import joining, localizing
 from hybridmap.sessions.editing import Measured, add_edge, remove_edge, remove_session
-from hybridmap.sessions.following import KnownMap
 from hybridmap.sessions.joining import config_of, map_onto, merge
 from hybridmap.sessions.joint_map import JointMap
 from hybridmap.sessions.localizing import localize
@@ -420,28 +418,6 @@ def test_a_place_that_some_views_agree_on_is_asked_about_at_all_nodes(drives):
         nodes = joint.take_up(Part.of(there))
         assert found(joint.join(nodes)) < 2.3
     assert any(edge.kind is EdgeKind.LOOP and edge.source == nodes.start for edge in joint.map.edges)
-
-
-@pytest.mark.parametrize("start_s", [2.0, 12.0])
-def test_a_robot_finds_its_place_while_it_drives(drives, start_s):
-    """Node by node; at the start of the known map, with its heading, it assumes no more than anywhere else."""
-    config = Config.load("laser", {"simulation.world": "lab", "seed": 6, "backends.names": ["gtsam-gnc"], "neural.modules": 0})
-    stream = open_stream("lab", config, start_s=start_s, end_s=start_s + 14.0)
-    truth, here = read_tum(drives[0] / "reference" / "groundtruth.tum"), read_tum(drives[0] / "trajectory" / "gtsam-gnc.tum")
-    pose_world_map = align(truth.at(here.stamps_ns), here.poses)
-    with MapStore.open(drives[0]) as store:
-        known = KnownMap(store)
-    mapper, off_m = Mapper(config, stream.rig), []
-    assert known.pose(mapper.pose_map_robot) is None
-    for sample in stream:
-        for update in mapper.add(sample):
-            known.follow(mapper, update)
-            if (pose := known.pose(update.pose_map_robot)) is not None:
-                off_m.append(np.hypot(*(compose(pose_world_map, pose) - truth.at([update.stamp_ns])[0])[:2]))
-    assert not known.lost
-    assert found(known.found_after_m) < 5.0
-    assert len(off_m) > 50
-    assert max(off_m) < 0.1
 
 
 def found(travel_m):
