@@ -149,7 +149,9 @@ class Mapper:
 
         Call it once, after the last sample. The last of the returned updates says `end of the drive`, unless no node was made.
         """
-        return [update for updates in self.ending() for update in updates]
+        updates = [update for step in self.ending() for update in step]
+        self._steps_ended = 0  # loops that are entered afterwards are looked at by another call
+        return updates
 
     def ending(self) -> Iterator[list[Update]]:
         """What `finish` does, in steps; gives the updates of each. If it is left between two steps, another call goes on."""
