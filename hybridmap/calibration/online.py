@@ -125,6 +125,11 @@ class SensorClock:
         share = (wanted - times[after - 1]) / (times[after] - times[after - 1])
         return interpolate(poses[after - 1], poses[after], share)
 
+    def poses_again(self, stamps_ns: NDArray[np.int64], driven: Array) -> Array:
+        """As `poses_at`, in place of the poses (N, 3) that were driven with."""
+        del driven
+        return self.poses_at(stamps_ns)
+
     def _estimated(self, experiences: ExperienceMap, *, wide: bool = False) -> ClockOffset:
         times, poses = self._track()
         if len(times) < 2:
@@ -230,6 +235,21 @@ class Remeasured:
     why: str
 
 
+@dataclass(frozen=True, slots=True)
+class _Rescaled:
+    """Odometry from N nodes on, scaled: the stamps, poses before and after, and scales (N, 3) of the nodes."""
+
+    stamps_ns: NDArray[np.int64]
+    before: Array
+    after: Array
+    scale: Array
+
+    def poses_at(self, stamps: NDArray[np.int64], driven: Array) -> Array:
+        """New poses (T, 3) for those that were driven with at stamps (T,)."""
+        node = np.clip(np.searchsorted(self.stamps_ns, stamps, side="right") - 1, 0, None)
+        return compose(self.after[node], between(self.before[node], driven) * self.scale[node])
+
+
 class OdometryWatch:
     """What is learnt about the odometry while driving, and put to use at once: its clock, and its gains if so configured.
 
@@ -298,8 +318,8 @@ class OdometryWatch:
         stamps_ns = np.array([*(node.stamp_ns for node in experiences.nodes), stamp_ns], dtype=np.int64)
         poses = np.array([*(node.pose_odom for node in experiences.nodes), pose_odom])
         if self.clock.finish(experiences):
-            poses_at = self.clock.poses_at
-            self.remeasured = Remeasured(poses_at(stamps_ns), lambda stamps, _: poses_at(stamps), None, str(self.clock.offset))
+            clock = self.clock
+            self.remeasured = Remeasured(clock.poses_at(stamps_ns), clock.poses_again, None, str(clock.offset))
         elif self._gains is not None and isinstance(vision, GaugingFrontEnd):
             self.remeasured = self._regauged(stamps_ns, poses, vision)
         return self.remeasured
@@ -315,12 +335,8 @@ class OdometryWatch:
         factor = self._seen[-1].gains.gain / gains[np.searchsorted(since_ns, stamps_ns[:-1], side="right")]
         scale = np.column_stack([factor, factor, np.ones(len(factor))])
         after = _chained(poses[0], between(poses[:-1], poses[1:]) * scale)
-
-        def poses_at(stamps: NDArray[np.int64], driven: Array) -> Array:
-            node = np.clip(np.searchsorted(stamps_ns[:-1], stamps, side="right") - 1, 0, None)
-            return compose(after[node], between(poses[node], driven) * scale[node])
-
-        return Remeasured(after, poses_at, self._seen[-1].gains, str(self._seen[-1]))
+        rescaled = _Rescaled(stamps_ns[:-1], poses, after, scale)
+        return Remeasured(after, rescaled.poses_at, self._seen[-1].gains, str(self._seen[-1]))
 
     def _gauged(self, stamp_ns: int, vision: GaugingFrontEnd) -> GainChange | None:
         """The gain by the views, if it differs from that in use: a change to apply. One that no robot has is left alone."""
