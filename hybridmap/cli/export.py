@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hybridmap.cli.options import AsJson, ReplaceFile
+from hybridmap.cli.options import AsJson, FootprintText, ReplaceFile, footprint_of
 from hybridmap.export import FORMATS
 
 _FORMATS = ", ".join(f"{name} ({entry.description})" for name, entry in FORMATS.items())
@@ -42,6 +42,15 @@ def export(
         float,
         typer.Option(min=0.1, help="Point clouds and grid: larger depth of a camera is left out, m; a laser is not limited."),
     ] = 5.0,
+    footprint: FootprintText = None,
+    inflation: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Occupancy grid: write costs of 0 to 100 instead of occupied and free (map_server's mode raw), which fall up"
+            " to this distance from an obstacle, m.",
+        ),
+    ] = None,
     overwrite: ReplaceFile = False,
     as_json: AsJson = False,
 ) -> None:
@@ -52,7 +61,13 @@ def export(
     from hybridmap.cli.show import emit
     from hybridmap.export.formats import ExportOptions, export_session
 
-    options = ExportOptions(resolution_m=resolution, voxel_m=voxel, max_depth_m=max_depth)
+    options = ExportOptions(
+        resolution_m=resolution,
+        voxel_m=voxel,
+        max_depth_m=max_depth,
+        footprint=footprint_of(footprint),
+        inflation_m=inflation,
+    )
     written = export_session(folder, format_name, out, backend=backend, overwrite=overwrite, options=options)
     files = [str(path) for path in written.files]
     head = {"format": format_name, "backend": written.backend, "files": files}

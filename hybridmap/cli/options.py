@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from hybridmap.export.carving import Footprint
 
 OUT = "Session folder to write: new, empty, or with --overwrite one that holds a session. What holds anything else is refused."
 SEED = (
@@ -42,7 +45,28 @@ SolverSetting = Annotated[
     list[str] | None, typer.Option("--set", help="KEY=VALUE, e.g. backends.gnc.start=batch. Keys: docs/configuration.md.")
 ]
 ReplaceFile = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file, which is otherwise refused.")]
+FootprintText = Annotated[
+    str | None,
+    typer.Option(
+        "--footprint",
+        metavar="R|CORNERS",
+        help="The robot on the floor: its radius, m, or the corners of a convex polygon round base_link, as 'x,y x,y x,y', m."
+        " Where it drove, the grid is free. Default: 0.2.",
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+
+
+def footprint_of(text: str | None) -> Footprint:
+    """The footprint that the option names, or the usual one.
+
+    Raises:
+        ExportError: it names none.
+    """
+    from hybridmap.export.carving import Footprint
+    from hybridmap.export.formats import ROBOT_RADIUS_M
+
+    return Footprint.disc(ROBOT_RADIUS_M) if text is None else Footprint.parse(text)
 
 
 def sensor_settings(source: str, **given: str | None) -> dict[str, str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -15,6 +15,7 @@ from hybridmap.backends.pieces import pieces_of
 from hybridmap.config import Config
 from hybridmap.errors import ExportError
 from hybridmap.export import FORMATS, Format
+from hybridmap.export.carving import Footprint, driven
 from hybridmap.geometry import Array
 from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.metrics import Metric
@@ -24,6 +25,9 @@ from hybridmap.store.track import Track
 from hybridmap.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
+
+ROBOT_RADIUS_M = 0.20
+"""Radius of a robot whose footprint is not given: that of the small round robots of laboratories (0.17 to 0.22 m)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +39,8 @@ class ExportOptions:
         voxel_m: voxel size of point clouds.
         max_depth_m: larger depth of a camera is left out; ranges of a laser are not.
         obstacle_low_m, obstacle_high_m: depth points between these heights above the floor are obstacles of the grid.
+        footprint: the robot; the cells that it drove over are free.
+        inflation_m: how far the grid's costs reach beyond an obstacle; None: no costs, but occupied, free and unknown cells.
     """
 
     resolution_m: float = 0.05
@@ -42,6 +48,8 @@ class ExportOptions:
     max_depth_m: float = 5.0
     obstacle_low_m: float = 0.10
     obstacle_high_m: float = 1.50
+    footprint: Footprint = field(default_factory=lambda: Footprint.disc(ROBOT_RADIUS_M))
+    inflation_m: float | None = None
 
 
 class SessionView:
@@ -96,6 +104,12 @@ class SessionView:
         """Poses of `base_link` in `map` at every stamp of the session, by the chosen back-end."""
         track = self.track
         return track.odometry if self.backend == ODOMETRY else trajectory_of(track, self.poses)
+
+    @cached_property
+    def driven(self) -> list[Array]:
+        """Poses (K, 3) in `map` of each stretch that the robot drove by itself, of all sessions; see `carving.driven`."""
+        tracks = [self.store.track(number) for number in range(len(self.store.sessions()))]
+        return driven(tracks, self.experiences, self.poses)
 
 
 def open_view(folder: Path, backend: str | None, options: ExportOptions) -> SessionView:

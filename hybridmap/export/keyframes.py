@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybridmap.errors import ExportError
+from hybridmap.export.carving import swept
+from hybridmap.export.costs import costs
 from hybridmap.export.formats import ExportOptions, SessionView
 from hybridmap.geometry import Array, compose, transform_points
 from hybridmap.metrics import Metric
@@ -27,7 +29,8 @@ _HIT, _MISS, _LIMIT = 0.9, -0.4, 4.0
 """Log-odds that a return adds to its cell, that a beam passing adds, and where they saturate."""
 
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
-_OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
+_OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.1
+"""Of `map_server`. An unknown pixel reads as 0.196; with nav2's usual 0.25 as the second limit it would be free."""
 _MARGIN_CELLS = 10
 _SHIFT = 4
 """Fractional bits of OpenCV's polygon corners."""
@@ -74,26 +77,36 @@ class _Fan:
 def write_grid(view: SessionView, path: Path) -> list[Metric]:
     """Write an occupancy grid: `path` (yaml) and a picture of the same name beside it (pgm); returns its size and areas.
 
-    Pixels are 0 for occupied, 254 for free, 205 for unknown; the top row has the largest y.
+    Pixels are 0 for occupied, 254 for free, 205 for unknown; the top row has the largest y. If the options ask for an
+    inflation, the pixels are costs (see `costs`).
 
     Raises:
         ExportError: the session's keyframes hold no obstacle, or the grid would be too large.
     """
-    return write_picture(build_grid(view), path)
+    grid, options = build_grid(view), view.options
+    if options.inflation_m is None:
+        return write_picture(grid, path)
+    pixels = costs(grid.occupied, grid.free, grid.resolution_m, options.footprint.radius_m, options.inflation_m)
+    return _write(grid, pixels, "raw", path)
 
 
 def write_picture(grid: OccupancyGrid, path: Path) -> list[Metric]:
-    """Write a grid as `write_grid` does."""
+    """Write a grid as `write_grid` does without costs."""
     picture: NDArray[np.uint8] = np.full(grid.log_odds.shape, _UNKNOWN, dtype=np.uint8)
     picture[grid.occupied] = _OCCUPIED
     picture[grid.free] = _FREE
-    height, width = grid.log_odds.shape
+    return _write(grid, picture, "trinary", path)
+
+
+def _write(grid: OccupancyGrid, pixels: NDArray[np.uint8], mode: str, path: Path) -> list[Metric]:
+    """Write pixels (H, W) of a grid and what they mean, as `map_server` reads them in that mode."""
+    height, width = pixels.shape
     image = path.with_suffix(".pgm")
-    image.write_bytes(f"P5\n{width} {height}\n255\n".encode() + picture[::-1].tobytes())
+    image.write_bytes(f"P5\n{width} {height}\n255\n".encode() + pixels[::-1].tobytes())
     write_text(
         path,
         f"image: {image.name}\n"
-        f"mode: trinary\n"
+        f"mode: {mode}\n"
         f"resolution: {grid.resolution_m:.17g}\n"
         f"origin: [{grid.origin_m[0]:.17g}, {grid.origin_m[1]:.17g}, 0.0]\n"
         f"negate: 0\n"
@@ -103,13 +116,15 @@ def write_picture(grid: OccupancyGrid, path: Path) -> list[Metric]:
     cell = grid.resolution_m**2
     return [
         Metric("size/grid", width * height, "1", f"cells, {width} x {height} of {grid.resolution_m} m"),
-        Metric("occupied/grid", float(np.count_nonzero(picture == _OCCUPIED)) * cell, "m^2", "area found occupied"),
-        Metric("free/grid", float(np.count_nonzero(picture == _FREE)) * cell, "m^2", "area found free"),
+        Metric("occupied/grid", float(np.count_nonzero(grid.occupied)) * cell, "m^2", "area found occupied"),
+        Metric("free/grid", float(np.count_nonzero(grid.free)) * cell, "m^2", "area found free"),
     ]
 
 
 def build_grid(view: SessionView) -> OccupancyGrid:
-    """Build an occupancy grid in `map`: ray-cast every keyframe, at the pose of its node, into log-odds. Nothing is written.
+    """Build an occupancy grid in `map`. Nothing is written.
+
+    Every keyframe is ray-cast, at the pose of its node, into log-odds. Then the cells that the robot drove over are free.
 
     Raises:
         ExportError: the session's keyframes hold no obstacle within the limits of the options, or the grid would be too large.
@@ -118,7 +133,9 @@ def build_grid(view: SessionView) -> OccupancyGrid:
     if not fans:
         raise ExportError(f"grid: the session's keyframes hold no obstacle{_far(view.options)}")
     resolution = view.options.resolution_m
-    corners = np.concatenate([np.vstack([fan.origin[None], fan.ends]) for fan in fans])
+    footprint, ways = view.options.footprint, np.concatenate(view.driven)[:, :2]
+    around = [ways.min(axis=0) - footprint.reach_m, ways.max(axis=0) + footprint.reach_m]
+    corners = np.concatenate([around, *(np.vstack([fan.origin[None], fan.ends]) for fan in fans)])
     low = np.floor(corners.min(axis=0) / resolution).astype(np.int64) - _MARGIN_CELLS
     size = np.floor(corners.max(axis=0) / resolution).astype(np.int64) + _MARGIN_CELLS + 1 - low
     if size[0] * size[1] > _MAX_CELLS:
@@ -126,6 +143,7 @@ def build_grid(view: SessionView) -> OccupancyGrid:
     log_odds = np.zeros((int(size[1]), int(size[0])), np.float32)
     for fan in fans:
         _cast(log_odds, fan, low, resolution)
+    log_odds[swept(log_odds.shape, low * resolution, resolution, view.driven, footprint)] = -_LIMIT
     return OccupancyGrid(log_odds, low * resolution, resolution)
 
 
