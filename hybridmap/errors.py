@@ -59,6 +59,10 @@ class ExportError(HybridMapError):
     """An export that the session does not support."""
 
 
+class PlanError(HybridMapError):
+    """A way that cannot be planned: its ends are not in known free space, or no way between them is known."""
+
+
 class EvaluationError(HybridMapError):
     """An evaluation or calibration that its data do not allow, or that was asked for in a wrong way."""
 

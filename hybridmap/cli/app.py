@@ -26,6 +26,7 @@ from hybridmap.cli.localize import localize
 from hybridmap.cli.map import map_source
 from hybridmap.cli.merge import merge
 from hybridmap.cli.optimize import optimize
+from hybridmap.cli.plan import plan
 from hybridmap.cli.reproduce import reproduce
 from hybridmap.cli.ros1 import ros1
 from hybridmap.cli.ros2 import ros2
@@ -86,6 +87,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], dict[int, str]]] = {
     "evaluate": (evaluate, {0: "evaluated, even if metrics.json or the page cannot be written, which is only warned of"}),
     "explain": (explain, {0: "explained"}),
     "export": (export, {0: "written"}),
+    "plan": (plan, {0: "a way was found", 2: f"there is none through known free space, or {_EVERY[2]}"}),
     "optimize": (
         optimize,
         {

@@ -195,15 +195,19 @@ def export_session(
         view = open_view(folder, backend, options or ExportOptions())
         try:
             if not chosen.of_pieces:
-                _require_one_piece(folder, view)
+                require_one_piece(folder, view)
             metrics = writer(view, work / targets[0].name)
         finally:
             view.store.close()
     return Exported(targets, view.backend, metrics)
 
 
-def _require_one_piece(folder: Path, view: SessionView) -> None:
-    """Refuse a map in pieces: drawn together they would look joined."""
+def require_one_piece(folder: Path, view: SessionView) -> None:
+    """Refuse a map in pieces: drawn together they would look joined.
+
+    Raises:
+        ExportError: says how many there are, and how to take one out.
+    """
     count = len(pieces_of(view.experiences.pose_graph()))
     if count > 1:
         raise ExportError(
