@@ -10,6 +10,16 @@ import typer
 from hybridmap.cli.options import AsJson, FootprintText, footprint_of
 from hybridmap.cli.show import emit
 
+_Blocked = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--blocked",
+        metavar="X,Y,R",
+        help="Something that is not in the map: a disc round X,Y of radius R, m. May be given several times. The way is"
+        " planned first, then mended by replay.",
+    ),
+]
+
 
 def plan(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Session folder, as `hybridmap map` writes it.")],
@@ -20,15 +30,7 @@ def plan(
     goal: Annotated[
         str, typer.Option("--to", metavar="X,Y[,YAW]|NODE", help="Where it shall go, m and degrees in the map, or a node.")
     ],
-    blocked: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--blocked",
-            metavar="X,Y,R",
-            help="Something that is not in the map: a disc round X,Y of radius R, m. May be given several times. The way is"
-            " planned first, then mended by replay.",
-        ),
-    ] = None,
+    blocked: _Blocked = None,
     by: Annotated[str, typer.Option(metavar="length|time", help="What the way is the least of.")] = "length",
     footprint: FootprintText = None,
     resolution: Annotated[float, typer.Option(min=0.001, max=10.0, help="Cell size of the grid, m.")] = 0.05,
