@@ -131,7 +131,8 @@ def _names(estimate: str) -> tuple[str, str, str]:
     """Suffix of the measure, back-end, and words for people."""
     if estimate.endswith(ONLINE):
         return ONLINE, estimate.removesuffix(ONLINE), "as the robot believed it at the time"
-    return "", estimate, "where its place on the map is known" if estimate == ON_MAP else "over the whole recording"
+    known = "where its place on the map is known; of its shape alone, as it is aligned"
+    return "", estimate, known if estimate == ON_MAP else "over the whole recording"
 
 
 def against_truth(estimate: str, trajectory: Trajectory, truth: Trajectory) -> list[Metric]:

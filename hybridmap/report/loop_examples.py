@@ -117,8 +117,9 @@ def _example(scene: SessionScene, store: MapStore, edge: Edge, points_of: Mappin
 
 def _facts(scene: SessionScene, edge: Edge) -> tuple[tuple[str, str], ...]:
     nodes = scene.experiences.nodes
+    one_drive = any(edge.source in drive and edge.target in drive for drive in scene.experiences.sessions)
     apart_s = abs(nodes[edge.source].stamp_ns - nodes[edge.target].stamp_ns) / NS_PER_S
-    rows = [("time apart", f"{apart_s:.1f} s")]
+    rows = [("time apart", f"{apart_s:.1f} s")] if one_drive else [("nodes of", "two drives, which no odometry joins")]
     if edge.relative is not None:
         x, y, yaw = edge.relative.delta
         sigma = np.sqrt(np.diag(edge.relative.covariance))
@@ -127,7 +128,9 @@ def _facts(scene: SessionScene, edge: Edge) -> tuple[tuple[str, str], ...]:
             ("standard deviation of the edge", f"({sigma[0]:.3f}, {sigma[1]:.3f}) m, {np.degrees(sigma[2]):.2f}°"),
         ]
         drift = between(edge.relative.delta, between(nodes[edge.source].pose_odom, nodes[edge.target].pose_odom))
-        rows.append((f"{ODOMETRY} disagrees by", f"{np.hypot(drift[0], drift[1]):.3f} m, {np.degrees(abs(drift[2])):.2f}°"))
+        if one_drive:
+            off = f"{np.hypot(drift[0], drift[1]):.3f} m, {np.degrees(abs(drift[2])):.2f}°"
+            rows.append((f"{ODOMETRY} disagrees by", off))
         rows.append(("final map disagrees by", f"{_contradiction_m(scene, edge):.3f} m"))
     else:
         rows.append(("measured", "nothing"))

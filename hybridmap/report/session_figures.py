@@ -244,7 +244,7 @@ def error_figure(scene: SessionScene) -> str | None:
         position, heading = picture.subplots(2, 1, sharex=True, height_ratios=(3, 2))
         draw_errors(position, scene, heading=False)
         draw_errors(heading, scene, heading=True)
-        _mark_loops(scene, position)
+        mark_loops(scene, position)
         position.set_xlabel("")
         picture.legend(*position.get_legend_handles_labels(), loc="outside upper left", ncols=5)
         return style.svg_uri(picture)
@@ -312,11 +312,12 @@ def with_gaps(errors: ErrorSeries, gaps_s: Array) -> ErrorSeries:
     return ErrorSeries(np.insert(errors.time_s, at, gaps_s), position, heading)
 
 
-def _mark_loops(scene: SessionScene, axes: Any) -> None:
+def mark_loops(scene: SessionScene, axes: Any) -> None:
+    """Mark the times of the accepted loops that the newest drive closed, s since it began."""
     nodes = scene.experiences.nodes
-    start_ns = scene.estimates[ODOMETRY].stamps_ns[0]
+    start_ns, newest = scene.estimates[ODOMETRY].stamps_ns[0], scene.experiences.sessions[-1]
     loops = (e for e in scene.experiences.edges if e.kind is EdgeKind.LOOP and e.status is Status.ACCEPTED)
-    times = sorted({(nodes[e.source].stamp_ns - start_ns) / NS_PER_S for e in loops})
+    times = sorted({(nodes[e.source].stamp_ns - start_ns) / NS_PER_S for e in loops if e.source in newest})
     if times:
         at_bottom = axes.get_xaxis_transform()
         axes.plot(

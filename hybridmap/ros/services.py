@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hybridmap.errors import HybridMapError, RosError
-from hybridmap.export.keyframes import write_picture
+from hybridmap.export.keyframes import OccupancyGrid, write_picture
 from hybridmap.live import LiveMapper
 from hybridmap.output import staged
 from hybridmap.ros import contents
@@ -50,7 +50,7 @@ class Services:
         )
 
     def _save_map(self, _: bool) -> str:
-        grid = self._mapper().grid(self._resolution_m, timeout_s=_ANSWER_S)
+        grid = self._grid()
         yaml = self._out.with_name(f"{self._out.name}.yaml")
         image = yaml.with_suffix(".pgm")
         with staged(yaml, image, overwrite=True) as work:
@@ -81,9 +81,14 @@ class Services:
         return {}
 
     def _dynamic_map(self, _: bool) -> Contents:
+        grid = self._grid()
+        return {"map": contents.occupancy(self._mapper().snapshot.stamp_ns, self._map_frame, grid)}
+
+    def _grid(self) -> OccupancyGrid:
+        """The grid of all that was mapped so far; it is saved before, as the way that was driven is free."""
         mapper = self._mapper()
-        grid = mapper.grid(self._resolution_m, timeout_s=_ANSWER_S)
-        return {"map": contents.occupancy(mapper.snapshot.stamp_ns, self._map_frame, grid)}
+        mapper.save(timeout_s=_ANSWER_S)
+        return mapper.grid(self._resolution_m, timeout_s=_ANSWER_S)
 
 
 def _answered(do: Callable[[bool], str]) -> Callable[[bool], Contents]:

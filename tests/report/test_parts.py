@@ -10,6 +10,7 @@ from matplotlib.text import Text
 
 from hybridmap.geometry import compose, transform_points
 from hybridmap.graph.edges import Edge, EdgeKind, at_least, at_most
+from hybridmap.graph.experience_map import ExperienceMap
 from hybridmap.metrics import Metric
 from hybridmap.report import loop_examples, page_tables, session_figures, style
 from hybridmap.report.loop_examples import examples, in_words, spread
@@ -20,6 +21,7 @@ from hybridmap.report.session_figures import (
     error_series,
     gaps,
     loops_by_fate,
+    mark_loops,
     over_intervals,
     with_gaps,
 )
@@ -110,6 +112,28 @@ def test_examples_are_spread_and_end_with_a_refused_one(session: SessionFolder, 
     assert len({example.title for example in found}) == 4
     assert all(example.overlay and example.profiles and len(example.photos) == 2 for example in found)
     assert ("time apart", "40.0 s") in found[0].facts
+
+
+def test_of_two_drives_only_the_newest_has_times_and_no_odometry_joins_them(
+    session: SessionFolder, scene: SessionScene
+) -> None:
+    drives, one = ExperienceMap(), scene.experiences
+    for number, node in enumerate(one.nodes):
+        if number == 50:
+            drives.begin_session()
+        drives.add_node(node, one.initial[number])
+    for edge in one.edges:
+        drives.add_edge(edge)
+    scene = replace(scene, experiences=drives)
+    with style.figure(4.0, 3.0) as picture:
+        axes = picture.add_subplot()
+        mark_loops(scene, axes)
+        (marks,) = axes.get_lines()
+    assert marks.get_xdata() == pytest.approx(np.arange(50.0, 60.0))
+    with MapStore.open(session.path) as store:
+        facts = dict(examples(scene, store, outlines(store, len(scene.nodes)))[1].facts)
+    assert "two drives" in facts["nodes of"]
+    assert not {"time apart", "odometry disagrees by"} & set(facts)
 
 
 def test_the_figures_of_a_closure_are_in_words_with_units(scene: SessionScene) -> None:
