@@ -70,7 +70,7 @@ class Artist:
 def draw(out: Path, poses: Array, resolution_m: float) -> OccupancyGrid | HybridMapError:
     """The grid, or the error in place of it; see `Artist.grid`."""
     try:
-        with MapStore.open(out) as store:
+        with MapStore.open(out) as store, store.at_one_moment():
             view = SessionView(store, store.primary, ExportOptions(resolution_m=resolution_m))
             view.poses = poses
             return build_grid(view)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridmap.config.root import Config
-from hybridmap.errors import ExportError, HybridMapError, LiveError, RosError, StreamError
+from hybridmap.errors import ExportError, HybridMapError, LiveError, RosError, StoreError, StreamError
 from hybridmap.geometry import Array, compose
 from hybridmap.live import LiveLimits, LiveMapper
 from hybridmap.live.locating import require_map
@@ -339,7 +339,7 @@ class RobotNode:
             grid = mapper.grid(self._options.resolution_m, timeout_s=_GRID_WAIT_S)
         except ExportError:
             return  # nothing to draw yet
-        except LiveError as error:
+        except (LiveError, StoreError) as error:
             self._ros.warn(f"/map is not shown this time: {error}")
             return
         self._ros.publish(ros.MAP, contents.occupancy(stamp_ns, self._options.map_frame, grid))

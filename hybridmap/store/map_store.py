@@ -58,11 +58,15 @@ class StoredSession:
 def _reading(
     method: Callable[Concatenate[MapStore, _Given], _Found],
 ) -> Callable[Concatenate[MapStore, _Given], _Found]:
-    """A method that reads; values in the file that are not what `create` wrote become a StoreError."""
+    """A method that reads the file as it is at one moment, also while it is written by another.
+
+    Values in the file that are not what `create` wrote become a StoreError.
+    """
 
     def guarded(self: MapStore, /, *args: _Given.args, **named: _Given.kwargs) -> _Found:
         try:
-            return method(self, *args, **named)
+            with self.at_one_moment():
+                return method(self, *args, **named)
         except _DAMAGE as error:
             raise StoreError(
                 f"{self.path}: damaged: {quoted(f'{error or type(error).__name__}')[1:-1]}; {schema.AGAIN}"

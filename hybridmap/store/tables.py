@@ -77,6 +77,19 @@ class Tables:
         last = self.one("SELECT MAX(number) FROM nodes")
         return 0 if last is None else int(last) + 1
 
+    @contextmanager
+    def at_one_moment(self) -> Iterator[None]:
+        """Where this only reads, read all that is asked for as of one moment: what another writes meanwhile is not seen."""
+        if self._writable or self._connection.in_transaction:
+            yield
+            return
+        with self.named_errors("read"):
+            self._connection.execute("BEGIN")
+        try:
+            yield
+        finally:
+            self._connection.rollback()
+
     def commit(self) -> None:
         """Make everything written so far survive a killed process.
 

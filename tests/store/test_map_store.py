@@ -166,6 +166,29 @@ def test_running_session_can_be_read_along(tmp_path):
             assert len(reader.map()) == 1
 
 
+def test_a_map_is_read_as_of_one_moment_while_it_is_written(tmp_path, monkeypatch):
+    experiences = ring_map(1.0)
+
+    def write(store: MapStore, number: int) -> None:
+        store.add_node(number, experiences.node(number), experiences.initial[number], {}, {})
+        store.commit()
+
+    with MapStore.create(tmp_path, "", Rig(), "a drive") as store:
+        write(store, 0)
+        with MapStore.open(tmp_path) as reader:
+            arrays_of_nodes = reader.arrays_of_nodes
+
+            def read_slowly(*args):
+                found = arrays_of_nodes(*args)
+                write(store, 1)
+                return found
+
+            monkeypatch.setattr(reader, "arrays_of_nodes", read_slowly)
+            assert len(reader.map()) == 1
+            monkeypatch.undo()
+            assert len(reader.map()) == 2
+
+
 def test_same_session_twice_has_the_same_stored_bytes(tmp_path):
     dumps = []
     for name in ("a", "b"):
