@@ -51,7 +51,8 @@ _Onto = Annotated[
     Path | None,
     typer.Option(
         help="Session folder of a map that the drive continues: the new map holds both. Nothing is assumed of where the drive"
-        " begins; if it is not found on that map, both stay apart and the verdict says `not joined`."
+        " begins; if it is not found on that map, both stay apart and the verdict says `not joined`. The drive alone lies in"
+        " DIR-drive until the end; if the run dies it stays there, and --onto with --resume goes on with it."
     ),
 ]
 _Strict = Annotated[
@@ -117,14 +118,14 @@ def map_source(
 
 
 def _mapped(chosen: Any, out: Path, onto: Path | None, *, overwrite: bool, resume: bool) -> tuple[dict[str, Any], list[Any]]:
-    if resume and (overwrite or onto is not None):
-        raise ConfigError("--resume goes on with a session as it is; give it without --overwrite and --onto")
+    if resume and overwrite:
+        raise ConfigError("--resume goes on with a session as it is; give it without --overwrite")
     if onto is None:
         return map_and_report(chosen.stream, chosen.config, out, overwrite=overwrite, resume=resume)
     from hybridmap.sessions.joining import map_onto
 
     with progress(f"mapping {chosen.stream.name}") as advance:
-        joined = map_onto(chosen.stream, chosen.config, onto, out, overwrite=overwrite, progress=advance)
+        joined = map_onto(chosen.stream, chosen.config, onto, out, overwrite=overwrite, resume=resume, progress=advance)
     return judged(joined.folder)
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from hybridmap.backends.base import ODOMETRY, Solution
@@ -100,18 +100,29 @@ def _joined(maps: Sequence[Path], out: Path, overwrite: bool, *, onto: bool) -> 
 
 
 def map_onto(
-    stream: Stream, config: Config, base: Path, out: Path, *, overwrite: bool = False, progress: Progress | None = None
+    stream: Stream,
+    config: Config,
+    base: Path,
+    out: Path,
+    *,
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: Progress | None = None,
 ) -> Joined:
     """Map a drive, and look for its place on a map that exists; the new map holds both.
 
     The drive is mapped as it would be alone, and then looked for on the map, whose edges stay as they are. That costs the same
     however many sessions the map has, where `merge` finds the loops between all of them again.
 
+    The session of the drive alone lies in `OUT-drive`, beside `out`, until the new map is written. It stays there if the run
+    is killed or breaks off, and `resume` goes on with it.
+
     Args:
         stream, config, progress: as for `session.run`.
         base: session folder of the map that exists; it is not changed.
         out: the session folder to write.
-        overwrite: replace a session that exists there.
+        overwrite: replace a session that exists there, or in `OUT-drive`.
+        resume: go on with the drive in `OUT-drive`, as `session.run` does.
 
     Raises:
         What `session.run` and `merge` raise. What can be told before the drive is told before it; nothing is written then.
@@ -122,9 +133,16 @@ def map_onto(
         finished(known)
     SessionFolder(out).require_free(overwrite=overwrite)
     out.absolute().parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(dir=out.absolute().parent, prefix=f".{out.name}.") as alone:
-        run(stream, config, Path(alone) / "session", progress=progress)
-        return _joined([base, Path(alone) / "session"], out, overwrite, onto=True)
+    drive = drive_alone(out)
+    run(stream, config, drive, overwrite=overwrite, resume=resume, progress=progress)
+    joined = _joined([base, drive], out, overwrite, onto=True)
+    shutil.rmtree(drive)
+    return joined
+
+
+def drive_alone(out: Path) -> Path:
+    """The folder of a drive that `map_onto` maps, until it is on the map in the session folder `out`."""
+    return out.with_name(f"{out.name}-drive")
 
 
 def conclude(

@@ -14,7 +14,7 @@ from hybridmap.backends.pieces import pieces_of, solve_by_piece
 from hybridmap.backends.registry import create
 from hybridmap.cli.graphs import open_graph
 from hybridmap.config import Config
-from hybridmap.errors import ExportError, GraphError, OutputError, StoreError
+from hybridmap.errors import ExportError, GraphError, OutputError, StoreError, StreamError
 from hybridmap.evaluate import evaluate_session
 from hybridmap.export.formats import export_session
 from hybridmap.geometry import align, between, compose
@@ -306,6 +306,25 @@ def test_a_map_that_is_continued_keeps_its_edges(drives, joined, tmp_path):
         count = len(before.map())
         old = [edge for edge in after.map().edges if max(edge.source, edge.target) < count]
         assert [(e.source, e.target, e.status) for e in old] == [(e.source, e.target, e.status) for e in before.map().edges]
+
+
+def test_a_drive_that_breaks_off_while_a_map_is_continued_is_kept_and_gone_on_with(drives, tmp_path):
+    def broken(*_):
+        raise StreamError("the cable is loose")
+
+    config = Config.load("laser", {"simulation.world": "lab", "seed": 9, "backends.names": ["gtsam-gnc"], "neural.modules": 0})
+    stream = open_stream("lab", config, start_s=4.0, end_s=16.0)
+    with pytest.raises(StreamError, match="cable"):
+        map_onto(stream, config, drives[0], tmp_path / "both", progress=lambda done, _: broken() if done > 40 else None)
+    assert [path.name for path in tmp_path.iterdir()] == ["both-drive"]
+    with MapStore.open(tmp_path / "both-drive") as store:
+        assert len(store.map()) > 3
+    done = map_onto(stream, config, drives[0], tmp_path / "both", resume=True)
+    assert done.joined
+    assert [path.name for path in tmp_path.iterdir()] == ["both"]
+    with pytest.raises(StoreError, match=r"twice-drive.* is the same drive as"):
+        map_onto(stream, config, done.folder.path, tmp_path / "twice")
+    assert (tmp_path / "twice-drive" / "map.db").is_file()
 
 
 def test_what_is_not_found_stays_apart_and_says_so(drives, tmp_path):
