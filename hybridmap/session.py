@@ -87,7 +87,7 @@ def run(
     folder = SessionFolder(out)
     if resume and folder.ended:
         require_same(folder, stream, config)
-        log.warning("%s: the session is finished: there is nothing to resume", out)
+        log.warning("%s: the session is finished, there is nothing to resume; for another part of the source map anew", out)
         read = folder.read_metrics()
         return Session(folder, read.head, read.metrics)
     before = resumable(folder, stream, config) if resume else None

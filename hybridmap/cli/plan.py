@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -61,17 +62,19 @@ def plan(
         begun_s = time.process_time()
         planner = planner_on(view, Cost(by))
         prepared_s = time.process_time()
-        found = planner.plan(*ends)
         for point, radius_m in in_the_way:
             planner.block(point, radius_m)
-        if in_the_way:
-            found = planner.plan(*ends)
+        found = planner.plan(*ends)
         done_s = time.process_time()
     head = {"backend": view.backend, "by": by, "nodes": list(found.nodes), "path": found.poses.tolist()}
     metrics = [
         Metric("length", found.length_m, "m", "length of the way"),
-        Metric("backups", planner.replay.backups, "1", f"values of nodes set to find it, of {len(view.poses)} nodes"),
+        Metric("backups", found.backups, "1", f"values of nodes set to find it, of {len(view.poses)} nodes"),
         Metric("cpu_s/plan", done_s - prepared_s, "s", "CPU time of planning"),
         Metric("cpu_s/free-space", prepared_s - begun_s, "s", "CPU time of drawing the grid and linking the nodes, once a map"),
     ]
     emit(head, metrics, as_json=as_json, title=f"{folder}: from {start} to {goal} ({view.backend})")
+    if not as_json:
+        typer.echo("way: x m, y m, heading")
+        for x_m, y_m, yaw_rad in found.poses.tolist():
+            typer.echo(f"{x_m:9.2f} {y_m:9.2f} {math.degrees(yaw_rad):5.0f}")

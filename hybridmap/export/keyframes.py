@@ -36,6 +36,8 @@ _SHIFT = 4
 """Fractional bits of OpenCV's polygon corners."""
 _BEAM_GAP_RAD = np.radians(5.0)
 _MAX_CELLS = 400_000_000
+_COVERED_SHARE = 0.1
+"""Of the occupied cells, which a robot of the given size may have driven over; of real drives it is at most 0.02."""
 _MERGE_EVERY = 50
 """Keyframes after which the cloud is thinned anew."""
 
@@ -127,7 +129,8 @@ def build_grid(view: SessionView) -> OccupancyGrid:
     Every keyframe is ray-cast, at the pose of its node, into log-odds. Then the cells that the robot drove over are free.
 
     Raises:
-        ExportError: the session's keyframes hold no obstacle within the limits of the options, or the grid would be too large.
+        ExportError: the session's keyframes hold no obstacle within the limits of the options, the grid would be too large, or
+            the robot's footprint covers much of what is occupied.
     """
     fans = list(_fans(view))
     if not fans:
@@ -143,8 +146,16 @@ def build_grid(view: SessionView) -> OccupancyGrid:
     log_odds = np.zeros((int(size[1]), int(size[0])), np.float32)
     for fan in fans:
         _cast(log_odds, fan, low, resolution)
-    log_odds[swept(log_odds.shape, low * resolution, resolution, view.driven, footprint)] = -_LIMIT
-    return OccupancyGrid(log_odds, low * resolution, resolution)
+    grid = OccupancyGrid(log_odds, low * resolution, resolution)
+    covered = swept(log_odds.shape, low * resolution, resolution, view.driven, footprint)
+    occupied, against = np.count_nonzero(grid.occupied), np.count_nonzero(grid.occupied & covered)
+    if against > _COVERED_SHARE * occupied:
+        raise ExportError(
+            f"footprint: a robot that reaches {footprint.reach_m:.3g} m from base_link would have driven over {against} of the"
+            f" {occupied} occupied cells; expected its true size, in m, which covers hardly any"
+        )
+    log_odds[covered] = -_LIMIT
+    return grid
 
 
 def _far(options: ExportOptions) -> str:

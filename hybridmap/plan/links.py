@@ -53,10 +53,6 @@ class Links:
             found[b].append((a, cost, number))
         return found
 
-    def without(self, blocked: NDArray[np.bool_]) -> Links:
-        """The links that a mask (L,) does not block."""
-        return Links(self.n_nodes, self.ends[~blocked], self.costs[~blocked])
-
 
 def links_of(
     graph: PoseGraph,

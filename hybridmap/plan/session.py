@@ -15,6 +15,9 @@ from hybridmap.plan.free_space import FreeSpace
 from hybridmap.plan.links import Cost
 from hybridmap.plan.planner import Planner
 
+_FAR_M = 1e9
+"""No place is so far away; grids are counted in whole cells."""
+
 
 def planner_on(view: SessionView, cost: Cost = Cost.LENGTH) -> Planner:
     """A planner on a session's map, with the poses of one back-end. Of a polygon, the largest disc round `base_link` must fit.
@@ -54,7 +57,7 @@ def place(text: str, poses: Array) -> Array:
         values = np.array([float(number) for number in text.split(",")])
     except ValueError:
         values = np.zeros(0)
-    if len(values) not in (2, 3) or not np.isfinite(values).all():
+    if len(values) not in (2, 3) or not (np.abs(values) < _FAR_M).all():
         raise PlanError(f"place {text!r}: expected X,Y or X,Y,YAW in m and degrees, or the number of a node")
     if len(values) == 3:
         values[2] = np.deg2rad(values[2])
@@ -72,8 +75,8 @@ def discs(texts: Sequence[str]) -> list[tuple[Array, float]]:
         try:
             x, y, radius_m = (float(number) for number in text.split(","))
         except ValueError:
-            radius_m = -1.0
-        if not 0.0 < radius_m < np.inf:
+            x = y = radius_m = np.nan
+        if not (0.0 < radius_m < np.inf and np.isfinite((x, y)).all()):
             raise PlanError(f"blocked {text!r}: expected X,Y,R in m, with a radius above 0")
         found.append((np.array([x, y]), radius_m))
     return found

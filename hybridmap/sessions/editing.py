@@ -123,8 +123,11 @@ def _read(folder: Path, out: Path) -> Iterator[MapStore]:
     with TemporaryDirectory() as aside:
         for file in folder.glob(f"{MAP_NAME}*"):
             shutil.copy2(file, aside)
-        with MapStore.open(Path(aside)) as whole:
-            yield whole
+        try:
+            with MapStore.open(Path(aside)) as whole:
+                yield whole
+        except StoreError as error:
+            raise StoreError(str(error).replace(str(Path(aside)), str(folder))) from None
 
 
 def _written(

@@ -102,6 +102,15 @@ def test_nobody_drove_where_the_robot_was_carried(folder):
     assert nearest[0] < 0.05 < 0.1 < nearest[1]
 
 
+def test_a_footprint_that_covers_the_walls_is_refused(folder, tmp_path):
+    wide = replace(ExportOptions(), footprint=Footprint.disc(6.0))
+    with pytest.raises(
+        ExportError, match=r"footprint: a robot that reaches 6.03 m .* occupied cells; expected its true size, in m"
+    ):
+        export_session(folder.path, "grid", tmp_path / "map.yaml", options=wide)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_of_a_map_that_grew_meanwhile_only_the_known_nodes_count(folder):
     view = open_view(folder.path, None, ExportOptions())
     with view.store:

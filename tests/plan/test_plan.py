@@ -122,12 +122,13 @@ def test_places_and_discs_are_read():
     poses = np.arange(6.0).reshape(2, 3)
     assert place("1", poses).tolist() == [3.0, 4.0, 5.0]
     np.testing.assert_allclose(place("-1,2.5,180", poses), [-1.0, 2.5, np.pi])
-    for text in ("2", "x", "1,2,3,4", "nan,1", ""):
+    for text in ("2", "x", "1,2,3,4", "nan,1", "1e308,0", ""):
         with pytest.raises(PlanError):
             place(text, poses)
     assert discs(["1,2,0.5"])[0][1] == 0.5
-    with pytest.raises(PlanError, match="blocked"):
-        discs(["1,2"])
+    for text in ("1,2", "x", "nan,0,1", "0,0,-1"):
+        with pytest.raises(PlanError, match="blocked"):
+            discs([text])
 
 
 @pytest.mark.parametrize("by", ["length", "time"])
@@ -140,3 +141,14 @@ def test_the_command_plans_on_a_session(tmp_path, by):
     assert metrics["length"] == pytest.approx(4.0, abs=0.1)
     assert metrics["backups"] == 60
     assert np.hypot(*(np.array(said["path"])[-1, :2] - [0.0, 4.0])) < 0.1
+
+
+def test_the_command_goes_round_what_is_blocked_and_prints_the_way(tmp_path):
+    write_session(tmp_path / "s", ring_map(), rig=Rig(laser=LASER))
+    words = ["plan", str(tmp_path / "s"), "--from", "0,0", "--to", "0,4"]
+    free, blocked = (CliRunner().invoke(app, [*words, *more]) for more in ((), ("--blocked", "0,2,0.5")))
+    assert free.exit_code == blocked.exit_code == 0, blocked.output
+    ways = [[line.split() for line in done.stdout.partition("heading\n")[2].splitlines()] for done in (free, blocked)]
+    assert ways[0] == [["0.00", "0.00", "90"], ["0.00", "4.00", "90"]]
+    assert len(ways[1]) > 2
+    assert max(abs(float(row[0])) for row in ways[1]) > 0.6
