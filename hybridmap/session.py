@@ -21,6 +21,7 @@ from hybridmap.output import Unfinished
 from hybridmap.recorder import Recorder
 from hybridmap.store import MapStore
 from hybridmap.store.session_folder import SessionFolder
+from hybridmap.store.tables import LIVE
 from hybridmap.store.track import trajectory_of
 from hybridmap.streams.base import Observation, Stream
 from hybridmap.trajectory import NS_PER_S
@@ -93,7 +94,7 @@ def run(
     before = resumable(folder, stream, config) if resume else None
     mapper = Mapper(config, stream.rig) if before is None else before.drive.mapper
     with folder.writing(overwrite=overwrite or (resume and before is None), resume=before is not None) as unfinished:
-        store = _begun(folder, stream, config) if before is None else MapStore.resume(folder.path)
+        store = _begun(folder, stream, config, repeatable=repeatable) if before is None else MapStore.resume(folder.path)
         with store, _kept(folder, store, mapper, unfinished, repeatable=repeatable):
             drive = Drive(mapper, Recorder(mapper, store)) if before is None else before.drive
             if before is not None:
@@ -110,12 +111,16 @@ def run(
         return session
 
 
-def _begun(folder: SessionFolder, stream: Stream, config: Config) -> MapStore:
+def _begun(folder: SessionFolder, stream: Stream, config: Config, *, repeatable: bool) -> MapStore:
     """The map file of a new session, with what can be written before the drive, so that a killed run can be evaluated."""
     folder.write_config(config.to_yaml())
     if stream.groundtruth is not None:
         folder.write_groundtruth(stream.groundtruth)
-    return MapStore.create(folder.path, config.to_yaml(), stream.rig, stream.name)
+    store = MapStore.create(folder.path, config.to_yaml(), stream.rig, stream.name)
+    if not repeatable:
+        store.put_info(LIVE, True)
+        store.commit()
+    return store
 
 
 @contextmanager
@@ -133,7 +138,7 @@ def _kept(
         with suppress(StoreError):
             store.close()
         if unfinished.worth_keeping and repeatable and not isinstance(error, KeyboardInterrupt):
-            log.warning("%s: what was mapped is kept; %s", folder.path, folder.what_to_do)
+            log.warning("%s: what was mapped is kept; %s", folder.path, folder.what_to_do())
         raise
 
 

@@ -375,3 +375,14 @@ def test_killed_runs_and_readers_are_proved_by_the_tool():
     judged = [row for name, row in figures.items() if row.get("passed") is not None and not name.endswith("cpu_ratio")]
     assert len(judged) >= 10
     assert all(row["passed"] for row in judged)
+
+
+def test_of_a_live_drive_nobody_is_told_to_resume_it(tmp_path, caplog):
+    stream = Breaks(laps=2.2)
+    stream.after = 300
+    with pytest.raises(StreamError, match="cable"):
+        session.run(stream, CONFIG, tmp_path / "s", repeatable=False)
+    caplog.clear()
+    SessionFolder(tmp_path / "s").require()
+    assert "a live drive cannot be resumed" in caplog.text
+    assert "--resume" not in caplog.text

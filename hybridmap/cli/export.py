@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from hybridmap.cli.options import AsJson, FootprintText, ReplaceFile, footprint_of
+from hybridmap.errors import ExportError
 from hybridmap.export import FORMATS
 
 _FORMATS = ", ".join(f"{name} ({entry.description})" for name, entry in FORMATS.items())
@@ -61,6 +62,7 @@ def export(
     from hybridmap.cli.show import emit
     from hybridmap.export.formats import ExportOptions, export_session
 
+    _require_grid(format_name, footprint=footprint, inflation=inflation)
     options = ExportOptions(
         resolution_m=resolution,
         voxel_m=voxel,
@@ -72,3 +74,10 @@ def export(
     files = [str(path) for path in written.files]
     head = {"format": format_name, "backend": written.backend, "files": files}
     emit(head, written.metrics, as_json=as_json, title=f"{', '.join(files)} ({written.backend})")
+
+
+def _require_grid(format_name: str, **options: object) -> None:
+    """Refuse options of the grid for another format."""
+    for name, value in options.items():
+        if value is not None and format_name != "grid":
+            raise ExportError(f"--{name} is for the format grid; found --format {format_name}")

@@ -45,7 +45,10 @@ CorrectionSpeed = Annotated[
 ]
 CorrectionTurn = Annotated[float, typer.Option(help="As --correction-m-s, for its heading, degrees/s.", min=0.01)]
 Lag = Annotated[
-    float, typer.Option(help="Views are left out so that none is on the map later than this after it came, s.", min=0.1)
+    float,
+    typer.Option(
+        help="Views are left out so that the others are on the map this soon after they came, s; see docs/live.md.", min=0.1
+    ),
 ]
 
 

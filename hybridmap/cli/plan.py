@@ -16,8 +16,7 @@ _Blocked = Annotated[
     typer.Option(
         "--blocked",
         metavar="X,Y,R",
-        help="Something that is not in the map: a disc round X,Y of radius R, m. May be given several times. The way is"
-        " planned first, then mended by replay.",
+        help="Something that is not in the map: a disc round X,Y of radius R, m. May be given several times.",
     ),
 ]
 

@@ -16,7 +16,6 @@ from collections.abc import Iterable, Mapping
 from heapq import heapify, heappop, heappush
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybridmap.geometry import Array
 from hybridmap.plan.links import Links
@@ -44,11 +43,6 @@ class ReplayPlanner:
         """(N,) cost of the way from each node to the goal; infinite where there is none."""
         return np.array(self._values)
 
-    @property
-    def next_nodes(self) -> NDArray[np.int64]:
-        """(N,) the node to go to from each; -1 where the way leads straight to the goal, and where there is none."""
-        return np.array(self._next, dtype=np.int64)
-
     def aim(self, seeds: Mapping[int, float]) -> int:
         """Take a new goal: reverse replay over all nodes that reach it, one backup each.
 
@@ -64,7 +58,7 @@ class ReplayPlanner:
         return self._reverse([(cost, node, _NONE) for node, cost in self._seeds.items()])
 
     def block(self, links: Iterable[int]) -> int:
-        """Take out links (by number) until they are opened: forward replay of what led over them, then reverse replay of that.
+        """Take out links (by number): forward replay of what led over them, then reverse replay of that.
 
         Returns:
             The number of backups: one for each value that becomes void, and one for each that is found again.
@@ -73,18 +67,6 @@ class ReplayPlanner:
         void = self._forward()
         rim = [(value, node, onward) for node in void if (best := self._best(node))[0] < np.inf for value, onward in [best]]
         return len(void) + self._reverse(rim)
-
-    def open(self, links: Iterable[int]) -> int:
-        """Put links (by number) back in: reverse replay of the nodes that are nearer to the goal through them.
-
-        Returns:
-            The number of backups.
-        """
-        opened = self._blocked & set(links)
-        self._blocked -= opened
-        ends = {node for link in opened for node in self._links.ends[link].tolist()}
-        rim = [(value, node, onward) for node in sorted(ends) for value, onward in [self._best(node)]]
-        return self._reverse([one for one in rim if one[0] < self._values[one[1]]])
 
     def way(self, node: int) -> list[int]:
         """The nodes from one to the last before the goal, by the policy. The node must have a value that is finite."""

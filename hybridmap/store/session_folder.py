@@ -18,6 +18,7 @@ from hybridmap.metrics import Metric, to_json
 from hybridmap.output import PREVIOUS, Kind, Unfinished, held, holds_only, is_held, write_text
 from hybridmap.store.map_store import MapStore
 from hybridmap.store.schema import MAP_NAME
+from hybridmap.store.tables import LIVE
 from hybridmap.trajectory import Trajectory, read_tum, write_tum
 
 log = logging.getLogger(__name__)
@@ -163,8 +164,8 @@ class SessionFolder:
             if store.ended:
                 return
             store.check()
-            reason = store.broken_off
-        log.warning("%s: %s", self.path, self._why_unended(reason))
+            reason, repeatable = store.broken_off, store.info(LIVE) is None
+        log.warning("%s: %s", self.path, self._why_unended(reason, repeatable=repeatable))
 
     def require_map(self) -> None:
         """Check that the folder holds a session, whether or not its run ended. The map is not opened.
@@ -205,16 +206,18 @@ class SessionFolder:
         with held(self.path, SESSION, overwrite=overwrite):
             pass
 
-    def _why_unended(self, reason: str) -> str:
+    def _why_unended(self, reason: str, *, repeatable: bool) -> str:
         if is_held(self.path):
             return "is still being written: this is the map so far"
         because = f" ({reason})" if reason else ""
-        return f"its run was broken off{because}: this is the map up to there; {self.what_to_do}"
+        return f"its run was broken off{because}: this is the map up to there; {self.what_to_do(repeatable=repeatable)}"
 
-    @property
-    def what_to_do(self) -> str:
-        """How to go on with a session whose run was broken off, and how to have the one before it back, if there is one."""
-        onward = "`hybridmap map` with --resume goes on with it"
+    def what_to_do(self, *, repeatable: bool = True) -> str:
+        """How to go on with a session whose run was broken off, and how to have the one before it back, if there is one.
+
+        A live drive is not `repeatable`, so nothing goes on with it.
+        """
+        onward = "`hybridmap map` with --resume goes on with it" if repeatable else "a live drive cannot be resumed"
         previous = self.path / PREVIOUS
         if not _ended(previous):
             return onward

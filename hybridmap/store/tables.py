@@ -19,6 +19,11 @@ from hybridmap.store import schema
 
 BROKEN_OFF = "broken_off"
 """Key of why a run was broken off."""
+LIVE = "live"
+"""Key that is there if the drive was mapped live, so that nobody can give its samples another time."""
+
+_DAMAGED = (None, sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+"""Codes of errors in reading that come from what is in the file; text that is none has no code."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +203,9 @@ class Tables:
         try:
             yield
         except sqlite3.Error as error:
-            raise StoreError(f"{self._path}: cannot {what}: {error}") from None
+            damaged = what == "read" and getattr(error, "sqlite_errorcode", None) in _DAMAGED
+            after = f"; it is damaged: {schema.AGAIN}" if damaged and not isinstance(error, sqlite3.ProgrammingError) else ""
+            raise StoreError(f"{self._path}: cannot {what}: {error}{after}") from None
 
 
 def floats(values: Array) -> tuple[float, ...]:

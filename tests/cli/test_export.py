@@ -45,6 +45,8 @@ def test_bad_input_is_one_line_and_code_two(folder, tmp_path):
         (tmp_path / "gone", "--format", "tum", "--out", tmp_path / "x"),
         (folder, "--format", "tum", "--out", tmp_path / "there.tum"),
         (folder, "--format", "tum"),
+        (folder, "--format", "g2o", "--out", tmp_path / "x.g2o", "--footprint", "0.3"),
+        (folder, "--format", "g2o", "--out", tmp_path / "x.g2o", "--inflation", "0.3"),
     ):
         done = run("export", *arguments)
         assert done.returncode == 2

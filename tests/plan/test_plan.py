@@ -12,8 +12,12 @@ from typer.testing import CliRunner
 
 from hybridmap.cli.app import app
 from hybridmap.errors import PlanError
+from hybridmap.geometry import RelativePose, between
+from hybridmap.graph.edges import Edge, EdgeKind, Status
+from hybridmap.graph.experience_map import ExperienceMap, Node
+from hybridmap.graph.gaps import Kidnapping
 from hybridmap.plan.free_space import FreeSpace
-from hybridmap.plan.links import Links
+from hybridmap.plan.links import Cost, Links, links_of
 from hybridmap.plan.planner import Planner
 from hybridmap.plan.replay import ReplayPlanner
 from hybridmap.plan.session import discs, place
@@ -52,9 +56,6 @@ def test_replay_is_exact_and_backs_up_only_what_it_must(seed):
         backups = replay.block(chosen.tolist())
         np.testing.assert_allclose(replay.values, exact(links, 40, blocked))
         assert backups <= 2 * int((replay.values != before).sum())
-    opened = np.flatnonzero(blocked)
-    replay.open(opened.tolist())
-    np.testing.assert_allclose(replay.values, exact(links, 40, np.zeros_like(blocked)))
     start = int(np.argmax(np.where(np.isfinite(replay.values), replay.values, -1.0)))
     way = replay.way(start)
     assert (way[0], way[-1]) == (start, 40)
@@ -110,6 +111,35 @@ def test_a_blocked_passage_is_gone_round_or_said():
         planner.plan(*ends)
     with pytest.raises(PlanError, match=r"goal \(2.00, 2.00\): .*no room there"):
         planner.plan(ends[0], np.array([2.0, 2.0]))
+
+
+def driven_line(kidnapped: list[Kidnapping], cost: Cost) -> Links:
+    """Nodes at 0, 1, 4 and 5 m in an open room, driven in 1, 5 and 1 s."""
+    experiences = ExperienceMap()
+    poses = np.array([[x, 1.0, 0.0] for x in (0.5, 1.5, 4.5, 5.5)])
+    stamps_ns = np.array([0, 1, 6, 7]) * 10**9
+    for k, pose in enumerate(poses):
+        experiences.add_node(Node(int(stamps_ns[k]), pose, np.zeros(1, dtype=np.float32), 0, 0.0), pose)
+        if k:
+            relative = RelativePose(between(poses[k - 1], pose), np.eye(3))
+            experiences.add_edge(Edge(k - 1, k, EdgeKind.ODOMETRY, Status.ACCEPTED, relative))
+    space = FreeSpace(np.ones((40, 140), dtype=bool), np.zeros(2), SIDE, 0.2)
+    return links_of(experiences.pose_graph(), poses, stamps_ns, space, kidnapped=kidnapped, cost=cost)
+
+
+def test_by_time_a_link_costs_what_it_took_and_nobody_drove_while_the_robot_was_carried():
+    carried = [Kidnapping(1, 2, 3, 3.0, 1.0)]
+    assert driven_line([], Cost.LENGTH).costs.tolist() == pytest.approx([1.0, 3.0, 1.0])
+    assert driven_line([], Cost.TIME).costs.tolist() == pytest.approx([1.0, 5.0, 1.0])
+    assert driven_line(carried, Cost.LENGTH).ends.tolist() == [[0, 1], [2, 3]]
+
+
+def test_by_time_only_driven_ways_are_known():
+    space = room_with_wall()
+    poses = np.array([[0.5, 0.5, 0], [0.5, 3.6, 0], [3.5, 3.6, 0], [3.5, 0.5, 0]])
+    links = Links(4, np.array([[0, 1], [1, 2], [2, 3]]), np.array([4.0, 4.0, 4.0]))
+    ends = np.array([0.7, 1.0]), np.array([3.3, 1.0])
+    assert Planner(space, poses, links, speed_m_s=1.0).plan(*ends).nodes == (1, 2)
 
 
 def test_straight_ways_do_not_cross_walls():

@@ -219,6 +219,8 @@ def test_what_is_wrong_is_told_before_the_drive_is_mapped(drives, tmp_path, monk
         localize(stream, config, broken, tmp_path / "drive")
     with pytest.raises(StoreError, match="has no finished map"):
         remove_edge(broken, 3, tmp_path / "edited")
+    with pytest.raises(StoreError, match=rf"^{broken}/map.db: "):
+        remove_edge(broken, 3, broken, overwrite=True)
     with pytest.raises(OutputError, match="holds a session already"):
         map_onto(stream, config, drives[0], drives[1])
     assert [path.name for path in tmp_path.iterdir()] == ["broken"]

@@ -231,6 +231,15 @@ def test_bad_files_are_refused_with_the_reason(tmp_path):
         MapStore.open(tmp_path / "v")
 
 
+def test_text_that_is_none_and_a_table_that_is_gone_are_damage(tmp_path):
+    for change in ("UPDATE sessions SET name = CAST(x'ff' AS TEXT)", "DROP TABLE sessions"):
+        folder = write_session(tmp_path / change.split()[0], ring_map(1.0))
+        with sqlite3.connect(folder.map_db) as connection:
+            connection.execute(change)
+        with MapStore.open(folder.path) as store, pytest.raises(StoreError, match=r"damaged.*--overwrite"):
+            store.sessions()
+
+
 def test_reading_changes_nothing(tmp_path):
     write_session(tmp_path / "s", ring_map())
     with MapStore.open(tmp_path / "s") as store, pytest.raises(StoreError, match="cannot write"):
