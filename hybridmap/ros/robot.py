@@ -112,7 +112,7 @@ class RobotNode:
     def start(self) -> None:
         """Look for the robot's topics, and offer the services; returns at once."""
         given = self._options
-        services = Services(self._require_mapper, given.out, given.map_frame, given.resolution_m, given.known_map)
+        services = Services(self._require_mapper, self._reset, given.out, given.map_frame, given.resolution_m, given.known_map)
         self._ros.offer(services.table)
         pose_type = "geometry_msgs/msg/PoseWithCovarianceStamped"
         self._ros.subscribe(ros.INITIAL_POSE, pose_type, self._guess)
@@ -168,13 +168,13 @@ class RobotNode:
         """Choose the topics once all are there, and subscribe; until it maps, say what is missing."""
         if self._incoming is None:
             try:
-                topics = self._ros.topics()
-                chosen = self._choose(topics)
+                chosen = self._choose(self._ros.topics())
+                time.sleep(_LOOK_S)
+                again = self._choose(self._ros.topics())
             except StreamError as error:
                 self._missing = [str(error)]
             else:
-                time.sleep(_LOOK_S)
-                if self._choose(self._ros.topics()).subscriptions == chosen.subscriptions:
+                if again.subscriptions == chosen.subscriptions:
                     self._subscribe(chosen)
         else:
             self._incoming.look()
@@ -356,6 +356,8 @@ class RobotNode:
             self.ended.set()  # `finish` says why
         if self._refused:
             sentences.append(f"{self._refused} messages could not be used")
+        losses = {} if self._incoming is None else self._incoming.losses
+        sentences += [f"messages left out, {name}: {number}" for name, number in losses.items() if number]
         self._ros.publish(ros.DIAGNOSTICS, contents.diagnostics(stamp_ns, "hybridmap", report, sentences))
 
     # ------------------------------------------------------------------ threads
@@ -374,6 +376,12 @@ class RobotNode:
         if self._error is None:
             self._error = error
         self.ended.set()
+
+    def _reset(self) -> None:
+        mapper = self._require_mapper()
+        mapper.reset()
+        if self._incoming is not None:
+            self._incoming.begin_anew()
 
     def _require_mapper(self) -> LiveMapper:
         if self._mapper is None:

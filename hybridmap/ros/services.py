@@ -21,19 +21,26 @@ class Services:
     """What the services do."""
 
     def __init__(
-        self, mapper: Callable[[], LiveMapper], out: Path, map_frame: str, resolution_m: float, known_map: Path | None = None
+        self,
+        mapper: Callable[[], LiveMapper],
+        reset: Callable[[], None],
+        out: Path,
+        map_frame: str,
+        resolution_m: float,
+        known_map: Path | None = None,
     ) -> None:
         """Remember what they need.
 
         Args:
             mapper: gives the mapper; raises a RosError before it has begun.
+            reset: begins a new map in place of the present one; raises as `mapper`.
             out: the session folder; `save_map` writes beside it.
             map_frame: name of the frame of the map.
             resolution_m: side of a cell of the grid.
             known_map: session folder of a finished map; None: there is none.
         """
-        self._mapper, self._out, self._map_frame, self._resolution_m = mapper, out, map_frame, resolution_m
-        self._known_map = known_map
+        self._mapper, self._begin_anew, self._out = mapper, reset, out
+        self._map_frame, self._resolution_m, self._known_map = map_frame, resolution_m, known_map
 
     @property
     def table(self) -> tuple[Service, ...]:
@@ -77,7 +84,7 @@ class Services:
         return {}
 
     def _reset(self, _: bool) -> Contents:
-        self._mapper().reset()
+        self._begin_anew()
         return {}
 
     def _dynamic_map(self, _: bool) -> Contents:

@@ -150,6 +150,12 @@ class Incoming:
             if self.rig is None:
                 self._try_to_start()
 
+    def begin_anew(self) -> None:
+        """A new map begins: its messages may be stamped earlier than those so far. What waits for a partner is forgotten."""
+        with self._observe:
+            self._raw.clear()
+            self._gatherer = None if self._gatherer is None else self._new_gatherer()
+
     def flush(self) -> None:
         """The end: give out what the messages that wait make. No transform is waited for any longer."""
         self._settle_s = 0.0
@@ -185,8 +191,7 @@ class Incoming:
             self._missing = [str(error)]
             return
         self._motion, self._decode = motion, plan.decode
-        if self.kind is not None and self.kind.in_bag is not None:
-            self._gatherer = self.kind.in_bag.gather(self.selection.sensors[self.kind.sensor_name], sensors)
+        self._gatherer = self._new_gatherer()
         self.remarks += [*motion.remarks, *plan.remarks]
         self._give = self._begin(plan.rig)
         for message in self._held:
@@ -242,6 +247,11 @@ class Incoming:
         for one in planned:
             parts = tuple(self._messages.decode(self._raw[key]) for key in one.needs)
             self._give(self._decode(one.stamp_ns, parts))
+
+    def _new_gatherer(self) -> Gatherer | None:
+        if self.kind is None or self.kind.in_bag is None:
+            return None
+        return self.kind.in_bag.gather(self.selection.sensors[self.kind.sensor_name], self._config.sensors)
 
     def _needed(self, topic: str) -> bool:
         """Whether mapping cannot begin without a message of this topic; transforms may be missing."""

@@ -15,6 +15,7 @@ from hybridmap.streams.bagfile import BagFile
 from hybridmap.streams.base import Rig, Sample
 from hybridmap.streams.incoming import Incoming
 from hybridmap.streams.messages import RawMessage, Topic
+from hybridmap.streams.rgbd import RgbdFrame
 from hybridmap.streams.rosbag import BagStream
 from tests.streams.recordings import NS, OPTICAL_XYZW, Recording, color_pixels, depth_mm, laser_drive, rgbd_drive
 
@@ -185,3 +186,16 @@ def test_without_a_sensor_it_says_what_it_expects(tmp_path: Path) -> None:
     robot = Robot(tmp_path / "drive.bag", {"vision.sensor": "none"})
     robot.say()
     assert len(robot.samples) == 1
+
+
+def test_a_recording_that_is_played_again_gives_its_samples_again(tmp_path: Path) -> None:
+    bag = rgbd_drive(True, frames=6).write(tmp_path / "drive.bag")
+    robot = Robot(bag)
+    robot.say()
+    robot.incoming.flush()
+    first = len(by_topic(robot.samples)[RgbdFrame])
+    robot.incoming.begin_anew()
+    robot.say()
+    robot.incoming.flush()
+    assert len(by_topic(robot.samples)[RgbdFrame]) == 2 * first
+    assert not any(robot.incoming.losses.values())
